@@ -1,0 +1,214 @@
+"""`nfc-gym`: check, close-loop, predict, demo. Everything heavy is imported inside the command that needs it.
+
+Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the same command resumes; 1 a fault of ours.
+"""
+
+import errno
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+from rich.console import Console
+
+from nfc_gym import __version__
+from nfc_gym.core import InputError, NfcError
+
+if TYPE_CHECKING:
+    from nfc_gym.measured.checks import Finding
+
+FAULT, BAD_INPUT, INTERRUPTED = 1, 2, 3
+
+# What the operating system may refuse, and what the user can do about it.
+_REFUSALS = {
+    errno.ENOSPC: "the disk is full: free some space and run the same command again",
+    errno.EDQUOT: "your disk quota is used up: free some space and run the same command again",
+    errno.EACCES: "permission denied: choose a place that you may write to, or change the permissions",
+    errno.EPERM: "not permitted: choose a place that you may write to, or change the permissions",
+    errno.EROFS: "the file system is read-only: choose another --out",
+}
+
+app = typer.Typer(
+    help="Find what a MuJoCo model lacks, from logs of the real machine, and put it there.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+class Mode(StrEnum):
+    """What is predicted: motion from commands, forces from motion, or sensors from states and commands."""
+
+    rollout = "rollout"
+    inverse = "inverse"
+    forward = "forward"
+
+
+class Stage(StrEnum):
+    """Which model predicts: as given, with calibrated parameters, or with the effects found as well."""
+
+    nominal = "nominal"
+    calibrated = "calibrated"
+    extended = "extended"
+
+
+MappingFile = Annotated[
+    Path, typer.Argument(metavar="MAPPING.yaml", help="Names the model, its parameters and the logs.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="The same inputs and seed give the same report.")]
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    ctx: typer.Context,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say it.")] = False,
+) -> None:
+    ctx.obj = debug
+
+
+@app.command()
+def check(ctx: typer.Context, mapping: MappingFile) -> None:
+    """Say in one place all that is wrong with a mapping file, its model and its logs; nothing is fitted or changed."""
+    with _outcome(ctx):
+        from nfc_gym.measured.checks import check as find
+
+        findings = find(mapping)
+        _print_findings(findings)
+        if any(f.severity == "error" for f in findings):
+            raise typer.Exit(BAD_INPUT)
+
+
+@app.command("close-loop")
+def close_loop(
+    ctx: typer.Context,
+    mapping: MappingFile,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for report.json, report.html, model.xml, effects.yaml.")
+    ],
+    seed: Seed = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Threads; 0 takes all cores.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left in DIR.")] = False,
+    resume: Annotated[bool, typer.Option(help="Go on from the last finished stage of an interrupted run.")] = True,
+    fold: Annotated[
+        str | None, typer.Option(metavar="NAME", help="With `by: rotate`: only the fold that verifies NAME.")
+    ] = None,
+) -> None:
+    """Calibrate the model, find what it lacks, add it; report the error before and after on logs nobody fitted to."""
+    with _outcome(ctx, resumes=True):
+        from nfc_gym.measured.loop import close_loop as run
+
+        run(mapping, out, seed=seed, jobs=jobs, overwrite=overwrite, resume=resume, fold=fold, console=Console())
+
+
+@app.command()
+def predict(
+    ctx: typer.Context,
+    mapping: MappingFile,
+    out: Annotated[Path, typer.Option(metavar="FILE.npz", help="One array a log.")],
+    fit: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="What close-loop wrote; not needed for --stage nominal.")
+    ] = None,
+    mode: Annotated[Mode, typer.Option(help="rollout: motion; inverse: forces; forward: sensors.")] = Mode.rollout,
+    stage: Annotated[Stage, typer.Option(help="Which model predicts.")] = Stage.extended,
+    restart: Annotated[
+        float | None,
+        typer.Option(metavar="S", min=0, help="rollout: start anew from the measured state every S seconds."),
+    ] = None,
+) -> None:
+    """Predict every log with the model as given, calibrated or extended."""
+    with _outcome(ctx):
+        if fit is None and stage is not Stage.nominal:
+            raise InputError(
+                f"--stage {stage.value} needs --fit DIR, the folder that close-loop wrote; or use --stage nominal"
+            )
+        if restart is not None and mode is not Mode.rollout:
+            raise InputError(f"--restart goes with --mode rollout, not {mode.value}")
+        from nfc_gym.measured.predict import predict as run
+
+        run(mapping, fit, mode.value, stage.value, out, restart=restart)
+
+
+@app.command()
+def demo(
+    ctx: typer.Context,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the logs, the sealed envelope and the report.")],
+    seed: Seed = 0,
+) -> None:
+    """Run the whole loop, blind, on a simulated stand-in machine with one hidden effect; then open the envelope."""
+    with _outcome(ctx):
+        from nfc_gym.measured.demo import demo as run
+
+        run(out, seed=seed, console=Console())
+
+
+@contextmanager
+def _outcome(ctx: typer.Context, resumes: bool = False) -> Iterator[None]:
+    """Turn whatever a command raises into one clear message on stderr and the exit code that goes with it."""
+    try:
+        yield
+    except typer.Exit:
+        raise
+    except KeyboardInterrupt:
+        again = "goes on from the last finished stage" if resumes else "starts over"
+        _fail(ctx, INTERRUPTED, f"interrupted; the same command {again}")
+    except NfcError as e:
+        _fail(ctx, BAD_INPUT, str(e))
+    except OSError as e:
+        refusal = _REFUSALS.get(e.errno or 0) or (_REFUSALS[errno.ENOSPC] if "No space left" in str(e) else None)
+        if refusal is None:
+            _fault(ctx, e)
+        _fail(ctx, BAD_INPUT, f"{e.filename}: {refusal}" if e.filename else refusal)
+    except Exception as e:
+        _fault(ctx, e)
+
+
+def _fail(ctx: typer.Context, code: int, message: str) -> NoReturn:
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    if ctx.obj:
+        console.print(traceback.format_exc(), markup=False)
+    console.print(f"nfc-gym {ctx.info_name}: {message}", markup=False)
+    raise typer.Exit(code)
+
+
+def _fault(ctx: typer.Context, error: Exception) -> NoReturn:
+    hint = "" if ctx.obj else "; the same command with --debug shows where"
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    _fail(
+        ctx,
+        FAULT,
+        f"a fault of nfc-gym, not of yours: {what}{hint}. Please report it with that output and the mapping.",
+    )
+
+
+def _print_findings(findings: "list[Finding]") -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False)
+    if not findings:
+        console.print("Nothing wrong found.")
+        return
+    colours = {"error": "bold red", "warning": "yellow", "note": "cyan"}
+    table = Table("", "where", "what", "what to do", show_lines=True)
+    for f in findings:
+        table.add_row(Text(f.severity, colours[f.severity]), Text(f.where), Text(f.message), Text(f.advice))
+    console.print(table)
+    counts = [(s, sum(f.severity == s for f in findings)) for s in colours]
+    console.print(", ".join(f"{n} {s}{'s' * (n != 1)}" for s, n in counts))
+
+
+def main() -> None:
+    """The entry point of `nfc-gym`; `--debug` may stand anywhere on the line."""
+    args = [a for a in sys.argv[1:] if a != "--debug"]
+    app(["--debug", *args] if len(args) < len(sys.argv) - 1 else args, prog_name="nfc-gym")
