@@ -1,0 +1,265 @@
+"""`Effect`: one physical effect that a model may lack.
+
+The same object is calibrated, wrapped around an environment, saved beside a model and named in a report. It acts through
+one or more hooks. Every hook is a pure function over arrays with any leading batch shape `...`; `theta` is (..., k), the
+effect's parameters in the order of `params`. In one physics step hooks run in this order: `action` on the command, `model`
+(once, when a simulation is set up), `friction` and `force` on the state before the step, `sense` on what is measured.
+
+At its null value an effect leaves the simulator's result unchanged bit for bit, by arithmetic and not by skipping it.
+"""
+
+from abc import ABC
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.fields import ModelFields
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Param:
+    """One parameter of an effect.
+
+    Attributes:
+      name, unit: as reports and `effects.yaml` have them.
+      low, high: bounds of any fit.
+      null: the value at which the effect vanishes.
+      probes: realistic sizes to try first, in the parameter's own unit.
+      shape: True where the parameter only shapes the effect (a Stribeck speed) and no value of it is null.
+      resolution: a size below which nobody would speak of the effect.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    null: float = 0.0
+    probes: tuple[float, ...] = ()
+    shape: bool = False
+    resolution: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Typical magnitudes along the logs at hand, from which effects take realistic sizes.
+
+    Attributes:
+      force: (nv,) generalised force, N or N m.
+      speed: (nv,) speed of each degree of freedom, m/s or rad/s.
+      command: (nu,) spread of each command, in its own unit.
+      actuation: (nu,) force of each actuator, in its own unit.
+      interval: median time between samples, s.
+      exogenous: names of the exogenous signals that the logs carry, with their median value.
+      channels: names of the measured channels, with (spread, noise) of each.
+    """
+
+    force: Array
+    speed: Array
+    command: Array
+    actuation: Array
+    interval: float
+    exogenous: Mapping[str, float] = field(default_factory=dict)
+    channels: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass
+class Context:
+    """What a hook may read of a simulation before a physics step; arrays share the leading batch shape.
+
+    Attributes:
+      model: the nominal model (sizes, addresses, names), never edited.
+      dt: physics step, s.
+      q, v: (..., nq), (..., nv) the state.
+      ctrl: (..., nu) the command as it reaches the actuators.
+      exogenous: measured signals by name, (...,).
+      data: derived field of `MjData` by name, (..., *shape), one substep behind the state as after `mj_step`.
+      nominal: a model field of the simulation before any per-step hook wrote to it, (..., *shape).
+    """
+
+    model: mujoco.MjModel
+    dt: float
+    q: Array
+    v: Array
+    ctrl: Array
+    exogenous: Mapping[str, Array]
+    data: Callable[[str], Array]
+    nominal: Callable[[str], Array]
+
+
+@dataclass
+class Forces:
+    """Where `force` hooks add: generalised forces (..., nv) and world-frame body wrenches (..., nbody, 6) at the com."""
+
+    qfrc: Array
+    xfrc: Array
+
+
+class Effect(ABC):
+    """Base class: identity, parameters, and hooks that do nothing.
+
+    Args:
+      where: names of the model that it acts on.
+      params: overrides the family's parameters (probing sizes are matched to the machine by `propose`).
+    """
+
+    family: ClassVar[str]
+    summary: ClassVar[str]
+    # A member of the generic alternatives takes part in every contest but is never claimed by name.
+    generic: ClassVar[bool] = False
+
+    def __init__(self, where: Sequence[str], params: Sequence[Param]) -> None:
+        self.where = tuple(where)
+        self.params = tuple(params)
+
+    @property
+    def place(self) -> str:
+        """The place in an id: one name, or names joined by `+`."""
+        return "+".join(self.where)
+
+    @property
+    def id(self) -> str:
+        """`family:place`."""
+        return f"{self.family}:{self.place}"
+
+    def __repr__(self) -> str:
+        return f"<{self.id}>"
+
+    @property
+    def null(self) -> Array:
+        """(k,) parameters at which nothing changes; shape parameters take their first probe."""
+        return np.array([p.probes[0] if p.shape else p.null for p in self.params], float)
+
+    @property
+    def low(self) -> Array:
+        """(k,) lower bounds."""
+        return np.array([p.low for p in self.params], float)
+
+    @property
+    def high(self) -> Array:
+        """(k,) upper bounds."""
+        return np.array([p.high for p in self.params], float)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Exogenous signals that the effect reads."""
+        return ()
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> "list[Effect]":
+        """Every place of a model where the effect could sit, with sizes that fit the machine."""
+        raise NotImplementedError
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        """Resolve names to addresses once; a name that the model lacks raises `InputError`."""
+
+    # ---- hooks ----------------------------------------------------------------------------------------------------
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        """Structural edit that lets plain MJCF carry the effect; returns whether it now does. theta (k,)."""
+        return False
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        """Edit model fields in place, starting from what is there (nominal, or psi's value)."""
+
+    def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
+        """Hidden state before the first command; `ctrl` (..., nu) is that command, held since ever."""
+        return None
+
+    def action(self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float) -> tuple[Array, Any]:
+        """Command (..., nu) -> what the actuators receive, and the new hidden state."""
+        return ctrl, memory
+
+    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
+        """Dry friction to add: (dofs (n,), level (..., n) >= 0 in N or N m). MuJoCo's constraint solver applies it."""
+        raise NotImplementedError
+
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        """Add generalised forces or body wrenches for the coming step."""
+
+    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array]) -> Array:
+        """Inverse mode: force that a motion needs of the actuators (..., nu) -> force that the nominal actuator would report."""
+        return force
+
+    def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
+        """True trajectory of a channel (..., time, dim) -> what its sensor reports."""
+        return values
+
+    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        """Measured start state -> true start state."""
+        return q, v
+
+    # ---- words ----------------------------------------------------------------------------------------------------
+
+    def say(self, theta: Array, sd: Array | None = None) -> str:
+        """One sentence with units."""
+        parts = []
+        for i, p in enumerate(self.params):
+            spread = "" if sd is None or not np.isfinite(sd[i]) else f" ± {1.96 * sd[i]:.2g}"
+            unit = "" if p.unit == "1" else f" {p.unit}"
+            parts.append(f"{p.name.replace('_', ' ')} {theta[i]:.3g}{spread}{unit}")
+        return f"{self.summary} at {' and '.join(self.where)}: {', '.join(parts)}."
+
+
+def overrides(effect: Effect, hook: str) -> bool:
+    """Whether an effect implements a hook."""
+    return getattr(type(effect), hook) is not getattr(Effect, hook)
+
+
+def joint_dofs(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
+    """Dof address of each named hinge or slide joint, (n,)."""
+    out = []
+    for name in names:
+        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+        if joint < 0:
+            raise InputError(f"the model has no joint named {name!r}; it has: {', '.join(scalar_joints(model))}")
+        out.append(int(model.jnt_dofadr[joint]))
+    return np.array(out, np.intp)
+
+
+def scalar_joints(model: mujoco.MjModel) -> list[str]:
+    """Names of the hinge and slide joints."""
+    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return [
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j)
+        for j in range(model.njnt)
+        if int(model.jnt_type[j]) >= slide
+    ]
+
+
+def actuator_names(model: mujoco.MjModel) -> list[str]:
+    """Names of the actuators, in id order."""
+    return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
+
+
+def actuator_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
+    """Id of each named actuator, (n,)."""
+    known = actuator_names(model)
+    for name in names:
+        if name not in known:
+            raise InputError(f"the model has no actuator named {name!r}; it has: {', '.join(known)}")
+    return np.array([known.index(n) for n in names], np.intp)
+
+
+def groups(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Places made of `names`: each alone, all together, and the sets that share a kind (`fl_hip`, `fr_hip`, ... -> hips).
+
+    Names are read as words; the words that tell corners and sides apart (fl, rear, left, 1) are set aside, and names that
+    agree in the rest form a set.
+    """
+    corners = {"fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br", "front", "rear", "back", "hind", "left", "right", "l", "r"}
+    sets: dict[str, list[str]] = {}
+    for name in names:
+        words = [w for w in name.lower().replace("-", "_").split("_") if w not in corners and not w.isdigit()]
+        sets.setdefault("_".join(words), []).append(name)
+    out: list[tuple[str, ...]] = [(n,) for n in names]
+    if len(names) > 1:
+        out.append(tuple(names))
+    out += [tuple(s) for s in sets.values() if 1 < len(s) < len(names)]
+    return out

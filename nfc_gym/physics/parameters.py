@@ -1,0 +1,221 @@
+"""psi: named, bounded numbers with units, each bound to fields of an `MjModel`.
+
+The same `write` serves one model and a batch of simulations (`ModelFields`). Values are physical; `normalise` maps the
+prior's box to [-1, 1].
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.contact import restitution_solref
+from nfc_gym.physics.fields import ModelFields, rows_of
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of psi.
+
+    Attributes:
+      name: unique in its space.
+      field: an `MjModel` field, with a component in brackets where it has several (`geom_friction[0]`), an option
+        (`opt.gravity[2]`), or one of the compound fields in `COMPOUND`.
+      of: the named objects that take the value, all the same.
+      unit: of the value.
+      low, high: the prior's bounds.
+      nominal: None reads it from the model.
+      anchored: known from a scale or a ruler; it stays at its nominal value and fixes the gauge of the others.
+    """
+
+    name: str
+    field: str
+    of: tuple[str, ...] = ()
+    unit: str = "1"
+    low: float = 0.0
+    high: float = 1.0
+    nominal: float | None = None
+    anchored: bool = False
+    reason: str = ""
+
+
+def _write_mass(fields: ModelFields, rows: NDArray[np.intp], value: Array) -> None:
+    """A body's mass; its inertia scales with it, as for a body of the same shape and another density."""
+    mass, inertia = fields["body_mass"], fields["body_inertia"]
+    nominal = fields.nominal("body_mass")[rows]
+    mass[..., rows] = value
+    inertia[..., rows, :] = fields.nominal("body_inertia")[rows] * (value / nominal)[..., None]
+
+
+def _write_servo_kv(fields: ModelFields, rows: NDArray[np.intp], value: Array) -> None:
+    """Gain of a `velocity` servo: force = kv (ctrl - velocity)."""
+    fields["actuator_gainprm"][..., rows, 0] = value
+    fields["actuator_biasprm"][..., rows, 2] = -value
+
+
+def _write_servo_kp(fields: ModelFields, rows: NDArray[np.intp], value: Array) -> None:
+    """Gain of a `position` servo: force = kp (ctrl - position) - kv velocity."""
+    fields["actuator_gainprm"][..., rows, 0] = value
+    fields["actuator_biasprm"][..., rows, 1] = -value
+
+
+def _write_restitution(fields: ModelFields, rows: NDArray[np.intp], value: Array) -> None:
+    """Coefficient of restitution of a geom, through a direct `solref` (see `contact.restitution_solref`)."""
+    fields["geom_solref"][..., rows, :] = restitution_solref(value)
+
+
+# Compound fields: several model fields that one physical number moves together -> (field its rows are named by, writer).
+COMPOUND = {
+    "body_mass": ("body_mass", _write_mass),
+    "servo_kv": ("actuator_gainprm", _write_servo_kv),
+    "servo_kp": ("actuator_gainprm", _write_servo_kp),
+    "geom_restitution": ("geom_solref", _write_restitution),
+}
+_READ = {"servo_kv": ("actuator_gainprm", 0), "servo_kp": ("actuator_gainprm", 0)}
+_FIELD = re.compile(r"^([\w.]+?)(?:\[(\d+)\])?$")
+
+
+def split_field(field: str) -> tuple[str, int | None]:
+    """`geom_friction[0]` -> (`geom_friction`, 0); without brackets the component is None."""
+    match = _FIELD.match(field)
+    if match is None:
+        raise InputError(f"field {field!r}: want a name of MjModel, with one component in brackets where it has several")
+    return match[1], None if match[2] is None else int(match[2])
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """A field resolved against a model: where a value of a parameter goes."""
+
+    name: str
+    component: int | None
+    rows: NDArray[np.intp] | None
+
+
+def resolve(model: mujoco.MjModel, field: str, of: Sequence[str]) -> _Bound:
+    """Resolve a field and its objects' names against a model; raises `InputError` naming what does not exist."""
+    name, component = split_field(field)
+    if name.startswith("opt."):
+        owner, key = model.opt, name[4:]
+    else:
+        owner, key = model, COMPOUND.get(name, (name,))[0]
+    array = getattr(owner, key, None)
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"field {field!r} is not an array field of MjModel (or one of {', '.join(COMPOUND)})")
+    if name.startswith("opt."):
+        return _Bound(name, component, None)
+    if not of:
+        raise InputError(f"field {field!r}: `of` must name at least one object")
+    rows = rows_of(model, name, tuple(of))
+    if name not in COMPOUND and array.ndim == 2 and component is None:
+        raise InputError(f"field {field!r} has {array.shape[1]} components: name one, for instance {field}[0]")
+    if component is not None and (array.ndim != 2 or component >= array.shape[1]):
+        size = array.shape[1] if array.ndim == 2 else 1
+        raise InputError(f"field {field!r}: component {component} does not exist, the field has {size}")
+    return _Bound(name, component, rows)
+
+
+def write_field(fields: ModelFields, bound: _Bound, value: Array) -> None:
+    """Write `value` (...,) to every row of a resolved field, over the fields' own batch shape."""
+    value = np.asarray(value, float)
+    if bound.rows is None:
+        fields[bound.name][..., bound.component] = value
+    elif bound.name in COMPOUND:
+        COMPOUND[bound.name][1](fields, bound.rows, np.broadcast_to(value[..., None], (*value.shape, len(bound.rows))))
+    elif bound.component is None:
+        fields[bound.name][..., bound.rows] = value[..., None]
+    else:
+        fields[bound.name][..., bound.rows, bound.component] = value[..., None]
+
+
+class ParameterSpace:
+    """An ordered box of parameters bound to one model.
+
+    Args:
+      model: the nominal model, from which omitted nominal values are read.
+      parameters: in the order of the psi vector.
+
+    Raises:
+      InputError: a field, an object or a component does not exist; bounds are not ordered; the nominal lies outside.
+    """
+
+    def __init__(self, model: mujoco.MjModel, parameters: Sequence[Parameter]) -> None:
+        self.parameters = tuple(parameters)
+        self._bound = [resolve(model, p.field, p.of) for p in parameters]
+        self.names = tuple(p.name for p in parameters)
+        self.units = tuple(p.unit for p in parameters)
+        twice = {n for n in self.names if self.names.count(n) > 1}
+        if twice:
+            raise InputError(f"parameters named twice: {', '.join(sorted(twice))}")
+        self.low = np.array([p.low for p in parameters], float)
+        self.high = np.array([p.high for p in parameters], float)
+        self.nominal = np.array(
+            [self._read(model, b) if p.nominal is None else p.nominal for p, b in zip(parameters, self._bound, strict=True)], float
+        )
+        for p, value in zip(parameters, self.nominal, strict=True):
+            if not p.low < p.high:
+                raise InputError(f"parameter {p.name!r}: low {p.low:g} must be below high {p.high:g}")
+            if not p.low <= value <= p.high:
+                raise InputError(f"parameter {p.name!r}: nominal {value:g} {p.unit} lies outside [{p.low:g}, {p.high:g}]")
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(d,) which parameters are not anchored."""
+        return np.array([not p.anchored for p in self.parameters], bool)
+
+    @staticmethod
+    def _read(model: mujoco.MjModel, bound: _Bound) -> float:
+        if bound.name == "geom_restitution":
+            raise InputError("geom_restitution has no single nominal value in the model: give `nominal`")
+        name, component = _READ.get(bound.name, (bound.name, bound.component))
+        array = getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
+        row = array if bound.rows is None else array[bound.rows[0]]
+        return float(row if component is None else row[component])
+
+    def write(self, fields: ModelFields, psi: ArrayLike) -> None:
+        """Write psi (d,) to one model, or (nsim, d) to a batch. Call `fields.commit()` once everything is written.
+
+        Raises:
+          InputError: a value is not finite, or a mass is not positive.
+        """
+        psi = np.asarray(psi, float)
+        if psi.shape[-1:] != (len(self),):
+            raise InputError(f"psi must end in {len(self)} values ({', '.join(self.names)}), got shape {psi.shape}")
+        for i, (p, bound) in enumerate(zip(self.parameters, self._bound, strict=True)):
+            value = psi[..., i]
+            if not np.isfinite(value).all():
+                raise InputError(f"parameter {p.name!r} is not finite")
+            if bound.name == "body_mass" and (value <= 0).any():
+                raise InputError(f"parameter {p.name!r}: a mass must be positive, got {float(value.min()):g} {p.unit}")
+            write_field(fields, bound, value)
+
+    def normalise(self, psi: ArrayLike) -> Array:
+        """Physical values (..., d) to [-1, 1] by the prior's bounds, not clipped."""
+        return 2 * (np.asarray(psi, float) - self.low) / (self.high - self.low) - 1
+
+    def denormalise(self, unit_box: ArrayLike) -> Array:
+        """Inverse of `normalise`."""
+        return self.low + (np.asarray(unit_box, float) + 1) / 2 * (self.high - self.low)
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        """(size, d) uniform draws from the prior's box; anchored parameters stay nominal."""
+        draws = rng.uniform(self.low, self.high, (size, len(self)))
+        return np.where(self.free, draws, self.nominal)
+
+    def vector(self, values: "dict[str, float] | ArrayLike") -> Array:
+        """(d,) from a dict of names (the rest nominal) or a vector; an unknown name raises `InputError`."""
+        if not isinstance(values, dict):
+            return np.asarray(values, float)
+        unknown = sorted(set(values) - set(self.names))
+        if unknown:
+            raise InputError(f"no parameter named {unknown[0]!r}; there are: {', '.join(self.names)}")
+        return np.array([values.get(n, v) for n, v in zip(self.names, self.nominal, strict=True)], float)

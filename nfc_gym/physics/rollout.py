@@ -1,0 +1,290 @@
+"""Batched multiple-shooting roll-outs on `mujoco.batch`, with effects acting through their hooks at every physics step.
+
+Rows of the batch are pairs (parameter vector, segment), parameter vectors slowest. Derived quantities that effects read are
+one substep behind the state, exactly as they are in an `MjData` between two calls of `mj_step`, so that a wrapper around a
+single environment and this roll-out agree bit for bit.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from nfc_gym.physics.effects.base import Context, Effect, Forces, overrides
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.parameters import ParameterSpace, resolve, write_field
+
+Array = NDArray[np.float64]
+_ROW_BYTES = 300_000_000  # recorded trajectories of one call; more parameter vectors are run in turns
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A firmware position loop: ctrl = supply * clip(gain (target - q) - damping v, -limit, limit)."""
+
+    actuator: int
+    qpos: int
+    dof: int
+    limit: float
+
+
+@dataclass(frozen=True)
+class Segments:
+    """S stretches of logs, laid on a uniform grid of physics steps; H steps of history come before the start.
+
+    Attributes:
+      dt: physics step, s.
+      history: H.
+      qpos, qvel: (S, nq), (S, nv) measured start states.
+      ctrl: (S, H + K, nu) commands, or targets where a firmware servo computes the command.
+      exogenous: name -> (S, H + K).
+      known: (field, object names) -> (S, H + K) model fields that the log itself gives.
+      servo: per `Servo`, its gain, supply and damping, (S, H + K) each.
+    """
+
+    dt: float
+    history: int
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+    exogenous: Mapping[str, Array] = field(default_factory=dict)
+    known: Mapping[tuple[str, tuple[str, ...]], Array] = field(default_factory=dict)
+    servo: Sequence[tuple[Servo, Mapping[str, Array]]] = ()
+
+    def __len__(self) -> int:
+        return len(self.qpos)
+
+    @property
+    def steps(self) -> int:
+        """K, physics steps after the start."""
+        return self.ctrl.shape[1] - self.history
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What was rolled out. P parameter vectors, S segments, times 0, dt, ..., K dt.
+
+    Attributes:
+      qpos, qvel: (P, S, K + 1, nq), (P, S, K + 1, nv).
+      sensordata: (P, S, K + 1, nsensordata), each at its own time, or None where not asked for.
+      stable: (P, S) False where MuJoCo warned or a value is not finite; such rows hold no meaning.
+    """
+
+    qpos: Array
+    qvel: Array
+    sensordata: Array | None
+    stable: NDArray[np.bool_]
+
+
+class Plant:
+    """A model, its psi, and the effects at work in it.
+
+    Args:
+      model: the nominal model; `model.opt.timestep` is the physics step.
+      space: psi.
+      effects: in the order in which their hooks run.
+      nthread: threads of the batch; 0 takes every core.
+    """
+
+    def __init__(self, model: mujoco.MjModel, space: ParameterSpace, effects: Sequence[Effect] = (), nthread: int = 0) -> None:
+        self.model, self.space, self.effects, self.nthread = model, space, tuple(effects), nthread
+        for effect in self.effects:
+            effect.bind(model)
+
+    def with_effects(self, effects: Sequence[Effect]) -> "Plant":
+        """The same machine with other effects."""
+        return Plant(self.model, self.space, effects, self.nthread)
+
+    @property
+    def size(self) -> int:
+        """Length of a full parameter vector: psi, then each effect's parameters."""
+        return len(self.space) + sum(len(e.params) for e in self.effects)
+
+    def split(self, x: Array) -> tuple[Array, list[Array]]:
+        """Full parameter vectors (..., size) -> psi (..., d) and theta of each effect (..., k)."""
+        sizes = [len(self.space), *(len(e.params) for e in self.effects)]
+        psi, *thetas = np.split(x, np.cumsum(sizes)[:-1], axis=-1)
+        return psi, thetas
+
+    @property
+    def null(self) -> Array:
+        """(size,) nominal psi and every effect at null."""
+        return np.concatenate([self.space.nominal, *(e.null for e in self.effects)])
+
+    def write(self, fields: ModelFields, x: Array) -> None:
+        """Psi and the effects' model edits into one model, x (size,), or a batch, x (nsim, size)."""
+        psi, thetas = self.split(x)
+        self.space.write(fields, psi)
+        for effect, theta in zip(self.effects, thetas, strict=True):
+            effect.model(fields, theta)
+
+    def shoot(self, x: Array, segments: Segments, sensors: bool = False) -> Trajectory:
+        """Roll every segment out under every parameter vector.
+
+        Args:
+          x: (P, size) or (P, S, size) full parameter vectors, the latter with values of its own for each segment.
+          segments: starts, commands and signals.
+          sensors: record `sensordata` too.
+        """
+        width = self.model.nq + self.model.nv + (self.model.nsensordata if sensors else 0)
+        turn = max(1, int(_ROW_BYTES / (8 * len(segments) * (segments.steps + 1) * width)))
+        parts = [self._shoot(x[i : i + turn], segments, sensors) for i in range(0, len(x), turn)]
+        if len(parts) == 1:
+            return parts[0]
+        return Trajectory(
+            np.concatenate([p.qpos for p in parts]),
+            np.concatenate([p.qvel for p in parts]),
+            np.concatenate([p.sensordata for p in parts if p.sensordata is not None]) if sensors else None,
+            np.concatenate([p.stable for p in parts]),
+        )
+
+    def _shoot(self, x: Array, segments: Segments, sensors: bool) -> Trajectory:
+        count, size = len(x), len(segments)
+        rows = np.broadcast_to(x[:, None] if x.ndim == 2 else x, (count, size, self.size)).reshape(count * size, self.size)
+        return _Run(self, rows, count, segments, sensors).roll()
+
+
+class _Run:
+    """One batch from set-up to the last step: the rows, their hidden states, and the recordings."""
+
+    def __init__(self, plant: Plant, rows: Array, count: int, segments: Segments, sensors: bool) -> None:
+        self.plant, self.segments, self.sensors, self.count = plant, segments, sensors, count
+        model = plant.model
+        self.thetas = plant.split(rows)[1]
+        self.batch = Batch(model, len(rows), plant.nthread)
+        self.fields = ModelFields(self.batch, model)
+        self.varying = self._write_known()
+        plant.write(self.fields, rows)
+        self.fields.commit()
+        q, v = self._tile(segments.qpos), self._tile(segments.qvel)
+        for effect, theta in zip(plant.effects, self.thetas, strict=True):
+            q, v = effect.unsense(q, v, theta)
+        self.batch.qpos[...], self.batch.qvel[...] = q, v
+        self.memories: list[Any] = []
+        self.commanding = [i for i, e in enumerate(plant.effects) if overrides(e, "action")]
+        self.rubbing = [i for i, e in enumerate(plant.effects) if overrides(e, "friction")]
+        self.pushing = [i for i, e in enumerate(plant.effects) if overrides(e, "force")]
+        if self.rubbing:
+            self.base_friction = self.fields["dof_frictionloss"].copy()
+
+    def _tile(self, array: Array) -> Array:
+        return np.broadcast_to(array, (self.count, *array.shape)).reshape(-1, *array.shape[1:])
+
+    def _write_known(self) -> list[tuple[Any, Array]]:
+        """Constant known fields are written once; those that vary through a segment are returned."""
+        varying = []
+        for (name, of), values in self.segments.known.items():
+            bound = resolve(self.plant.model, name, of)
+            start = values[:, self.segments.history]
+            write_field(self.fields, bound, self._tile(start))
+            if (values[:, self.segments.history :] != start[:, None]).any():
+                varying.append((bound, values))
+        return varying
+
+    def _command(self, k: int, exogenous: Mapping[str, Array]) -> Array:
+        """Command of step k (negative in the history) after the effects on it."""
+        ctrl = self._tile(self.segments.ctrl[:, self.segments.history + k])
+        for slot, i in enumerate(self.commanding):
+            effect, theta = self.plant.effects[i], self.thetas[i]
+            if len(self.memories) == slot:
+                self.memories.append(effect.state0(ctrl.shape[:-1], ctrl, theta, self.segments.dt))
+            ctrl, self.memories[slot] = effect.action(ctrl, theta, self.memories[slot], exogenous, self.segments.dt)
+        return ctrl
+
+    def _exogenous(self, k: int) -> dict[str, Array]:
+        return {n: self._tile(s[:, self.segments.history + k]) for n, s in self.segments.exogenous.items()}
+
+    def _serve(self, k: int, ctrl: Array) -> Array:
+        """Firmware servos turn targets into commands."""
+        if not self.segments.servo:
+            return ctrl
+        ctrl = ctrl.copy()
+        at = self.segments.history + k
+        for servo, terms in self.segments.servo:
+            wish = self._tile(terms["gain"][:, at]) * (ctrl[:, servo.actuator] - self.batch.qpos[:, servo.qpos])
+            wish = wish - self._tile(terms["damping"][:, at]) * self.batch.qvel[:, servo.dof]
+            ctrl[:, servo.actuator] = self._tile(terms["supply"][:, at]) * np.clip(wish, -servo.limit, servo.limit)
+        return ctrl
+
+    def _apply(self, ctx: Context) -> None:
+        """State-feedback friction and forces of the coming step."""
+        if self.rubbing:
+            loss = self.fields["dof_frictionloss"]
+            loss[...] = self.base_friction
+            for i in self.rubbing:
+                dofs, level = self.plant.effects[i].friction(ctx, self.thetas[i])
+                loss[:, dofs] += level
+        if self.pushing:
+            out = Forces(self.batch.qfrc_applied, self.batch.xfrc_applied)
+            out.qfrc[...] = 0
+            out.xfrc[...] = 0
+            for i in self.pushing:
+                self.plant.effects[i].force(ctx, self.thetas[i], out)
+
+    def _nominal(self, name: str) -> Array:
+        if name == "dof_frictionloss" and self.rubbing:
+            return self.base_friction
+        return self.fields[name]
+
+    def roll(self) -> Trajectory:
+        """Step through all segments at once."""
+        model, batch, steps = self.plant.model, self.batch, self.segments.steps
+        rows = batch.nsim
+        for k in range(-self.segments.history, 0):
+            advance_activations(model, self._command(k, self._exogenous(k)), batch.act, self.segments.dt, settle=k == -self.segments.history)
+        qpos, qvel = np.empty((steps + 1, rows, model.nq)), np.empty((steps + 1, rows, model.nv))
+        sensed = np.empty((steps + 1, rows, model.nsensordata)) if self.sensors else None
+        feedback = bool(self.rubbing or self.pushing)
+        for k in range(steps):
+            exogenous = self._exogenous(k)
+            for bound, values in self.varying:
+                write_field(self.fields, bound, self._tile(values[:, self.segments.history + k]))
+            batch.ctrl[...] = self._serve(k, self._command(k, exogenous))
+            if k == 0:
+                self._start(bool(feedback or sensed is not None))
+            if feedback:
+                self._apply(Context(model, self.segments.dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, batch.bind, self._nominal))
+            qpos[k], qvel[k] = batch.qpos, batch.qvel
+            batch.step()
+            if sensed is not None:
+                sensed[k] = batch.sensordata
+        qpos[steps], qvel[steps] = batch.qpos, batch.qvel
+        if sensed is not None:
+            batch.forward()
+            sensed[steps] = batch.sensordata
+        return self._result(qpos, qvel, sensed)
+
+    def _start(self, forward: bool) -> None:
+        """Without a history actuator states begin settled; derived fields become current where hooks read them."""
+        if self.segments.history == 0:
+            advance_activations(self.plant.model, self.batch.ctrl, self.batch.act, self.segments.dt, settle=True)
+        if forward:
+            self.batch.forward()
+
+    def _result(self, qpos: Array, qvel: Array, sensed: Array | None) -> Trajectory:
+        stable = np.isfinite(qpos).all((0, 2)) & np.isfinite(qvel).all((0, 2)) & (self.batch.warning[..., 1].sum(-1) == 0)
+        size = len(self.segments)
+
+        def shape(a: Array) -> Array:
+            return np.ascontiguousarray(a.reshape(len(a), self.count, size, -1).transpose(1, 2, 0, 3))
+
+        return Trajectory(
+            shape(qpos), shape(qvel), None if sensed is None else shape(sensed), stable.reshape(self.count, size)
+        )
+
+
+def advance_activations(model: mujoco.MjModel, ctrl: Array, act: Array, dt: float, settle: bool) -> None:
+    """One step of first-order actuator states (..., na) under commands (..., nu), in place; `settle` holds them for ever."""
+    filters = {int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)}
+    for i in range(model.nu):
+        if int(model.actuator_dyntype[i]) not in filters:
+            continue
+        limited = bool(model.actuator_ctrllimited[i])
+        target = np.clip(ctrl[..., i], *model.actuator_ctrlrange[i]) if limited else ctrl[..., i]
+        at = int(model.actuator_actadr[i])
+        keep = 0.0 if settle else float(np.exp(-dt / max(model.actuator_dynprm[i, 0], 1e-9)))
+        act[..., at] = target + keep * (act[..., at] - target)

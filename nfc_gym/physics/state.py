@@ -1,0 +1,103 @@
+"""Differences and sums of MuJoCo states in tangent space, over arrays with any leading batch shape.
+
+A configuration holds unit quaternions (free and ball joints), whose differences live in three numbers: the rotation vector
+in the body's own frame, as `mj_differentiatePos` and `mj_integratePos` have it.
+"""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def quat_multiply(a: Array, b: Array) -> Array:
+    """Hamilton product of quaternions (..., 4), scalar first."""
+    aw, ax, ay, az = np.moveaxis(a, -1, 0)
+    bw, bx, by, bz = np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
+
+
+def quat_conjugate(q: Array) -> Array:
+    """Inverse of unit quaternions (..., 4)."""
+    return q * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def quat_to_vector(q: Array) -> Array:
+    """Rotation vector (..., 3), rad, of unit quaternions (..., 4): the shorter way round."""
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    return q[..., 1:] * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1), 2.0)
+
+
+def vector_to_quat(v: Array) -> Array:
+    """Unit quaternions (..., 4) of rotation vectors (..., 3), rad."""
+    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    half = np.where(angle > 1e-12, np.sin(angle / 2) / np.where(angle > 1e-12, angle, 1), 0.5)
+    return np.concatenate([np.cos(angle / 2), half * v], -1)
+
+
+def quat_difference(a: Array, b: Array) -> Array:
+    """Rotation vector (..., 3) that takes `a` to `b`, in the frame of `a`."""
+    return quat_to_vector(quat_multiply(quat_conjugate(a), b))
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
+    w, u = q[..., :1], q[..., 1:]
+    t = 2 * np.cross(u, v)
+    return v + w * t + np.cross(u, t)
+
+
+def rotate_back(q: Array, v: Array) -> Array:
+    """Vectors (..., 3) rotated by the inverse of unit quaternions (..., 4): world to body."""
+    return rotate(quat_conjugate(q), v)
+
+
+def _blocks(model: mujoco.MjModel) -> tuple[NDArray[np.intp], NDArray[np.intp], list[tuple[int, int]]]:
+    """(coordinates, dofs) that subtract plainly, and (quaternion address, dof address) of the rotations."""
+    plain_q: list[int] = []
+    plain_v: list[int] = []
+    rotations: list[tuple[int, int]] = []
+    for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
+        if int(kind) == int(mujoco.mjtJoint.mjJNT_FREE):
+            plain_q += [q, q + 1, q + 2]
+            plain_v += [v, v + 1, v + 2]
+            rotations.append((int(q) + 3, int(v) + 3))
+        elif int(kind) == int(mujoco.mjtJoint.mjJNT_BALL):
+            rotations.append((int(q), int(v)))
+        else:
+            plain_q.append(int(q))
+            plain_v.append(int(v))
+    return np.array(plain_q, np.intp), np.array(plain_v, np.intp), rotations
+
+
+def difference(model: mujoco.MjModel, start: Array, end: Array) -> Array:
+    """Tangent vector (..., nv) that takes configuration `start` (..., nq) to `end` (..., nq) in unit time."""
+    plain_q, plain_v, rotations = _blocks(model)
+    shape = np.broadcast_shapes(start.shape[:-1], end.shape[:-1])
+    out = np.zeros((*shape, model.nv))
+    out[..., plain_v] = end[..., plain_q] - start[..., plain_q]
+    for q, v in rotations:
+        out[..., v : v + 3] = quat_difference(start[..., q : q + 4], end[..., q : q + 4])
+    return out
+
+
+def integrate(model: mujoco.MjModel, start: Array, step: Array) -> Array:
+    """Configuration (..., nq) reached from `start` (..., nq) by the tangent vector `step` (..., nv)."""
+    plain_q, plain_v, rotations = _blocks(model)
+    shape = np.broadcast_shapes(start.shape[:-1], step.shape[:-1])
+    out = np.broadcast_to(start, (*shape, model.nq)).copy()
+    out[..., plain_q] += step[..., plain_v]
+    for q, v in rotations:
+        out[..., q : q + 4] = quat_multiply(out[..., q : q + 4], vector_to_quat(step[..., v : v + 3]))
+    return out
