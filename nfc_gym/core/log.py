@@ -22,6 +22,7 @@ class Channel:
       smooth: measurement and prediction are compared after a centred moving average of so many samples.
       mask: (T,) bool, where the channel is compared; None is everywhere.
       axes: which components of a vector sensor the columns are; None is all of them.
+      rate: Hz at which the value is renewed where it is held between samples; None is every sample.
     """
 
     values: Array
@@ -30,6 +31,7 @@ class Channel:
     smooth: int = 1
     mask: NDArray[np.bool_] | None = None
     axes: tuple[int, ...] | None = None
+    rate: float | None = None
 
 
 @dataclass(frozen=True)

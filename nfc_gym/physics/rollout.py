@@ -44,6 +44,8 @@ class Segments:
       exogenous: name -> (S, H + K).
       known: (field, object names) -> (S, H + K) model fields that the log itself gives.
       servo: per `Servo`, its gain, supply and damping, (S, H + K) each.
+      settle: steps for which the first command is held before the start; velocities and hidden states are then kept, the
+        positions go back to the measured ones. 0 starts at the measured velocities.
     """
 
     dt: float
@@ -54,6 +56,7 @@ class Segments:
     exogenous: Mapping[str, Array] = field(default_factory=dict)
     known: Mapping[tuple[str, tuple[str, ...]], Array] = field(default_factory=dict)
     servo: Sequence[tuple[Servo, Mapping[str, Array]]] = ()
+    settle: int = 0
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -238,18 +241,15 @@ class _Run:
             advance_activations(model, self._command(k, self._exogenous(k)), batch.act, self.segments.dt, settle=k == -self.segments.history)
         qpos, qvel = np.empty((steps + 1, rows, model.nq)), np.empty((steps + 1, rows, model.nv))
         sensed = np.empty((steps + 1, rows, model.nsensordata)) if self.sensors else None
-        feedback = bool(self.rubbing or self.pushing)
+        if self.segments.settle:
+            start = batch.qpos.copy()
+            for k in range(self.segments.settle):
+                self._advance(0, first=k == 0)
+            batch.qpos[...] = start
+            batch.qacc_warmstart[...] = 0
         for k in range(steps):
-            exogenous = self._exogenous(k)
-            for bound, values in self.varying:
-                write_field(self.fields, bound, self._tile(values[:, self.segments.history + k]))
-            batch.ctrl[...] = self._serve(k, self._command(k, exogenous))
-            if k == 0:
-                self._start(bool(feedback or sensed is not None))
-            if feedback:
-                self._apply(Context(model, self.segments.dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, batch.bind, self._nominal))
             qpos[k], qvel[k] = batch.qpos, batch.qvel
-            batch.step()
+            self._advance(k, first=k == 0)
             if sensed is not None:
                 sensed[k] = batch.sensordata
         qpos[steps], qvel[steps] = batch.qpos, batch.qvel
@@ -258,12 +258,22 @@ class _Run:
             sensed[steps] = batch.sensordata
         return self._result(qpos, qvel, sensed)
 
-    def _start(self, forward: bool) -> None:
-        """Without a history actuator states begin settled; derived fields become current where hooks read them."""
-        if self.segments.history == 0:
-            advance_activations(self.plant.model, self.batch.ctrl, self.batch.act, self.segments.dt, settle=True)
-        if forward:
-            self.batch.forward()
+    def _advance(self, k: int, first: bool) -> None:
+        """One physics step under the command of step k."""
+        model, batch, exogenous = self.plant.model, self.batch, self._exogenous(k)
+        for bound, values in self.varying:
+            write_field(self.fields, bound, self._tile(values[:, self.segments.history + k]))
+        batch.ctrl[...] = self._serve(k, self._command(k, exogenous))
+        feedback = bool(self.rubbing or self.pushing)
+        if first:
+            # Without a history actuator states begin settled; derived fields become current where hooks read them.
+            if self.segments.history == 0 and self.segments.settle == 0:
+                advance_activations(model, batch.ctrl, batch.act, self.segments.dt, settle=True)
+            if feedback:
+                batch.forward()
+        if feedback:
+            self._apply(Context(model, self.segments.dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, batch.bind, self._nominal))
+        batch.step()
 
     def _result(self, qpos: Array, qvel: Array, sensed: Array | None) -> Trajectory:
         stable = np.isfinite(qpos).all((0, 2)) & np.isfinite(qvel).all((0, 2)) & (self.batch.warning[..., 1].sum(-1) == 0)

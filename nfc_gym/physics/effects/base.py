@@ -183,8 +183,8 @@ class Effect(ABC):
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         """Add generalised forces or body wrenches for the coming step."""
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array]) -> Array:
-        """Inverse mode: force that a motion needs of the actuators (..., nu) -> force that the nominal actuator would report."""
+    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        """Inverse mode: forces that a motion needs of the actuators along time (T, nu) -> forces that were commanded. theta (k,)."""
         return force
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:

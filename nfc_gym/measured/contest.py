@@ -1,0 +1,100 @@
+"""Which of several fitted candidates to believe: gains on logs they were not fitted to, under a moving-block bootstrap."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.metric import Metric, loss
+from nfc_gym.measured.problem import Problem
+
+Array = NDArray[np.float64]
+
+
+def clusters(problem: Problem, seconds: float = 1.0) -> NDArray[np.intp]:
+    """(S,) cluster of each block: blocks of one log within `seconds` of each other are not independent."""
+    keys = np.stack([problem.log_of, np.floor(problem.time_of / seconds)], 1)
+    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def bootstrap(values: Array, blocks: NDArray[np.intp], rng: np.random.Generator, draws: int = 2000) -> Array:
+    """(draws,) sums of per-block values (S,) over clusters drawn with replacement."""
+    sums = np.bincount(blocks, values)
+    picks = rng.integers(len(sums), size=(draws, len(sums)))
+    return sums[picks].sum(1)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A fitted candidate and how it did.
+
+    Attributes:
+      fitted: on the fit logs.
+      gains: (S,) drop of the loss per block of the selection logs against the model without it.
+      fit_gains: the same on the fit logs.
+      total: drop over both, less a penalty for each parameter.
+      lower: 0.5 % bootstrap quantile of the selection gain.
+    """
+
+    fitted: Fit
+    gains: Array
+    fit_gains: Array
+    total: float
+    lower: float
+
+    @property
+    def gain(self) -> float:
+        """Drop of the loss over the selection logs."""
+        return float(self.gains.sum())
+
+
+def losses(problem: Problem, metric: Metric, fitted: Fit) -> Array:
+    """(S,) loss of each block of a problem under a fitted model."""
+    return loss(metric.whiten(fitted_residual(problem, fitted)))[0]
+
+
+def fitted_residual(problem: Problem, fitted: Fit) -> Array:
+    """(1, S, m) residual under a fitted model."""
+    return problem.residual(fitted.plant, fitted.x[None])
+
+
+def judge(
+    fitted: Fit, base: Fit, select: Problem, metric: Metric, base_losses: Array, rng: np.random.Generator
+) -> Judged:
+    """Compare a fitted candidate with the model without it, on the selection logs."""
+    gains = base_losses - losses(select, metric, fitted)
+    fit_gains = base.losses - fitted.losses
+    extra = len(fitted.x) - len(base.x)
+    draws = bootstrap(gains, clusters(select), rng)
+    total = float(gains.sum() + fit_gains.sum()) - 2 * extra * dispersion(base)
+    return Judged(fitted, gains, fit_gains, total, float(np.quantile(draws, 0.005)))
+
+
+def dispersion(fitted: Fit) -> float:
+    """Loss per number that counts: about 1 where the metric describes the residual, the natural unit of a chance gain."""
+    count = max(int((fitted.white != 0).sum()), 1)
+    return max(float(fitted.losses.sum()) / count, 1e-6)
+
+
+def not_worse(best: Judged, other: Judged, blocks_fit: NDArray[np.intp], blocks_select: NDArray[np.intp], rng: np.random.Generator) -> bool:
+    """Whether `other` explains the data not significantly worse than `best` (2.5 % level, both sets of logs)."""
+    apart = np.concatenate([best.fit_gains - other.fit_gains, best.gains - other.gains])
+    blocks = np.concatenate([blocks_fit, blocks_select + int(blocks_fit.max()) + 1])
+    penalty = best.total - other.total - float(apart.sum())
+    draws = bootstrap(apart, blocks, rng) + penalty
+    return bool(np.quantile(draws, 0.025) <= 0)
+
+
+def shortlist(screened: Sequence, size: int = 8, each: int = 3) -> list:  # noqa: ANN401
+    """The best candidates with at most `each` of one family, so that one family's places do not crowd out the others."""
+    out, count = [], {}
+    for s in screened:
+        if s.gain <= 0 or count.get(s.effect.family, 0) >= each:
+            continue
+        count[s.effect.family] = count.get(s.effect.family, 0) + 1
+        out.append(s)
+        if len(out) == size:
+            break
+    return out

@@ -1,0 +1,81 @@
+"""Whitening and loss: how large a residual is, given the noise to be expected and what no model so far explains."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured.problem import Problem
+
+Array = NDArray[np.float64]
+_UNSTABLE = 30.0  # standard deviations that every number of an unstable block counts as
+_TURN = 3.0  # standard deviations at which the loss turns from squared to linear
+
+
+@dataclass(frozen=True)
+class Metric:
+    """Whitening of a problem's residuals.
+
+    Attributes:
+      inverse_root: (S, m, m) lower triangular, maps a block's residual to unit variance.
+      mask: (S, m) which numbers count.
+    """
+
+    inverse_root: Array
+    mask: NDArray[np.bool_]
+
+    def whiten(self, residual: Array) -> Array:
+        """(P, S, m) residuals in standard deviations; unstable blocks count as far off."""
+        white = np.einsum("sij,psj->psi", self.inverse_root, np.where(np.isfinite(residual), residual, 0.0))
+        bad = ~np.isfinite(residual).all(-1, keepdims=True)
+        return np.where(self.mask, np.where(bad, _UNSTABLE, white), 0.0)
+
+    def take(self, index: NDArray[np.intp]) -> "Metric":
+        """The metric of some of the blocks."""
+        return Metric(self.inverse_root[index], self.mask[index])
+
+
+def unexplained_variance(problem: Problem, residual: Array, sigma: Array) -> Array:
+    """(m,) variance of each column beyond what the noise explains, from the middle of the residuals' spread.
+
+    residual (S, m) and sigma (S, m, m) are those of the best model so far. Candidates of one round are compared under one
+    such variance, so that no model is flattered by a metric of its own.
+    """
+    values = np.where(problem.mask & np.isfinite(residual), residual, np.nan)
+    expected = np.where(problem.mask, np.einsum("sii->si", sigma), np.nan)
+    with np.errstate(invalid="ignore"):
+        spread = (1.4826 * np.nanmedian(np.abs(values), axis=0)) ** 2
+        heavy = np.nanmean(np.minimum(values**2, 9 * np.where(spread > 0, spread, np.inf)), axis=0)
+    found = np.fmax(np.fmax(spread, heavy) - np.nanmedian(expected, axis=0), 0.0)
+    return np.where(np.isfinite(found), found, 0.0)
+
+
+def metric(problem: Problem, sigma: Array, extra: Array | None = None) -> Metric:
+    """Metric of covariance sigma (S, m, m), plus independent variance `extra` (m,) of each column."""
+    width = sigma.shape[-1]
+    total = sigma.copy()
+    if extra is not None:
+        total[:, np.arange(width), np.arange(width)] += extra
+    masked = ~problem.mask
+    total = np.where(masked[:, :, None] | masked[:, None, :], 0.0, total)
+    diagonal = np.einsum("sii->si", total)
+    typical = np.where(masked, 1.0, np.maximum(diagonal, 1e-18))
+    scale = np.sqrt(typical)
+    unit = total / scale[:, :, None] / scale[:, None, :]
+    unit[:, np.arange(width), np.arange(width)] = np.where(masked, 1.0, 1.0 + 1e-6)
+    root = np.linalg.cholesky(unit)
+    inverse = np.linalg.inv(root) / scale[:, None, :]
+    return Metric(inverse, problem.mask)
+
+
+def loss(white: Array) -> Array:
+    """(..., S) loss of whitened residuals (..., S, m): squared near zero, linear far out (Huber's idea, smooth)."""
+    return (2 * _TURN**2 * (np.sqrt(1 + (white / _TURN) ** 2) - 1)).sum(-1)
+
+
+def loss_weight(white: Array) -> Array:
+    """Square root of the weight that the loss gives each residual in a linearised fit."""
+    return (1 + (white / _TURN) ** 2) ** -0.25
+
+
+TURN = _TURN

@@ -1,0 +1,278 @@
+"""What a model is asked to explain: residuals of S blocks with m numbers each, and the noise to be expected in them.
+
+Three kinds share one face: roll-outs from measured starts (here), actuator forces that a measured motion needs, and sensors
+at measured states and commands (`instant`). The search above them never asks which it has.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.log import Log
+from nfc_gym.measured.observe import Observer, observer
+from nfc_gym.measured.segments import Cut, Layout, cut, lay
+from nfc_gym.measured.states import States, channel_noise
+from nfc_gym.physics.effects.base import overrides
+from nfc_gym.physics.rollout import Plant, Segments, Servo, Trajectory
+from nfc_gym.physics.state import integrate, vector_to_quat, quat_multiply
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What the m numbers of a block are: report group, unit, seconds after the start, and the place in the model."""
+
+    group: tuple[str, ...]
+    unit: tuple[str, ...]
+    horizon: Array
+    place: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.group)
+
+
+class Problem(ABC):
+    """Measured blocks against predictions.
+
+    Attributes:
+      columns: the meaning of the m numbers.
+      mask: (S, m) where a number is compared.
+      log_of: (S,) index of the log each block is from; blocks of a log are in order of time.
+      names: names of the logs.
+    """
+
+    columns: Columns
+    mask: NDArray[np.bool_]
+    log_of: NDArray[np.intp]
+    names: tuple[str, ...]
+    time_of: Array
+
+    def __len__(self) -> int:
+        return len(self.log_of)
+
+    @abstractmethod
+    def residual(self, plant: Plant, x: Array) -> Array:
+        """measured - predicted (P, S, m) for parameter vectors x (P, size); 0 where masked, NaN where unstable."""
+
+    @abstractmethod
+    def covariance(self, plant: Plant, x: Array) -> Array:
+        """(S, m, m) of the residual that a perfect model would leave at x (size,)."""
+
+    @abstractmethod
+    def take(self, index: NDArray[np.intp]) -> "Problem":
+        """The problem of some of the blocks."""
+
+    @abstractmethod
+    def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "Problem":
+        """The same experiment as if the model at x (size,) were the machine: fresh noise, no unknown effect."""
+
+
+def interpolate(grid: Array, step: Array, quaternion: bool) -> Array:
+    """Values (P, S, K + 1, dim) on the physics grid at steps (S, h), linearly: (P, S, h, dim)."""
+    low = np.clip(np.floor(step + 1e-9).astype(int), 0, grid.shape[2] - 2)
+    part = np.clip(step - low, 0, 1)[None, :, :, None]
+    block = np.arange(grid.shape[1])[:, None]
+    out = grid[:, block, low] * (1 - part) + grid[:, block, low + 1] * part
+    return out / np.linalg.norm(out, axis=-1, keepdims=True) if quaternion else out
+
+
+@dataclass(frozen=True)
+class _Kit:
+    """What a roll-out problem is made of, kept to lay it out again at another time step."""
+
+    model: mujoco.MjModel
+    logs: tuple[Log, ...]
+    states: tuple[States, ...]
+    layout: Layout
+    servos: Mapping[str, Servo]
+    linear: frozenset[str]
+    settle: bool
+
+
+class RolloutProblem(Problem):
+    """Segments that start at measured states; states are compared at several horizons."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        logs: Sequence[Log],
+        states: Sequence[States],
+        layout: Layout,
+        servos: Mapping[str, Servo] | None = None,
+        linear: frozenset[str] = frozenset(),
+        settle: bool = False,
+    ) -> None:
+        where = cut(logs, layout)
+        self._kit = _Kit(model, tuple(logs), tuple(states), layout, servos or {}, linear, settle)
+        self._observers = [
+            o for key, c in logs[0].channels.items() if (o := observer(model, key, c.axes)) is not None
+        ]
+        self.names = tuple(log.name for log in logs)
+        self._place(where, None)
+
+    def _place(self, where: Cut, measured: list[Array] | None) -> None:
+        kit = self._kit
+        self._where, self.log_of = where, where.log
+        self.time_of = np.array([kit.logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)])
+        segments = lay(kit.model, kit.logs, kit.states, where, kit.layout, kit.servos, kit.linear)
+        self.segments = replace(segments, settle=round(0.5 / kit.layout.dt) if kit.settle else 0)
+        self._start_sd = [
+            np.stack([getattr(kit.states[i], name)[s] for i, s in zip(where.log, where.start, strict=True)]) for name in ("qpos_sd", "qvel_sd")
+        ]
+        take = lambda o: np.stack([kit.logs[i].channels[o.name].values.reshape(len(kit.logs[i]), -1)[n] for i, n in zip(where.log, where.samples, strict=True)])  # noqa: E731
+        self._measured = measured if measured is not None else [take(o) for o in self._observers]
+        noise = [np.array([channel_noise(log, o.name) for log in kit.logs])[where.log] for o in self._observers]
+        horizons = len(kit.layout.horizons)
+        self._noise = np.concatenate([np.repeat(n[:, None], horizons * o.size, 1) for n, o in zip(noise, self._observers, strict=True)], 1)
+        self.mask = np.isfinite(np.concatenate([self._flat(o.difference(m, m), o) for m, o in zip(self._measured, self._observers, strict=True)], -1))
+        self.columns = self._describe()
+
+    @staticmethod
+    def _flat(difference: Array, o: Observer) -> Array:
+        return difference.reshape(*difference.shape[:-2], -1)
+
+    def _describe(self) -> Columns:
+        group, unit, horizon, place = [], [], [], []
+        for o in self._observers:
+            for h in self._kit.layout.horizons:
+                for _ in range(o.size):
+                    group.append(o.group)
+                    unit.append(o.unit)
+                    horizon.append(h)
+                    place.append(o.place)
+        return Columns(tuple(group), tuple(unit), np.array(horizon), tuple(place))
+
+    @property
+    def observers(self) -> list[Observer]:
+        """The compared channels, in the order of the columns."""
+        return self._observers
+
+    def predict(self, plant: Plant, x: Array, segments: Segments, observers: Sequence[Observer]) -> tuple[list[Array], Trajectory]:
+        """What each channel would report along a roll-out, (P, S, K + 1, dim) each, sensor effects included."""
+        traj = plant.shoot(x, segments, sensors=any(o.needs_sensors for o in observers))
+        thetas = plant.split(x)[1]
+        out = []
+        for o in observers:
+            values = o.predict(traj)
+            for effect, theta in zip(plant.effects, thetas, strict=True):
+                if overrides(effect, "sense"):
+                    values = effect.sense(o.name, values, theta[:, None, :] if theta.ndim == 2 else theta, segments.dt)
+            out.append(values)
+        return out, traj
+
+    def _compare(self, plant: Plant, x: Array, segments: Segments, measured: Sequence[Array], step: Array, mask: NDArray[np.bool_]) -> Array:
+        values, traj = self.predict(plant, x, segments, self._observers)
+        parts = [
+            self._flat(o.difference(interpolate(v, step, o.quaternion), m), o)
+            for o, v, m in zip(self._observers, values, measured, strict=True)
+        ]
+        residual = np.where(mask, np.concatenate(parts, -1), 0.0)
+        return np.where(traj.stable[..., None], residual, np.nan)
+
+    def residual(self, plant: Plant, x: Array) -> Array:
+        """See `Problem`."""
+        return self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
+
+    def covariance(self, plant: Plant, x: Array) -> Array:
+        """Sensor noise, start-state noise carried through the roll-out, and the discretisation's own error."""
+        size, width = len(self), len(self.columns)
+        sigma = np.zeros((size, width, width))
+        sigma[:, np.arange(width), np.arange(width)] = np.where(self.mask, self._noise**2, 1.0)
+        base = self.residual(plant, x[None])[0]
+        carried = self._carried(plant, x, base)
+        discretised = self._halved(plant, x) - base
+        for column in [*carried, discretised]:
+            column = np.where(np.isfinite(column), column, 0.0)
+            sigma += column[:, :, None] * column[:, None, :]
+        return sigma
+
+    def _carried(self, plant: Plant, x: Array, base: Array) -> list[Array]:
+        """Change of the residual for one standard deviation of each start coordinate, (S, m) each."""
+        model, seg = self._kit.model, self.segments
+        directions = [(kind, d) for kind in (0, 1) for d in range(model.nv) if (self._start_sd[kind][:, d] > 0).any()]
+        if not directions:
+            return []
+        starts_q, starts_v = [], []
+        for kind, d in directions:
+            step = np.zeros((len(self), model.nv))
+            step[:, d] = self._start_sd[kind][:, d]
+            starts_q.append(integrate(model, seg.qpos, step) if kind == 0 else seg.qpos)
+            starts_v.append(seg.qvel + step if kind == 1 else seg.qvel)
+        n = len(directions)
+        repeated = _repeat(seg, n, np.concatenate(starts_q), np.concatenate(starts_v))
+        measured = [np.concatenate([m] * n) for m in self._measured]
+        moved = self._compare(plant, x[None], repeated, measured, np.concatenate([self._where.step] * n), np.concatenate([self.mask] * n))
+        return list(moved[0].reshape(n, len(self), -1) - base)
+
+    def _halved(self, plant: Plant, x: Array) -> Array:
+        """Residual with the physics step halved."""
+        import copy
+
+        model = copy.copy(plant.model)
+        model.opt.timestep = plant.model.opt.timestep / 2
+        fine = Plant(model, plant.space, plant.effects, plant.nthread)
+        segments = _refine(self.segments)
+        return self._compare(fine, x[None], segments, self._measured, self._where.step * 2, self.mask)[0]
+
+    def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
+        """See `Problem`."""
+        out = object.__new__(RolloutProblem)
+        out.__dict__.update(self.__dict__)
+        w = self._where
+        out._where = Cut(w.log[index], w.start[index], w.samples[index], w.step[index])
+        out.log_of, out.time_of = self.log_of[index], self.time_of[index]
+        out.segments = _pick(self.segments, index)
+        out._start_sd = [s[index] for s in self._start_sd]
+        out._measured = [m[index] for m in self._measured]
+        out._noise, out.mask = self._noise[index], self.mask[index]
+        return out
+
+    def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "RolloutProblem":
+        """The model's own motion from the measured starts, with fresh start and sensor noise."""
+        values, traj = self.predict(plant, x[None], self.segments, self._observers)
+        out = self.take(np.flatnonzero(traj.stable[0]))
+        stable, step = traj.stable[0], self._where.step
+        measured = []
+        at = 0
+        for o, v, m in zip(self._observers, values, self._measured, strict=True):
+            clean = interpolate(v, step, o.quaternion)[0]
+            width = m.shape[1] * o.size
+            noise = rng.normal(size=(*m.shape[:2], o.size)) * self._noise[:, at : at + width].reshape(*m.shape[:2], o.size)
+            noisy = quat_multiply(clean, vector_to_quat(noise)) if o.quaternion else clean + noise
+            measured.append(noisy[stable])
+            at += width
+        dq, dv = (rng.normal(size=sd.shape) * sd for sd in out._start_sd)
+        out._measured = measured
+        out.segments = replace(out.segments, qpos=integrate(self._kit.model, out.segments.qpos, dq), qvel=out.segments.qvel + dv)
+        return out
+
+
+def _map(segments: Segments, rows, qpos: Array, qvel: Array) -> Segments:  # noqa: ANN001
+    return replace(
+        segments,
+        qpos=qpos,
+        qvel=qvel,
+        ctrl=rows(segments.ctrl),
+        exogenous={k: rows(v) for k, v in segments.exogenous.items()},
+        known={k: rows(v) for k, v in segments.known.items()},
+        servo=[(law, {n: rows(v) for n, v in terms.items()}) for law, terms in segments.servo],
+    )
+
+
+def _pick(segments: Segments, index: NDArray[np.intp]) -> Segments:
+    return _map(segments, lambda a: a[index], segments.qpos[index], segments.qvel[index])
+
+
+def _repeat(segments: Segments, n: int, qpos: Array, qvel: Array) -> Segments:
+    return _map(segments, lambda a: np.concatenate([a] * n), qpos, qvel)
+
+
+def _refine(segments: Segments) -> Segments:
+    """The same segments on a grid of half the step; commands are held, as on the coarse grid."""
+    fine = _map(segments, lambda a: np.repeat(a, 2, axis=1), segments.qpos, segments.qvel)
+    return replace(fine, dt=segments.dt / 2, history=2 * segments.history, settle=2 * segments.settle)

@@ -1,0 +1,136 @@
+"""Screening: which candidate effects could explain the residual, judged at realistic sizes with psi projected out.
+
+A secant instead of a derivative: delay, dry friction and saturation have no useful derivative at zero (LOOP.md's score test).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.metric import Metric, loss_weight
+from nfc_gym.measured.problem import Problem
+from nfc_gym.physics.effects.base import Effect
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Screened:
+    """One candidate after screening.
+
+    Attributes:
+      effect: the candidate.
+      gain: drop of the (weighted, squared) loss that its best linear combination reaches, psi and accepted effects refitted.
+      theta: (k,) parameters to start a fit from.
+      columns: (n, k') projected whitened change at the probe that did best, for the identifiability table.
+      probe: (k',) size of the probed parameters.
+    """
+
+    effect: Effect
+    gain: float
+    theta: Array
+    columns: Array
+    probe: Array
+
+
+def probe_sets(effect: Effect) -> list[Array]:
+    """Sets of realistic parameter vectors, (k', k) each: one row for each sizing parameter, sharing the shape parameters."""
+    sizing = [i for i, p in enumerate(effect.params) if not p.shape]
+    shaping = [i for i, p in enumerate(effect.params) if p.shape]
+    ranks = max(len(effect.params[i].probes) for i in sizing)
+    sets = []
+    for shape in product(*(effect.params[i].probes for i in shaping)):
+        for rank in range(ranks):
+            rows = np.repeat(effect.null[None], len(sizing), 0)
+            rows[:, shaping] = shape
+            for row, i in zip(rows, sizing, strict=True):
+                probes = effect.params[i].probes
+                row[i] = probes[min(rank, len(probes) - 1)]
+            sets.append(rows)
+    return sets
+
+
+class Screen:
+    """Screening against one fitted model: its residual, weights, and the tangent space of what is already fitted."""
+
+    def __init__(self, problem: Problem, metric: Metric, current: Fit) -> None:
+        self.problem, self.metric, self.current = problem, metric, current
+        self.weight = loss_weight(current.white)
+        self.target = (self.weight * current.white).ravel()
+        tangent = (self.weight[..., None] * current.jacobian).reshape(len(self.target), -1)
+        norms = np.linalg.norm(tangent, axis=0)
+        tangent = tangent[:, norms > 1e-9] / norms[norms > 1e-9]
+        self.basis = np.linalg.svd(tangent, full_matrices=False)[0] if tangent.size else np.zeros((len(self.target), 0))
+        self.projected = self.project(self.target)
+
+    def project(self, a: Array) -> Array:
+        """Remove from (n,) or (n, k) what the fitted parameters can produce."""
+        return a - self.basis @ (self.basis.T @ a)
+
+    def try_one(self, effect: Effect) -> Screened:
+        """Probe one candidate at all its sizes in one batch."""
+        sets = probe_sets(effect)
+        plant = self.current.plant.with_effects([*self.current.plant.effects, effect])
+        rows = np.concatenate(sets)
+        x = np.concatenate([np.repeat(self.current.x[None], len(rows), 0), rows], 1)
+        white = self.metric.whiten(self.problem.residual(plant, x))
+        change = (self.weight * (white - self.current.white)).reshape(len(rows), -1).T
+        best = Screened(effect, 0.0, sets[0][0], np.zeros((len(self.target), 0)), np.zeros(0))
+        at = 0
+        for probe in sets:
+            columns = self.project(change[:, at : at + len(probe)])
+            at += len(probe)
+            gain, theta = self._combine(effect, probe, columns)
+            if gain > best.gain or best.columns.shape[1] == 0:
+                sizes = (probe - effect.null)[np.arange(len(probe)), [i for i, p in enumerate(effect.params) if not p.shape]]
+                best = Screened(effect, gain, theta, columns, sizes)
+        return best
+
+    def _combine(self, effect: Effect, probe: Array, columns: Array) -> tuple[float, Array]:
+        """Best multiples of the probes within the parameters' bounds, and what they gain."""
+        norms = np.linalg.norm(columns, axis=0)
+        if not (norms > 1e-9).any():
+            return 0.0, probe[0]
+        solution = np.linalg.lstsq(columns / np.maximum(norms, 1e-12), -self.projected, rcond=1e-6)[0] / np.maximum(norms, 1e-12)
+        sizing = [i for i, p in enumerate(effect.params) if not p.shape]
+        size = (probe - effect.null)[np.arange(len(probe)), sizing]
+        low, high = (effect.low - effect.null)[sizing] / size, (effect.high - effect.null)[sizing] / size
+        low, high = np.minimum(low, high), np.maximum(low, high)
+        multiple = np.clip(solution, np.maximum(low, -4.0), np.minimum(high, 4.0))
+        after = self.projected + columns @ multiple
+        gain = float(self.projected @ self.projected - after @ after)
+        theta = probe[0].copy()
+        theta[sizing] = effect.null[sizing] + multiple * size
+        return gain, np.clip(theta, effect.low, effect.high)
+
+    def chance(self, found: Sequence[Screened], blocks: NDArray[np.intp], rng: np.random.Generator, draws: int = 99) -> Array:
+        """(draws,) best gain over all candidates when every block of the residual takes a random sign.
+
+        A residual whose sign is random from block to block holds no effect, yet the best of many candidates gains from it:
+        that is the gain to be beaten.
+        """
+        width = self.current.white.shape[1]
+        signs = rng.choice([-1.0, 1.0], (draws, int(blocks.max()) + 1))[:, blocks]
+        targets = (signs[:, :, None] * self.projected.reshape(-1, width)).reshape(draws, -1)
+        best = np.zeros(draws)
+        for s in found:
+            if s.columns.shape[1]:
+                q, r = np.linalg.qr(s.columns)
+                keep = np.abs(np.diag(r)) > 1e-9
+                best = np.maximum(best, ((targets @ q[:, keep]) ** 2).sum(1))
+        return best
+
+
+def screen_all(
+    screen: Screen, candidates: Sequence[Effect], tick: Callable[[Effect], None] = lambda e: None
+) -> list[Screened]:
+    """Screen every candidate, best gain first."""
+    out = []
+    for effect in candidates:
+        tick(effect)
+        out.append(screen.try_one(effect))
+    return sorted(out, key=lambda s: -s.gain)

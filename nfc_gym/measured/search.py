@@ -1,0 +1,215 @@
+"""The search for what a model lacks: calibrate psi, screen all candidates, refit the best, select on held-out logs, repeat.
+
+Method and its reasons: Kennedy and O'Hagan (2001) for the discrepancy that must not be credited to psi; score tests with
+secants for the screening; a moving-block bootstrap (Kuensch 1989) for what is believed.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured.contest import Judged, clusters, judge, losses, not_worse, shortlist
+from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.metric import Metric, metric, unexplained_variance
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.screen import Screen, Screened, screen_all
+from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.each import split
+from nfc_gym.physics.rollout import Plant
+
+Array = NDArray[np.float64]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Knobs of a search.
+
+    Attributes:
+      most: effects at most.
+      worth: share of the excess that an effect must explain to be named.
+      short: candidates refitted in each round.
+      seed: of bootstrap and chance draws.
+    """
+
+    most: int = 6
+    worth: float = 0.02
+    short: int = 8
+    seed: int = 0
+
+
+@dataclass
+class Round:
+    """What one round of the search saw, for the report."""
+
+    accepted: str | None
+    share: float
+    ranking: list[dict] = field(default_factory=list)
+    equivalents: list[str] = field(default_factory=list)
+    reason: str = ""
+
+
+@dataclass
+class Found:
+    """Outcome of a search.
+
+    Attributes:
+      calibrated: psi alone, fitted.
+      extended: psi and the accepted effects, fitted.
+      rounds: in order, the last one being the round that accepted nothing.
+      generic: a generic alternative that beat every named effect, or None.
+      screened: the last round's screening, from which the identifiability table is made.
+      metric: the whitening of the last round on the fit logs.
+    """
+
+    calibrated: Fit
+    extended: Fit
+    rounds: list[Round]
+    generic: Judged | None
+    screened: list[Screened]
+    metric: Metric
+    screen: Screen
+
+
+@dataclass
+class Data:
+    """A problem with its noise covariance at the calibrated model."""
+
+    problem: Problem
+    sigma: Array
+
+
+class Search:
+    """One greedy search on fit and selection problems."""
+
+    def __init__(self, fit_data: Data, select: Data, plant: Plant, candidates: Sequence[Effect], options: Options, say: Say) -> None:
+        self.fit_data, self.select, self.plant = fit_data, select, plant
+        self.candidates, self.options, self.say = list(candidates), options, say
+        self.rng = np.random.default_rng(options.seed)
+        self.fit_blocks, self.select_blocks = clusters(fit_data.problem), clusters(select.problem)
+
+    def metrics(self, current: Fit) -> tuple[Metric, Metric]:
+        """Common metrics of a round, with what the current model leaves unexplained as extra variance."""
+        residual = self.fit_data.problem.residual(current.plant, current.x[None])[0]
+        extra = unexplained_variance(self.fit_data.problem, residual, self.fit_data.sigma)
+        return metric(self.fit_data.problem, self.fit_data.sigma, extra), metric(self.select.problem, self.select.sigma, extra)
+
+    def refit(self, current: Fit, under: Metric, plant: Plant | None = None, start: Array | None = None, rounds: int = 15) -> Fit:
+        """Full refit of every parameter under a metric."""
+        plant, start = plant or current.plant, current.x if start is None else start
+        return fit(self.fit_data.problem, under, plant, start, rounds)
+
+    def run(self, calibrated: Fit) -> Found:
+        """Greedy rounds from a calibrated model until nothing more is believed."""
+        current, rounds = calibrated, []
+        generic: Judged | None = None
+        while True:
+            fit_metric, select_metric = self.metrics(current)
+            current = self.refit(current, fit_metric, rounds=6)
+            screen = Screen(self.fit_data.problem, fit_metric, current)
+            screened = self._screen(screen, current)
+            outcome, best, generic = self._round(screen, screened, current, fit_metric, select_metric)
+            rounds.append(outcome)
+            if best is None or len(current.plant.effects) >= self.options.most:
+                return Found(calibrated, current, rounds, generic, screened, fit_metric, screen)
+            current = self._prune(self.refit(best.fitted, fit_metric), fit_metric, select_metric)
+
+    def _screen(self, screen: Screen, current: Fit) -> list[Screened]:
+        taken = {e.id for e in current.plant.effects}
+        left = [e for e in self.candidates if e.id not in taken]
+        self.say(f"screening {len(left)} candidates")
+        return screen_all(screen, left)
+
+    def _round(
+        self, screen: Screen, screened: list[Screened], current: Fit, fit_metric: Metric, select_metric: Metric
+    ) -> tuple[Round, Judged | None, Judged | None]:
+        """Refit the shortlist, judge it on the selection logs, and decide."""
+        chance = float(np.quantile(screen.chance(screened, self.fit_blocks, self.rng), 0.99))
+        base_losses = losses(self.select.problem, select_metric, current)
+        judged: list[Judged] = []
+        for s in shortlist(screened, self.options.short):
+            self.say(f"refitting {s.effect.id}")
+            judged.append(self._try(current, [*current.plant.effects, s.effect], s.theta, screen, fit_metric, select_metric, base_losses))
+        for effect in current.plant.effects:
+            parts = split(effect, current.plant)
+            if parts is not None:
+                judged.append(self._try_split(current, effect, parts, fit_metric, select_metric, base_losses))
+        judged.sort(key=lambda j: -j.total)
+        ranking = [self._row(j, current) for j in judged]
+        outcome = Round(None, 0.0, ranking)
+        named = [j for j in judged if not self._newest(j, current).generic]
+        if not named:
+            outcome.reason = "no candidate reduces the misfit"
+            return outcome, None, None
+        generics = [j for j in judged if self._newest(j, current).generic and self._believed(j, chance, current, base_losses)]
+        best = named[0]
+        if generics and generics[0].total > best.total and not not_worse(generics[0], best, self.fit_blocks, self.select_blocks, self.rng) and generics[0].total > 1.25 * best.total:
+            outcome.reason = f"{self._newest(generics[0], current).id} explains clearly more than any named effect"
+            return outcome, None, generics[0]
+        if not self._believed(best, chance, current, base_losses):
+            outcome.reason = f"the best candidate, {self._newest(best, current).id}, gains no more on unseen logs than chance"
+            return outcome, None, None
+        outcome.accepted = self._newest(best, current).id
+        outcome.share = best.gain / max(float(base_losses.sum()), 1e-9)
+        outcome.equivalents = [
+            self._newest(j, current).id for j in named[1:] if j.gain > 0 and not_worse(best, j, self.fit_blocks, self.select_blocks, self.rng)
+        ]
+        self.say(f"accepted {outcome.accepted}")
+        return outcome, best, None
+
+    def _try(
+        self, current: Fit, effects: Sequence[Effect], theta: Array, screen: Screen, fit_metric: Metric, select_metric: Metric, base_losses: Array
+    ) -> Judged:
+        plant = current.plant.with_effects(effects)
+        fitted = fit(self.fit_data.problem, fit_metric, plant, np.concatenate([current.x, theta]), 10, known=current.jacobian)
+        return judge(fitted, current, self.select.problem, select_metric, base_losses, self.rng)
+
+    def _try_split(self, current: Fit, effect: Effect, parts: tuple[Effect, Array], fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
+        """The same effect with a value of its own at each place."""
+        each, copies = parts
+        psi, thetas = current.plant.split(current.x)
+        pieces: list[Array] = [psi]
+        effects: list[Effect] = []
+        for e, theta in zip(current.plant.effects, thetas, strict=True):
+            effects.append(each if e is effect else e)
+            pieces.append(theta[copies] if e is effect else theta)
+        self.say(f"refitting {each.id} with values of its own at each place")
+        fitted = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(effects), np.concatenate(pieces), 8)
+        return judge(fitted, current, self.select.problem, select_metric, base_losses, self.rng)
+
+    def _believed(self, j: Judged, chance: float, current: Fit, base_losses: Array) -> bool:
+        worth = self.options.worth * float(base_losses.sum())
+        return j.lower > 0 and j.gain > worth and float(j.fit_gains.sum()) > chance
+
+    @staticmethod
+    def _newest(j: Judged, current: Fit) -> Effect:
+        before = set(map(id, current.plant.effects))
+        return next(e for e in j.fitted.plant.effects if id(e) not in before)
+
+    def _row(self, j: Judged, current: Fit) -> dict:
+        effect = self._newest(j, current)
+        theta = j.fitted.plant.split(j.fitted.x)[1][j.fitted.plant.effects.index(effect)]
+        return {
+            "id": effect.id,
+            "gain_fit": float(j.fit_gains.sum()),
+            "gain_select": j.gain,
+            "gain_select_low": j.lower,
+            "generic": effect.generic,
+            "sentence": effect.say(theta),
+        }
+
+    def _prune(self, current: Fit, fit_metric: Metric, select_metric: Metric) -> Fit:
+        """Drop earlier effects that the later ones have made superfluous."""
+        for effect in list(current.plant.effects[:-1]):
+            rest = [e for e in current.plant.effects if e is not effect]
+            psi, thetas = current.plant.split(current.x)
+            start = np.concatenate([psi, *(t for e, t in zip(current.plant.effects, thetas, strict=True) if e is not effect)])
+            without = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(rest), start, 8)
+            base = losses(self.select.problem, select_metric, without)
+            kept = judge(current, without, self.select.problem, select_metric, base, self.rng)
+            if kept.lower <= 0 or kept.gain < self.options.worth * float(base.sum()):
+                self.say(f"dropped {effect.id}: the others explain what it did")
+                current = without
+        return current

@@ -1,0 +1,152 @@
+"""Cutting logs into segments: starts, commands on the grid of physics steps, and where the samples fall on that grid."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.log import Log
+from nfc_gym.measured.states import States
+from nfc_gym.physics.rollout import Segments, Servo
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How logs are cut.
+
+    Attributes:
+      length: s, of a segment.
+      history: s of commands before its start.
+      horizons: s after the start at which prediction and measurement are compared.
+      stride: s between starts; the length where segments follow each other.
+      dt: physics step, s.
+    """
+
+    length: float
+    history: float
+    horizons: tuple[float, ...]
+    stride: float
+    dt: float
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Where each of S segments lies in its log.
+
+    Attributes:
+      log: (S,) index of the log.
+      start: (S,) sample at which the segment starts.
+      samples: (S, h) sample nearest to each horizon.
+      step: (S, h) the samples' times on the physics grid, in steps after the start (not whole numbers).
+    """
+
+    log: NDArray[np.intp]
+    start: NDArray[np.intp]
+    samples: NDArray[np.intp]
+    step: Array
+
+
+def cut(logs: Sequence[Log], layout: Layout) -> Cut:
+    """Place segments end to end in every log that is long enough.
+
+    Raises:
+      InputError: no log holds even one segment.
+    """
+    which, starts, samples, steps = [], [], [], []
+    for i, log in enumerate(logs):
+        last = log.time[-1] - max(layout.horizons) + 0.5 * log.interval
+        for begin in np.arange(0.0, max(last, 0.0) + 1e-9, layout.stride) if last >= 0 else ():
+            s = int(np.searchsorted(log.time, begin - 1e-9))
+            near = np.abs(log.time[:, None] - (log.time[s] + np.array(layout.horizons))).argmin(0)
+            which.append(i)
+            starts.append(s)
+            samples.append(near)
+            steps.append((log.time[near] - log.time[s]) / layout.dt)
+    if not which:
+        longest = max(log.duration for log in logs)
+        raise InputError(
+            f"no log is long enough for one segment of {max(layout.horizons):g} s (the longest has {longest:.3g} s): shorten segments.length"
+        )
+    return Cut(np.array(which), np.array(starts), np.array(samples), np.array(steps))
+
+
+def resample(time: Array, values: Array, at: Array, linear: bool) -> Array:
+    """A sampled signal (T,) at other times: held from the last sample, or interpolated; its ends are held."""
+    if linear:
+        return np.interp(at, time, values)
+    return values[np.clip(np.searchsorted(time, at + 1e-9, side="right") - 1, 0, len(time) - 1)]
+
+
+def servos(model: mujoco.MjModel, laws: Mapping[str, tuple[str, float]]) -> dict[str, Servo]:
+    """`ctrl:<actuator>` -> (joint, limit) bound to the model's addresses."""
+    out = {}
+    for control, (joint, limit) in laws.items():
+        j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+        a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, control.removeprefix("ctrl:"))
+        out[control] = Servo(a, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), limit)
+    return out
+
+
+def lay(
+    model: mujoco.MjModel,
+    logs: Sequence[Log],
+    states: Sequence[States],
+    where: Cut,
+    layout: Layout,
+    laws: Mapping[str, Servo],
+    linear: frozenset[str] = frozenset(),
+) -> Segments:
+    """Lay cut segments on the physics grid.
+
+    Args:
+      laws: firmware servos by control.
+      linear: controls that are interpolated between samples rather than held.
+    """
+    before = round(layout.history / layout.dt)
+    after = int(np.ceil(where.step.max() - 1e-6)) + 1
+    offsets = np.arange(-before, after) * layout.dt
+    starts = [logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)]
+
+    def lane(pick: str, key: str, straight: bool = False) -> Array:
+        return np.stack(
+            [
+                resample(logs[i].time, getattr(logs[i], pick)[key], t + offsets, straight)
+                for i, t in zip(where.log, starts, strict=True)
+            ]
+        )
+
+    ctrl = np.zeros((len(where.log), len(offsets), model.nu))
+    for key in logs[0].controls:
+        a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, key.removeprefix("ctrl:"))
+        ctrl[:, :, a] = lane("controls", key, key in linear)
+    known = {}
+    for key in logs[0].known:
+        name, _, of = key.rpartition(":")
+        known[(name, tuple(of.split("+")) if of else ())] = lane("known", key)
+    servo = []
+    for key, law in laws.items():
+        terms = {
+            n: np.stack(
+                [
+                    resample(logs[i].time, logs[i].servo[key][n], t + offsets, False)
+                    for i, t in zip(where.log, starts, strict=True)
+                ]
+            )
+            for n in ("gain", "supply", "damping")
+        }
+        servo.append((law, terms))
+    return Segments(
+        dt=layout.dt,
+        history=before,
+        qpos=np.stack([states[i].qpos[s] for i, s in zip(where.log, where.start, strict=True)]),
+        qvel=np.stack([states[i].qvel[s] for i, s in zip(where.log, where.start, strict=True)]),
+        ctrl=ctrl,
+        exogenous={k: lane("exogenous", k) for k in logs[0].exogenous},
+        known=known,
+        servo=servo,
+    )

@@ -1,0 +1,87 @@
+"""Local polynomial regression of a sampled signal: value, slope and curvature with their noise gain, and its noise level."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Local:
+    """A local polynomial at the wanted times, T of them, of a signal with k columns.
+
+    Attributes:
+      value, slope, curvature: (T, k), in the unit, unit/s and unit/s^2.
+      value_gain, slope_gain: (T,) standard deviation of value and slope for unit noise on the samples.
+    """
+
+    value: Array
+    slope: Array
+    curvature: Array
+    value_gain: Array
+    slope_gain: Array
+
+
+def local_polynomial(time: Array, values: Array, at: Array, points: int = 7, degree: int = 3) -> Local:
+    """Fit a polynomial to the `points` samples nearest each time of `at`.
+
+    Args:
+      time: (N,) s, increasing.
+      values: (N, k).
+      at: (T,) s.
+      points: samples in each fit; fewer where the signal is shorter.
+      degree: of the polynomial, lowered to leave at least one sample more than coefficients.
+    """
+    points = min(points, len(time))
+    degree = max(min(degree, points - 2), 0)
+    middle = np.searchsorted(time, at)
+    first = np.clip(middle - points // 2, 0, len(time) - points)
+    window = first[:, None] + np.arange(points)
+    span = np.maximum(time[window[:, -1]] - time[window[:, 0]], 1e-12)
+    scaled = (time[window] - at[:, None]) / span[:, None]
+    basis = scaled[..., None] ** np.arange(degree + 1)
+    solve = np.linalg.pinv(basis)  # (T, degree + 1, points)
+    fitted = solve @ values[window]
+    rows = [fitted[:, i] if i <= degree else np.zeros_like(fitted[:, 0]) for i in range(3)]
+    gain = np.linalg.norm(solve, axis=-1)
+    slope_gain = gain[:, 1] / span if degree >= 1 else np.zeros(len(at))
+    return Local(rows[0], rows[1] / span[:, None], 2 * rows[2] / span[:, None] ** 2, gain[:, 0], slope_gain)
+
+
+def fresh_samples(time: Array, values: Array, rate: float | None) -> NDArray[np.intp]:
+    """Indices at which a signal that is held between updates was renewed; every index where no `rate` (Hz) is given."""
+    if rate is None or rate <= 0:
+        return np.arange(len(time))
+    columns = values.reshape(len(time), -1)
+    changed = np.flatnonzero((np.diff(columns, axis=0) != 0).any(1)) + 1
+    index = np.concatenate([[0], changed])
+    return index if len(index) >= 4 else np.arange(len(time))
+
+
+def estimate_noise(values: Array) -> float:
+    """Standard deviation of white noise on a smooth signal (N,) or (N, k), from the spread of its third differences.
+
+    Third differences of white noise have 20 times its variance while a smooth signal hardly shows in them. The median
+    absolute value ignores the instants where the signal is not smooth. Never less than what a quantised signal's step implies.
+    """
+    columns = values.reshape(len(values), -1)
+    if len(columns) < 8:
+        return 0.0
+    third = np.diff(columns, 3, axis=0)
+    noise = 1.4826 * np.median(np.abs(third)) / np.sqrt(20)
+    steps = np.abs(np.diff(columns, axis=0))
+    moved = steps[steps > 0]
+    quantum = float(moved.min()) / np.sqrt(12) if moved.size else 0.0
+    return float(max(noise, quantum))
+
+
+def moving_average(values: Array, samples: int) -> Array:
+    """Centred moving average along the first axis; the ends are zero-padded as `numpy.convolve(..., "same")` has them."""
+    if samples <= 1:
+        return values
+    kernel = np.ones(samples) / samples
+    columns = values.reshape(len(values), -1)
+    out = np.stack([np.convolve(c, kernel, "same") for c in columns.T], -1)
+    return out.reshape(values.shape)

@@ -1,0 +1,106 @@
+"""An effect with a value of its own at each of several places: several single-place effects that act as one."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, overrides
+from nfc_gym.physics.fields import ModelFields
+
+if TYPE_CHECKING:
+    from nfc_gym.physics.rollout import Plant
+
+_HOOKS = ("spec", "model", "action", "friction", "force", "demand", "sense", "unsense")
+
+
+class Each(Effect):
+    """Members of one family, one a place; parameters are named `<parameter>@<place>`.
+
+    Args:
+      members: single-place effects of one family.
+    """
+
+    def __init__(self, members: Sequence[Effect]) -> None:
+        self.members = tuple(members)
+        params = [replace(p, name=f"{p.name}@{m.place}") for m in members for p in m.params]
+        super().__init__([w for m in members for w in m.where], params)
+        sizes = np.cumsum([0, *(len(m.params) for m in members)])
+        self._parts = [slice(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+
+    @property
+    def id(self) -> str:
+        """`family:place+place`, as of the tied effect, with a mark that values differ."""
+        return f"{self.family}:{self.place}:each"
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Exogenous signals that any member reads."""
+        return tuple(dict.fromkeys(s for m in self.members for s in m.signals))
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        """Bind every member."""
+        for m in self.members:
+            m.bind(model)
+
+    def _theta(self, theta: Array) -> list[Array]:
+        return [theta[..., p] for p in self._parts]
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        """See `Effect`."""
+        return all([m.spec(spec, t) for m, t in zip(self.members, self._theta(theta), strict=True)])
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        """See `Effect`."""
+        for m, t in zip(self.members, self._theta(theta), strict=True):
+            m.model(fields, t)
+
+    def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
+        """See `Effect`."""
+        return [m.state0(shape, ctrl, t, dt) for m, t in zip(self.members, self._theta(theta), strict=True)]
+
+    def action(self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float) -> tuple[Array, Any]:
+        """See `Effect`."""
+        kept = []
+        for m, t, old in zip(self.members, self._theta(theta), memory, strict=True):
+            ctrl, new = m.action(ctrl, t, old, exogenous, dt)
+            kept.append(new)
+        return ctrl, kept
+
+    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
+        """See `Effect`."""
+        both = [m.friction(ctx, t) for m, t in zip(self.members, self._theta(theta), strict=True)]
+        return np.concatenate([d for d, _ in both]), np.concatenate([level for _, level in both], -1)
+
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        """See `Effect`."""
+        for m, t in zip(self.members, self._theta(theta), strict=True):
+            m.force(ctx, t, out)
+
+    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        """See `Effect`."""
+        for m, t in zip(self.members, self._theta(theta), strict=True):
+            force = m.demand(force, t, exogenous, dt)
+        return force
+
+
+def each(members: Sequence[Effect]) -> Each:
+    """An `Each` that implements just the hooks its members' family implements."""
+    first = members[0]
+    name = f"Each{type(first).__name__}"
+    body: dict[str, Any] = {"family": first.family, "summary": first.summary, "generic": first.generic}
+    body |= {hook: getattr(Effect, hook) for hook in _HOOKS if not overrides(first, hook)}
+    return type(name, (Each,), body)(members)
+
+
+def split(effect: Effect, plant: "Plant") -> tuple[Effect, NDArray[np.intp]] | None:
+    """A tied effect at several places as an `Each`, and which old parameter each new one starts from; None where it cannot."""
+    if isinstance(effect, Each) or len(effect.where) < 2 or effect.generic:
+        return None
+    members = [type(effect)((name,), effect.params) for name in effect.where]
+    together = each(members)
+    together.bind(plant.model)
+    return together, np.tile(np.arange(len(effect.params)), len(members))
