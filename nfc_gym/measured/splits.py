@@ -1,0 +1,243 @@
+"""Which log fits, which selects and which verifies: log files found, named, grouped and divided."""
+
+import json
+import re
+from collections import Counter
+from collections.abc import Mapping as Dict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nfc_gym.core import InputError, Log
+from nfc_gym.measured.entries import LogEntry, SplitRule
+from nfc_gym.measured.mapping import SPLITS, Mapping, Split
+from nfc_gym.measured.readers import suffixes
+from nfc_gym.measured.yaml_marks import suggest
+
+SELECT_OF_REST = 0.2  # by: rotate: this part of the logs that do not verify selects
+SELECT_BY_TIME = 0.25  # no log selects: this last part of every fitting log does
+
+
+@dataclass(frozen=True)
+class Source:
+    """A log file and what the mapping says of it.
+
+    Attributes:
+      name: unique; the stem, or the path below the mapping's folder where two stems are alike.
+      split: fit, select, verify, or auto where the split rule decides.
+      group: empty where none was given.
+    """
+
+    name: str
+    path: Path
+    split: str
+    group: str
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One way to divide the logs: log name -> fit, select or verify. `name` is the group that verifies, or empty."""
+
+    name: str
+    splits: Dict[str, Split]
+
+    def names(self, split: Split) -> tuple[str, ...]:
+        """Names of the logs of a split, in the data set's order."""
+        return tuple(name for name, own in self.splits.items() if own == split)
+
+
+@dataclass(frozen=True)
+class Division:
+    """Logs (cut where the rule cuts), the folds over them, and whether no two splits share a log."""
+
+    logs: tuple[Log, ...]
+    folds: tuple[Fold, ...]
+    independent: bool
+
+
+def find_logs(mapping: Mapping, folder: Path) -> list[Source]:
+    """The mapping's log files, sorted within each entry.
+
+    Raises:
+      InputError: nothing matches, a file is listed twice, a group's pattern does not match, `splits` names other files.
+    """
+    found: dict[Path, tuple[LogEntry, str, str]] = {}
+    for entry in mapping.logs:
+        paths = _matches(entry, folder)
+        assigned = _read_splits(folder / entry.splits, paths) if entry.splits else {}
+        for path in paths:
+            if path in found:
+                raise InputError(
+                    f"logs: {path.name} is matched by {found[path][0].path!r} and by {entry.path!r}; list it once"
+                )
+            name = assigned.get(path.stem, entry.split)
+            split, group = (name, "") if name in (*SPLITS, "auto") else ("auto", name)
+            found[path] = entry, split, _group(entry, path) or group
+    stems = Counter(path.stem for path in found)
+
+    def name_of(path: Path) -> str:
+        if stems[path.stem] == 1:
+            return path.stem
+        inside = path.relative_to(folder) if path.is_relative_to(folder) else path
+        return inside.with_suffix("").as_posix()
+
+    sources = [Source(name_of(path), path, split, group) for path, (_, split, group) in found.items()]
+    name, count = Counter(source.name for source in sources).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"logs: {count} files would all be called {name!r}; rename them")
+    return sources
+
+
+def _matches(entry: LogEntry, folder: Path) -> list[Path]:
+    pattern = Path(entry.path)
+    base = Path(pattern.anchor) if pattern.is_absolute() else folder
+    relative = str(pattern.relative_to(pattern.anchor)) if pattern.is_absolute() else entry.path
+    try:
+        matches = sorted(p for p in base.glob(relative) if p.is_file())
+    except (ValueError, NotImplementedError) as e:
+        raise InputError(f"logs: {entry.path!r} is no path or glob: {e}") from None
+    if not matches:
+        nearest = base / relative
+        while not nearest.is_dir():
+            nearest = nearest.parent
+        there = sorted(p.name for p in nearest.iterdir() if p.suffix.lower() in suffixes())
+        raise InputError(
+            f"logs: no file matches {entry.path!r} in {base}; {nearest} holds: {', '.join(there[:6]) or 'no log'}"
+        )
+    return matches
+
+
+def _group(entry: LogEntry, path: Path) -> str:
+    if entry.group is None:
+        return ""
+    match = re.search(entry.group, path.stem)
+    if match is None or not match[1]:
+        raise InputError(
+            f"logs: group pattern {entry.group!r} does not match the file name {path.stem!r}; widen the pattern"
+        )
+    return match[1]
+
+
+def _read_splits(path: Path, logs: list[Path]) -> dict[str, str]:
+    try:
+        splits = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"logs: splits file {path} does not exist") from None
+    except ValueError as e:
+        raise InputError(f"logs: splits file {path} is not JSON: {e}") from None
+    if not isinstance(splits, dict) or not all(isinstance(v, str) and v for v in splits.values()):
+        raise InputError(f'logs: splits file {path} must hold {{"log stem": "fit" | "select" | "verify" | group name}}')
+    stems = [p.stem for p in logs]
+    for stem in stems:
+        if stem not in splits:
+            raise InputError(f"logs: splits file {path} says nothing of {stem!r}; {suggest(stem, list(splits))}")
+    for stem in splits:
+        if stem not in stems:
+            raise InputError(f"logs: splits file {path} names {stem!r}, which is no log; {suggest(stem, stems)}")
+    return splits
+
+
+def divide(rule: SplitRule, sources: Sequence[Source], logs: Sequence[Log]) -> Division:
+    """Divide logs by the mapping's rule; `logs` are the sources' contents in the same order.
+
+    Raises:
+      InputError: too few logs or groups for the rule, or a split that stays empty; with what to change.
+    """
+    fixed: dict[str, Split] = {s.name: split for s in sources for split in SPLITS if s.split == split}
+    free = [log for log in logs if log.name not in fixed]
+    if rule.by == "rotate":
+        return Division(tuple(logs), _rotate(rule, fixed, free), True)
+    independent = True
+    if rule.by == "time" and free:
+        parts = {log.name: _by_time(log, rule) for log in free}
+        fixed |= {part.name: split for cut in parts.values() for split, part in cut.items()}
+        logs = [part for log in logs for part in (parts[log.name].values() if log.name in parts else [log])]
+        independent = False
+    elif free:
+        fixed |= _by_unit(rule, free)
+    _require_both(fixed)
+    if "select" not in fixed.values():
+        independent = False
+        cut = {
+            log.name: _cut(log, (("fit", 1 - SELECT_BY_TIME), ("select", SELECT_BY_TIME)))
+            for log in logs
+            if fixed[log.name] == "fit"
+        }
+        fixed |= {part.name: split for parts in cut.values() for split, part in parts.items()}
+        logs = [part for log in logs for part in (cut[log.name].values() if log.name in cut else [log])]
+    return Division(tuple(logs), (Fold("", {log.name: fixed[log.name] for log in logs}),), independent)
+
+
+def _require_both(splits: dict[str, Split]) -> None:
+    if "verify" not in splits.values():
+        raise InputError(
+            "split: no log verifies; give some log `split: verify`, set split.verify above 0, or say `by: time`"
+        )
+    if "fit" not in splits.values():
+        raise InputError("split: no log fits; give some log `split: fit`, or leave logs `split: auto`")
+
+
+def _by_unit(rule: SplitRule, free: Sequence[Log]) -> dict[str, Split]:
+    """Logs, or whole groups of them, shuffled by the seed and dealt out by the rule's fractions."""
+    if rule.by == "group" and any(not log.group for log in free):
+        raise InputError("split: `by: group` needs a `group` pattern in every entry of `logs` (or use `by: log`)")
+    units = sorted({log.group if rule.by == "group" else log.name for log in free})
+    wanted = 1 + (rule.select > 0) + (rule.verify > 0)
+    if len(units) < wanted:
+        raise InputError(
+            f"split: {len(units)} {rule.by}{'s' * (len(units) != 1)} cannot be split {wanted} ways; record more, or "
+            "use `split: {by: time}`, which cuts every log in consecutive parts (reported as not independent)"
+        )
+    order = np.random.default_rng(rule.seed).permutation(len(units))
+    select = max(round(rule.select * len(units)), 1) if rule.select > 0 else 0
+    verify = max(round(rule.verify * len(units)), 1) if rule.verify > 0 else 0
+    while select + verify >= len(units):  # rounding up must leave something to fit
+        select, verify = (select, verify - 1) if verify > select else (select - 1, verify)
+    counts: list[tuple[Split, int]] = [("select", select), ("verify", verify), ("fit", len(units) - select - verify)]
+    kinds: list[Split] = [split for split, count in counts for _ in range(count)]
+    split_of: dict[str, Split] = {units[i]: kind for i, kind in zip(order, kinds, strict=True)}
+    return {log.name: split_of[log.group if rule.by == "group" else log.name] for log in free}
+
+
+def _by_time(log: Log, rule: SplitRule) -> dict[Split, Log]:
+    fractions: list[tuple[Split, float]] = [("fit", rule.fit), ("select", rule.select), ("verify", rule.verify)]
+    return _cut(log, fractions)
+
+
+def _cut(log: Log, fractions: Sequence[tuple[Split, float]]) -> dict[Split, Log]:
+    """Consecutive parts of a log, by rows; empty fractions are left out."""
+    edges = np.floor(np.cumsum([0.0] + [f for _, f in fractions]) * len(log) + 1e-6).astype(int)
+    parts: dict[Split, Log] = {}
+    for (split, fraction), start, stop in zip(fractions, edges[:-1], edges[1:], strict=True):
+        if fraction <= 0:
+            continue
+        if stop - start < 2:
+            raise InputError(
+                f"split: log {log.name!r} has {len(log)} rows, too few to cut by time; record a longer one"
+            )
+        parts[split] = log.part(int(start), int(stop), f"{log.name}@{split}")
+    return parts
+
+
+def _rotate(rule: SplitRule, fixed: dict[str, Split], free: Sequence[Log]) -> tuple[Fold, ...]:
+    """Every group verifies in turn; a fifth of the remaining logs selects, chosen by the seed."""
+    group_of = {log.name: log.group or log.name for log in free}
+    groups = sorted(set(group_of.values()))
+    fits, selects = (list(fixed.values()).count(s) for s in ("fit", "select"))
+    folds = []
+    for i, group in enumerate(groups):
+        rest = [name for name, own in group_of.items() if own != group]
+        count = max(round(SELECT_OF_REST * len(rest)), 1) if not selects else 0
+        if len(groups) < 2 or len(rest) + fits <= count:
+            raise InputError(
+                f"split: {len(free)} logs in {len(groups)} groups are too few to rotate: besides the group that "
+                "verifies one log must fit and one select; record more, or say `by: time` (reported as not independent)"
+            )
+        chosen = {rest[k] for k in np.random.default_rng([rule.seed, i]).permutation(len(rest))[:count]}
+        own: dict[str, Split] = {n: "select" if n in chosen else "fit" if n in rest else "verify" for n in group_of}
+        folds.append(Fold(group, fixed | own))
+    if not folds:
+        raise InputError("split: `by: rotate` needs logs with `split: auto`")
+    return tuple(folds)
