@@ -1,0 +1,26 @@
+"""The robots: one folder each with its MJCF (`<robot>.xml`) and its prior over physical parameters (`psi.toml`).
+
+Everything here is data. `restitution.toml` maps a coefficient of restitution to the damping ratio of a contact.
+"""
+
+from pathlib import Path
+
+from nfc_gym.core.errors import InputError
+
+ROBOTS = ("jackal", "quadcopter", "quadruped")
+
+_HERE = Path(__file__).resolve().parent
+
+
+def path(robot: str) -> Path:
+    """The robot's MJCF file; `psi.toml` lies beside it.
+
+    Args:
+      robot: one of `ROBOTS`.
+
+    Raises:
+      InputError: no robot has that name.
+    """
+    if robot not in ROBOTS:
+        raise InputError(f"no robot is called {robot!r}; the robots are {', '.join(ROBOTS)}")
+    return _HERE / robot / f"{robot}.xml"
