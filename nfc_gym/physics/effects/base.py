@@ -113,10 +113,12 @@ class Effect(ABC):
     summary: ClassVar[str]
     # A member of the generic alternatives takes part in every contest but is never claimed by name.
     generic: ClassVar[bool] = False
+    # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
+    PARAMS: ClassVar[tuple[Param, ...]] = ()
 
-    def __init__(self, where: Sequence[str], params: Sequence[Param]) -> None:
+    def __init__(self, where: Sequence[str], params: Sequence[Param] | None = None) -> None:
         self.where = tuple(where)
-        self.params = tuple(params)
+        self.params = self.PARAMS if params is None else tuple(params)
 
     @property
     def place(self) -> str:
@@ -155,6 +157,14 @@ class Effect(ABC):
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> "list[Effect]":
         """Every place of a model where the effect could sit, with sizes that fit the machine."""
         raise NotImplementedError
+
+    @classmethod
+    def declare(cls, names: Sequence[str]) -> tuple[Param, ...]:
+        """The family's parameters of those names, in its own order; others raise `InputError`."""
+        known = [p.name for p in cls.PARAMS]
+        if set(names) != set(known):
+            raise InputError(f"{cls.family} has the parameters {', '.join(known)}, got: {', '.join(names) or 'none'}")
+        return cls.PARAMS
 
     def bind(self, model: mujoco.MjModel) -> None:
         """Resolve names to addresses once; a name that the model lacks raises `InputError`."""
