@@ -1,1 +1,73 @@
-"""The effects that a model may lack: one interface (`Effect`), one family a file, and the library that lists them."""
+"""The library of effects: every family by name, where a model could have them, and effects from saved values."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.air import DragLinear, DragQuadratic
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.drive import Gain, Loss, TorqueSpeed
+from nfc_gym.physics.effects.friction import Coulomb, DirectionalFriction, LoadFriction, Stribeck
+from nfc_gym.physics.effects.inertial import ComShift, Inertia, Payload, complete_inertia
+from nfc_gym.physics.effects.joint import Armature, Cogging, DampingPoly, SpringOffset
+from nfc_gym.physics.effects.timing import Delay, Lag
+
+__all__ = ["FAMILIES", "Context", "Effect", "Forces", "Param", "Scales", "build", "complete_inertia", "propose"]
+
+_TYPES: tuple[type[Effect], ...] = (
+    Coulomb, Stribeck, LoadFriction, DirectionalFriction, DampingPoly, Armature, SpringOffset, Cogging,
+    Gain, Loss, Lag, Delay, TorqueSpeed,
+    Payload, ComShift, Inertia, DragLinear, DragQuadratic,
+)  # fmt: skip
+
+FAMILIES: dict[str, type[Effect]] = {t.family: t for t in _TYPES}
+
+
+def propose(
+    model: mujoco.MjModel, scales: Scales, only: Sequence[str] = (), exclude: Sequence[str] = (), generic: bool = True
+) -> list[Effect]:
+    """Every effect that the model could have, with sizes that fit the machine.
+
+    Args:
+      model: the nominal model.
+      scales: typical magnitudes along the logs.
+      only: families to propose; empty means all. The generic alternatives stay in either way.
+      exclude: families to leave out.
+      generic: whether the generic alternatives, which are never claimed by name, are among them.
+    """
+    named = [f for n, f in FAMILIES.items() if not f.generic and (not only or n in only)]
+    generics = [f for f in FAMILIES.values() if f.generic and generic]
+    chosen = [f for f in (*named, *generics) if f.family not in exclude]
+    return [effect for family in chosen for effect in family.propose(model, scales)]
+
+
+def build(family: str, where: Sequence[str] | str, parameters: Mapping[str, object]) -> tuple[Effect, Array]:
+    """An effect and its parameter values (k,) from saved ones, as `effects.yaml` and `report.json` hold them.
+
+    Args:
+      family: one of `FAMILIES`.
+      where: a name of the model, several, or several joined by `+`.
+      parameters: by name, a number or a mapping with `value` and perhaps `unit`.
+
+    Raises:
+      InputError: an unknown family, or names of parameters that the family does not have.
+    """
+    kind = _family(family)
+    places = tuple(where.split("+")) if isinstance(where, str) else tuple(where)
+    declared = kind.declare(tuple(parameters))
+    values, params = [], []
+    for p in declared:
+        entry = parameters[p.name]
+        unit = str(entry.get("unit", p.unit)) if isinstance(entry, Mapping) else p.unit
+        params.append(replace(p, unit=unit))
+        values.append(float(entry["value"] if isinstance(entry, Mapping) else entry))  # type: ignore[arg-type]
+    return kind(places, params), np.array(values)
+
+
+def _family(name: str) -> type[Effect]:
+    if name not in FAMILIES:
+        raise InputError(f"no family of effects named {name!r}; there are: {', '.join(FAMILIES)}")
+    return FAMILIES[name]

@@ -1,0 +1,142 @@
+"""Dry friction of joints. All four laws set the level that MuJoCo's constraint solver may use to hold or brake a joint.
+
+MuJoCo's default friction is soft (a time constant of 20 ms): a joint creeps under a load that real friction would hold.
+Where the nominal model has no friction of its own the effects therefore make it sharp, with the shortest time constant that
+a step allows (2 dt) and an impedance of 0.99, which leaves a creep of about one per cent of the acceleration in a step.
+A joint whose friction the user already declared keeps the user's softness.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales, joint_dofs
+from nfc_gym.physics.effects.places import angle_unit, force_unit, joint_places, joint_scales, sized, with_units
+from nfc_gym.physics.fields import ModelFields
+
+_IMPEDANCE = (0.99, 0.99, 0.001, 0.5, 2.0)
+_TURN = 0.01  # rad/s or m/s: speed over which a direction-dependent level passes from one side to the other
+
+
+def sharpen(fields: ModelFields, dofs: NDArray[np.intp]) -> None:
+    """Make dry friction sharp on those dofs where the nominal model has none (its softness then acts on nothing)."""
+    bare = dofs[fields.nominal("dof_frictionloss")[dofs] == 0]
+    if len(bare):
+        fields["dof_solref"][..., bare, :] = (2 * float(fields.nominal_model.opt.timestep), 1.0)
+        fields["dof_solimp"][..., bare, :] = _IMPEDANCE
+
+
+class _JointFriction(Effect):
+    """What the laws share: scalar joints, a sharp constraint, a level in N m or N."""
+
+    LEVELS = ("level",)
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.dofs = joint_dofs(model, self.where)
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        sharpen(fields, self.dofs)
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        for where in joint_places(model):
+            force, speed = joint_scales(model, scales, where)
+            unit = force_unit(model, where[0])
+            params = sized(cls.PARAMS, **cls._sizes(force, speed))
+            units = dict.fromkeys(cls.LEVELS, unit) | {"speed": f"{angle_unit(model, where[0])}/s"}
+            out.append(cls(where, with_units(params, units)))
+        return out
+
+    @classmethod
+    def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
+        return {n: level_size(force) for n in cls.LEVELS}
+
+
+def level_size(force: float) -> dict[str, Any]:
+    """Bounds and probing sizes of a friction level, from the joint's typical force."""
+    return {"probes": (0.05 * force, 0.2 * force), "high": 3 * force, "resolution": 2e-3 * force}
+
+
+class Coulomb(_JointFriction):
+    """Constant friction: |force| <= level, opposing motion."""
+
+    family = "coulomb"
+    summary = "Dry (Coulomb) friction"
+    PARAMS = (Param("level", "N m", 0.0, 1e3, probes=(0.01, 0.1)),)
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        super().model(fields, theta)
+        fields["dof_frictionloss"][..., self.dofs] += theta[..., :1]
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        for name in self.where:
+            joint = spec.joint(name)
+            if joint.frictionloss == 0:
+                joint.solref_friction = (2 * spec.option.timestep, 1.0)
+                joint.solimp_friction = _IMPEDANCE
+            joint.frictionloss += float(theta[0])
+        return True
+
+
+class Stribeck(_JointFriction):
+    """Friction that is higher at rest: level + rise exp(-(v / speed)^2). Armstrong-Helouvry et al., Automatica 30 (1994)."""
+
+    family = "stribeck"
+    summary = "Dry friction with a Stribeck rise at low speed"
+    LEVELS = ("level", "rise")
+    PARAMS = (
+        Param("level", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
+        Param("rise", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
+        Param("speed", "rad/s", 1e-3, 1e2, probes=(0.1, 0.3, 1.0), shape=True),
+    )
+
+    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
+        level, rise, speed = theta[..., 0:1], theta[..., 1:2], theta[..., 2:3]
+        return self.dofs, level + rise * np.exp(-((ctx.v[..., self.dofs] / speed) ** 2))
+
+    @classmethod
+    def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
+        shape = {"probes": (0.1 * speed, 0.3 * speed, speed), "low": 0.01 * speed, "high": 5 * speed}
+        return super()._sizes(force, speed) | {"speed": shape}
+
+
+class LoadFriction(_JointFriction):
+    """Friction of a loaded gear: level + |motor * actuator torque + external * bias torque|.
+
+    The actuator pushes the gear's one side (`qfrc_actuator`); gravity, Coriolis and centrifugal forces push the other
+    (`qfrc_bias`, the torque that must be applied to balance them). A joint held still has both equal, and they add up.
+    With `motor` alone the gear is loaded by its own drive only. Contact forces are not counted: MuJoCo does not tell them
+    apart from the friction itself. Law: load-dependent models of Duclusaud et al., arXiv:2410.08650 (2024).
+    """
+
+    family = "load_friction"
+    summary = "Gear friction that grows with the load"
+    PARAMS = (
+        Param("level", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
+        Param("motor", "1", 0.0, 0.8, probes=(0.05, 0.2), resolution=2e-3),
+        Param("external", "1", 0.0, 0.8, probes=(0.05, 0.2), resolution=2e-3),
+    )
+
+    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
+        drive = theta[..., 1:2] * ctx.data("qfrc_actuator")[..., self.dofs]
+        load = theta[..., 2:3] * ctx.data("qfrc_bias")[..., self.dofs]
+        return self.dofs, theta[..., 0:1] + np.abs(drive + load)
+
+
+class DirectionalFriction(_JointFriction):
+    """Friction with a level of its own for each direction of motion; both meet within 0.01 rad/s (m/s) of rest."""
+
+    family = "directional_friction"
+    summary = "Dry friction that differs by direction of motion"
+    LEVELS = ("forward", "backward")
+    PARAMS = (
+        Param("forward", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
+        Param("backward", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
+    )
+
+    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
+        ahead = (1 + np.tanh(ctx.v[..., self.dofs] / _TURN)) / 2
+        return self.dofs, theta[..., 0:1] * ahead + theta[..., 1:2] * (1 - ahead)

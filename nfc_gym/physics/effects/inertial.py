@@ -1,0 +1,184 @@
+"""Mass that the model has not, or has elsewhere: payload, shift of the centre of mass, scaled inertia.
+
+Payload and shift move a body off the place that MuJoCo's "simple body" short cut was compiled for; such bodies must be
+compiled with `simple="false"` (`complete_inertia` does it to a spec), else `bind` raises.
+"""
+
+import mujoco
+import numpy as np
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Array, Effect, Param, Scales
+from nfc_gym.physics.effects.places import body_ids, gyration, moving_bodies, sized
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.state import quat_multiply, rotate_back
+
+_SWEEPS = 6  # cyclic Jacobi on 3 x 3 converges quadratically; six sweeps reach the last bit
+
+
+def complete_inertia(spec: mujoco.MjSpec) -> None:
+    """Compile every body of a spec without the "simple body" short cut, so that its centre of mass may move afterwards."""
+    for body in spec.bodies:
+        if body.name != "world":
+            body.simple = 0
+
+
+def principal(matrix: Array) -> tuple[Array, Array]:
+    """Eigenvalues (..., 3) and rotation quaternion (..., 4) of symmetric matrices (..., 3, 3), by Jacobi rotations.
+
+    A diagonal matrix gives its own diagonal and exactly no rotation, and a matrix close to it a small rotation: unlike a
+    library's sorted eigenvectors, the result is continuous in the payload.
+    """
+    a = np.array(matrix, float)
+    quat = np.zeros((*a.shape[:-2], 4))
+    quat[..., 0] = 1.0
+    for _ in range(_SWEEPS):
+        for p, q in ((0, 1), (0, 2), (1, 2)):
+            a, turn = _jacobi(a, p, q)
+            quat = quat_multiply(quat, turn)
+    return np.stack([a[..., i, i] for i in range(3)], -1), quat
+
+
+def _jacobi(a: Array, p: int, q: int) -> tuple[Array, Array]:
+    """One rotation in the plane (p, q) that clears a[p, q]; also as a quaternion."""
+    gap, off = a[..., q, q] - a[..., p, p], 2 * a[..., p, q]
+    size = np.abs(gap) + np.sqrt(gap**2 + off**2)
+    sign = np.where(gap < 0, -1.0, 1.0)
+    tangent = np.where(size > 0, sign * off / np.where(size > 0, size, 1.0), 0.0)
+    cosine = 1 / np.sqrt(1 + tangent**2)
+    sine = tangent * cosine
+    rotation = np.zeros_like(a)
+    rotation[...] = np.eye(3)
+    rotation[..., p, p], rotation[..., q, q] = cosine, cosine
+    rotation[..., p, q], rotation[..., q, p] = sine, -sine
+    turned = np.swapaxes(rotation, -1, -2) @ a @ rotation
+    turned[..., p, q] = turned[..., q, p] = 0.0
+    half = np.arctan(tangent) / 2
+    quat = np.zeros((*a.shape[:-2], 4))
+    quat[..., 0] = np.cos(half)
+    axis, direction = {(0, 1): (3, -1.0), (0, 2): (2, 1.0), (1, 2): (1, -1.0)}[(p, q)]
+    quat[..., axis] = direction * np.sin(half)
+    return turned, quat
+
+
+class _Inertial(Effect):
+    """What the three share: named bodies, and a spec that takes the edited inertia as an explicit one."""
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.bodies = body_ids(model, self.where)
+
+    def _refuse_simple(self, model: mujoco.MjModel) -> None:
+        for name, body in zip(self.where, self.bodies, strict=True):
+            if model.body_simple[body]:
+                raise InputError(
+                    f"{self.family} at body {name!r}: the model was compiled with MuJoCo's simple-body short cut, which "
+                    "fixes the centre of mass; compile it with simple='false' (inertial.complete_inertia does so to a spec)"
+                )
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        compiled = spec.copy().compile()
+        self.bind(compiled)
+        self.model(ModelFields(compiled), np.asarray(theta, float))
+        for name, b in zip(self.where, self.bodies, strict=True):
+            body = spec.body(name)
+            body.explicitinertial = True
+            body.fullinertia = np.full(6, np.nan)
+            body.mass = compiled.body_mass[b]
+            body.ipos, body.iquat = compiled.body_ipos[b], compiled.body_iquat[b]
+            body.inertia = compiled.body_inertia[b]
+        return True
+
+
+class Payload(_Inertial):
+    """A point mass fixed to a body at (x, y, z) of the body's frame, m."""
+
+    family = "payload"
+    summary = "Point mass carried"
+    PARAMS = (
+        Param("mass", "kg", 0.0, 1e3, probes=(0.1,)),
+        Param("x", "m", -1.0, 1.0, probes=(0.0, 0.1), shape=True),
+        Param("y", "m", -1.0, 1.0, probes=(0.0, 0.1), shape=True),
+        Param("z", "m", -1.0, 1.0, probes=(0.0, 0.1), shape=True),
+    )
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        super().bind(model)
+        self._refuse_simple(model)
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        for b in self.bodies:
+            add_point_mass(fields, int(b), theta[..., 0], theta[..., 1:4])
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        names = moving_bodies(model)
+        for name, b in zip(names, body_ids(model, names), strict=True):
+            mass, centre, extent = float(model.body_mass[b]), model.body_ipos[b], gyration(model, int(b))
+            sizes = {"mass": {"probes": (0.15 * mass,), "high": 3 * mass, "resolution": 2e-3 * mass}}
+            for axis, c in zip("xyz", centre.tolist(), strict=True):
+                sizes[axis] = {"probes": (c, c + extent), "low": c - 5 * extent, "high": c + 5 * extent}
+            out.append(cls((name,), sized(cls.PARAMS, **sizes)))
+        return out
+
+
+def add_point_mass(fields: ModelFields, body: int, mass: Array, place: Array) -> None:
+    """Fix a point mass (...,), kg, at `place` (..., 3) of a body's frame: mass, centre and principal inertia, in place.
+
+    About the common centre the two add mu (|d|^2 1 - d d'), mu the reduced mass and d the way from the old centre.
+    """
+    masses, iposes = fields["body_mass"], fields["body_ipos"]
+    inertias, iquats = fields["body_inertia"], fields["body_iquat"]
+    old, quat = masses[..., body], iquats[..., body, :]
+    share = (mass / (old + mass))[..., None]
+    d = rotate_back(quat, place - iposes[..., body, :])
+    reduced = (share[..., 0] * old)[..., None, None]
+    outer = d[..., :, None] * d[..., None, :]
+    matrix = reduced * ((d**2).sum(-1)[..., None, None] * np.eye(3) - outer)
+    diagonal = np.arange(3)
+    matrix[..., diagonal, diagonal] += inertias[..., body, :]
+    moments, turn = principal(matrix)
+    iposes[..., body, :] += share * (place - iposes[..., body, :])
+    iquats[..., body, :] = quat_multiply(quat, turn)
+    inertias[..., body, :] = moments
+    masses[..., body] = old + mass
+
+
+class ComShift(_Inertial):
+    """Centre of mass moved by (x, y, z) along the body's axes, m; mass and inertia about it stay."""
+
+    family = "com_shift"
+    summary = "Centre of mass shifted"
+    PARAMS = tuple(Param(axis, "m", -0.5, 0.5, probes=(0.01,), resolution=2e-4) for axis in "xyz")
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        super().bind(model)
+        self._refuse_simple(model)
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        fields["body_ipos"][..., self.bodies, :] += theta[..., None, :]
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        names = moving_bodies(model)
+        for name, b in zip(names, body_ids(model, names), strict=True):
+            extent = gyration(model, int(b))
+            size = {"probes": (0.2 * extent,), "low": -3 * extent, "high": 3 * extent, "resolution": 5e-3 * extent}
+            out.append(cls((name,), sized(cls.PARAMS, x=size, y=size, z=size)))
+        return out
+
+
+class Inertia(_Inertial):
+    """Principal moments of inertia times (x, y, z), in the order of the model's inertial frame; the mass stays."""
+
+    family = "inertia"
+    summary = "Principal moments of inertia scaled"
+    PARAMS = tuple(Param(axis, "1", 0.3, 3.0, null=1.0, probes=(1.2,), resolution=0.005) for axis in "xyz")
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        fields["body_inertia"][..., self.bodies, :] *= theta[..., None, :]
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        return [cls((name,), cls.PARAMS) for name in moving_bodies(model)]

@@ -1,0 +1,114 @@
+"""Where effects can sit in a model, and sizes that fit it: helpers that the families share."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Array, Param, Scales, groups, joint_dofs
+from nfc_gym.physics.fields import ModelFields, names_of
+
+_SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+
+
+def sized(params: Iterable[Param], **changes: dict[str, object]) -> tuple[Param, ...]:
+    """The same parameters with some attributes replaced, by parameter name."""
+    return tuple(replace(p, **changes.get(p.name, {})) for p in params)  # type: ignore[arg-type]
+
+
+def with_units(params: Iterable[Param], units: dict[str, str]) -> tuple[Param, ...]:
+    """The same parameters with other units, by parameter name."""
+    return tuple(replace(p, unit=units.get(p.name, p.unit)) for p in params)
+
+
+def joint_kind(model: mujoco.MjModel, name: str) -> int:
+    """`mjtJoint` of a named joint."""
+    return int(model.jnt_type[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)])
+
+
+def joint_places(model: mujoco.MjModel) -> list[tuple[str, ...]]:
+    """Named hinge joints and named slide joints: each alone, all of a kind together, and sets of like names.
+
+    Hinges and slides never share a place, because their forces have different units.
+    """
+    names = names_of(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)
+    out: list[tuple[str, ...]] = []
+    for kind in (_HINGE, _SLIDE):
+        alike = [n for j, n in enumerate(names) if n and int(model.jnt_type[j]) == kind]
+        out += groups(alike) if alike else []
+    return out
+
+
+def force_unit(model: mujoco.MjModel, joint: str) -> str:
+    """`N m` for a hinge, `N` for a slide."""
+    return "N m" if joint_kind(model, joint) == _HINGE else "N"
+
+
+def angle_unit(model: mujoco.MjModel, joint: str) -> str:
+    """`rad` for a hinge, `m` for a slide."""
+    return "rad" if joint_kind(model, joint) == _HINGE else "m"
+
+
+def typical(values: NDArray, rows: NDArray[np.intp], floor: float = 1e-3) -> float:
+    """Median of a scale over some rows, kept off zero so that bounds and sizes made of it are usable."""
+    return max(float(np.median(np.abs(np.asarray(values, float)[rows]))), floor)
+
+
+def joint_scales(model: mujoco.MjModel, scales: Scales, names: Sequence[str]) -> tuple[float, float]:
+    """(force, speed) typical of the named scalar joints."""
+    dofs = joint_dofs(model, names)
+    return typical(scales.force, dofs), typical(scales.speed, dofs, 1e-2)
+
+
+def moving_bodies(model: mujoco.MjModel) -> list[str]:
+    """Names of bodies that have mass and can move, one for each set of bodies welded together."""
+    names = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
+    return [
+        names[b]
+        for b in range(1, model.nbody)
+        if names[b] and int(model.body_weldid[b]) == b and model.body_mass[b] > 0
+    ]
+
+
+def base_bodies(model: mujoco.MjModel) -> list[str]:
+    """Moving bodies that stand on the world itself: free bases, planar bases, the first link of an arm."""
+    names = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
+    moving = set(moving_bodies(model))
+    free = [int(model.jnt_bodyid[j]) for j in range(model.njnt) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)]
+    return [names[b] for b in range(1, model.nbody) if names[b] in moving and (b in free or _is_carrier(model, b))]
+
+
+def _is_carrier(model: mujoco.MjModel, body: int) -> bool:
+    """A body that slides in the world along at least one axis, through joints of its own or of massless carriers above."""
+    while body > 0:
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        if any(int(model.jnt_type[j]) == _SLIDE for j in range(first, first + count)):
+            return int(model.body_weldid[model.body_parentid[body]]) == 0
+        body = int(model.body_parentid[body])
+        if model.body_mass[body] > 0:
+            return False
+    return False
+
+
+def body_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
+    """Id of each named body, (n,); an unknown name raises `InputError` listing what exists."""
+    known = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
+    for name in names:
+        if name not in known:
+            raise InputError(f"the model has no body named {name!r}; it has: {', '.join(n for n in known if n)}")
+    return np.array([known.index(n) for n in names], np.intp)
+
+
+def gyration(model: mujoco.MjModel, body: int) -> float:
+    """Largest radius of gyration of a body, m: a measure of its extent that needs no geometry."""
+    return float(np.sqrt(max(model.body_inertia[body].max(), 1e-12) / max(model.body_mass[body], 1e-12)))
+
+
+def scale_rows(fields: ModelFields, name: str, rows: NDArray[np.intp], factor: Array) -> None:
+    """Multiply rows of a model field by `factor` (...,), in place."""
+    array = fields[name]
+    wide = factor.reshape(factor.shape + (1,) * (array.ndim - factor.ndim))
+    array[..., rows, :] *= wide

@@ -1,0 +1,105 @@
+"""Commands that arrive late: a first-order lag and a pure delay."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names
+from nfc_gym.physics.effects.drive import actuator_places
+from nfc_gym.physics.effects.places import sized
+
+_STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
+
+
+def command_limits(model: mujoco.MjModel, rows: Array) -> tuple[Array, Array]:
+    """(low, high) that MuJoCo itself clips the commands of some actuators to, infinite where it does not."""
+    off = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL))
+    limited = model.actuator_ctrllimited[rows].astype(bool) & (not off)
+    low, high = model.actuator_ctrlrange[rows].T
+    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+
+
+class _Late(Effect):
+    """What both share: the commands of some actuators, clipped as MuJoCo would, and a time in seconds."""
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.rows = actuator_ids(model, self.where)
+        self.limits = command_limits(model, self.rows)
+
+    def _commands(self, ctrl: Array) -> Array:
+        return np.clip(ctrl[..., self.rows], *self.limits)
+
+    def _replace(self, ctrl: Array, values: Array) -> Array:
+        out = np.array(ctrl)
+        out[..., self.rows] = values
+        return out
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        names = [n for n in actuator_names(model) if n]
+        # Under a sample and a half the logs say little; beyond 0.3 s no drive of a robot would be called late.
+        probes = tuple(p for p in (0.01, 0.03, 0.08) if p > 0.4 * scales.interval) or (2 * scales.interval,)
+        params = sized(cls.PARAMS, **{cls.PARAMS[0].name: {"probes": probes, "resolution": 0.05 * scales.interval}})
+        return [cls(where, params) for where in actuator_places(model, names)]
+
+
+class Lag(_Late):
+    """First-order lag of the command: y <- u + exp(-dt / tau) (y - u), exact for commands held through a step."""
+
+    family = "lag"
+    summary = "First-order lag of the command"
+    PARAMS = (Param("time_constant", "s", 0.0, 0.5, probes=(0.01, 0.03, 0.08)),)
+
+    def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
+        return self._commands(ctrl)
+
+    def action(self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float) -> tuple[Array, Any]:
+        wish = self._commands(ctrl)
+        tau = theta[..., :1]
+        keep = np.where(tau > 0, np.exp(-dt / np.maximum(tau, 1e-12)), 0.0)
+        made = wish + keep * (memory - wish)
+        return self._replace(ctrl, made), made
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        actuators = [spec.actuator(n) for n in self.where]
+        if any(int(a.dyntype) != _STATELESS for a in actuators):
+            return False
+        for actuator in actuators:
+            actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+            actuator.dynprm = [float(theta[0]), *np.asarray(actuator.dynprm)[1:]]
+            actuator.actearly = True  # a step's force already feels that step's command, as in `action`
+        return True
+
+
+class Delay(_Late):
+    """Pure delay of the command. A delay between two steps mixes the two commands around it linearly."""
+
+    family = "delay"
+    summary = "Delayed command"
+    PARAMS = (Param("delay", "s", 0.0, 0.5, probes=(0.01, 0.03, 0.08)),)
+
+    def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
+        length = int(np.ceil(np.max(theta[..., 0], initial=0.0) / dt - 1e-9)) + 1
+        return (self._commands(ctrl),) * length
+
+    def action(self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float) -> tuple[Array, Any]:
+        past = (self._commands(ctrl), *memory[:-1]) if len(memory) > 1 else (self._commands(ctrl),)
+        steps = theta[..., :1] / dt
+        made = np.zeros_like(past[0])
+        for age, values in enumerate(past):
+            made = made + np.maximum(0.0, 1.0 - np.abs(steps - age)) * values
+        return self._replace(ctrl, made), past
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        dt, delay = spec.option.timestep, float(theta[0])
+        actuators = [spec.actuator(n) for n in self.where]
+        # MuJoCo reads its buffer before it writes, so that it knows no delay shorter than one step.
+        if delay < dt * (1 - 1e-9) or any(a.delay > 0 or a.nsample > 0 for a in actuators):
+            return False
+        for actuator in actuators:
+            actuator.delay = delay
+            actuator.nsample = int(np.ceil(delay / dt - 1e-9)) + 1
+            actuator.interp = 1  # linear
+        return True
