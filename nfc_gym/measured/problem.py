@@ -152,6 +152,10 @@ class RolloutProblem(Problem):
         """The compared channels, in the order of the columns."""
         return self._observers
 
+    def samples(self, channel: int) -> tuple[Array, Array]:
+        """The first block's compared samples of a channel: (h,) physics steps after the start and (h, dim) values."""
+        return self._where.step[0], self._measured[channel][0]
+
     def predict(self, plant: Plant, x: Array, segments: Segments, observers: Sequence[Observer]) -> tuple[list[Array], Trajectory]:
         """What each channel would report along a roll-out, (P, S, K + 1, dim) each, sensor effects included."""
         traj = plant.shoot(x, segments, sensors=any(o.needs_sensors for o in observers))

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 def _table() -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """(omega in rad/s, restitution, damping ratio) as measured by drop tests; see the data file for how."""
     data = tomllib.loads(files("nfc_gym.assets").joinpath("restitution.toml").read_text())
-    return float(data["omega"]), np.array(data["restitution"], float), np.array(data["damping_ratio"], float)
+    return float(data["omega"]), np.array(data["restitution"], float), np.array(data["zeta"], float)
 
 
 def restitution_solref(restitution: ArrayLike) -> NDArray[np.float64]:

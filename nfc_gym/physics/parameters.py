@@ -5,8 +5,10 @@ prior's box to [-1, 1].
 """
 
 import re
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -219,3 +221,9 @@ class ParameterSpace:
         if unknown:
             raise InputError(f"no parameter named {unknown[0]!r}; there are: {', '.join(self.names)}")
         return np.array([values.get(n, v) for n, v in zip(self.names, self.nominal, strict=True)], float)
+
+
+def parameters_from_toml(path: Path) -> list[Parameter]:
+    """The psi of a robot from its `psi.toml`: an array of tables `[[parameter]]` with the attributes of `Parameter`."""
+    rows = tomllib.loads(path.read_text())["parameter"]
+    return [Parameter(**{**row, "of": tuple(row.get("of", ()))}) for row in rows]

@@ -1,0 +1,160 @@
+"""The test bench: a mapping's model, parameters and logs made ready for fitting; one `Bench` serves the whole loop."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from nfc_gym import assets
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.log import Log
+from nfc_gym.measured.dataset import Dataset
+from nfc_gym.measured.instant import ForwardProblem, InverseProblem
+from nfc_gym.measured.problem import Problem, RolloutProblem
+from nfc_gym.measured.segments import Layout, servos
+from nfc_gym.measured.states import States, estimate_states
+from nfc_gym.physics.effects import propose
+from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrides
+from nfc_gym.physics.parameters import ParameterSpace, parameters_from_toml
+from nfc_gym.physics.rollout import Plant
+
+
+@dataclass
+class Bench:
+    """A mapping made ready.
+
+    Attributes:
+      spec: the model as written, to save it with corrections.
+      plant: the compiled model with psi and no effects.
+      states: of every log, by name.
+    """
+
+    dataset: Dataset
+    spec: mujoco.MjSpec
+    plant: Plant
+    states: dict[str, States]
+
+    @property
+    def mode(self) -> str:
+        """What is predicted: rollout, inverse or forward."""
+        return self.dataset.mapping.segments.mode
+
+    def problem(self, logs: Sequence[Log], most: int | None = None) -> Problem:
+        """The problem of some logs, thinned to about `most` blocks, spread evenly."""
+        segments, model = self.dataset.mapping.segments, self.plant.model
+        states = [self.states[log.name] for log in logs]
+        if self.mode != "rollout":
+            kind = InverseProblem if self.mode == "inverse" else ForwardProblem
+            return kind(model, logs, states, segments.length)
+        controls = self.dataset.mapping.controls
+        laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
+        linear = frozenset(k for k, c in controls.items() if c.hold == "linear")
+        layout = Layout(segments.length, segments.history, segments.horizons, segments.length, model.opt.timestep)
+        whole = RolloutProblem(model, logs, states, layout, servos(model, laws), linear, settle=segments.start == "settled")
+        if most is None or len(whole) <= most:
+            return whole
+        return whole.take(np.unique(np.linspace(0, len(whole) - 1, most).round().astype(int)))
+
+
+def load_spec(dataset: Dataset) -> mujoco.MjSpec:
+    """The model as written: a file beside the mapping, or a registered id."""
+    name = dataset.mapping.model_file
+    path = model_path(dataset)
+    if not path.exists():
+        raise InputError(f"model {name!r}: no such file beside the mapping ({path}), and no registered robot has that id")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        step = dataset.mapping.segments.timestep
+        if step is not None:
+            spec.option.timestep = step
+        return spec
+    except ValueError as error:
+        raise InputError(f"model {path}: MuJoCo cannot read it: {error}") from error
+
+
+def registered(name: str) -> str | None:
+    """Robot of a registered id (`nfc_gym/JackalFlat-v0` -> `jackal`), or None."""
+    short = name.rsplit("/", 1)[-1].lower()
+    return next((r for r in assets.ROBOTS if short in (f"{r}flat-v0", r)), None)
+
+
+def model_path(dataset: Dataset) -> Path:
+    """Where the model lies."""
+    robot = registered(dataset.mapping.model_file)
+    return assets.path(robot) if robot else dataset.folder / dataset.mapping.model_file
+
+
+def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
+    """Compile the model, bind psi, and estimate the states along every log.
+
+    Raises:
+      InputError: the model does not compile, or names of the mapping do not exist in it.
+    """
+    spec = load_spec(dataset)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise InputError(f"model {dataset.mapping.model_file}: does not compile: {error}") from error
+    known = actuator_names(model)
+    for control in dataset.mapping.controls:
+        if control.removeprefix("ctrl:") not in known:
+            raise InputError(f"{control}: the model has no such actuator; it has: {', '.join(known) or 'none'}")
+    declared = list(dataset.mapping.declared)
+    robot = registered(dataset.mapping.model_file)
+    if robot and not declared:
+        declared = parameters_from_toml(assets.path(robot).with_name("psi.toml"))
+    plant = Plant(model, ParameterSpace(model, declared), nthread=nthread)
+    return Bench(dataset, spec, plant, {log.name: estimate_states(model, log) for log in dataset.logs})
+
+
+def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
+    """Typical magnitudes along the logs, from states, commands and inverse dynamics without contact."""
+    model = bench.plant.model
+    data = mujoco.MjData(model)
+    qpos, qvel, qacc, ctrl, acting = [], [], [], [], []
+    for log in logs:
+        s = bench.states[log.name]
+        rows = np.linspace(0, len(log) - 1, min(len(log), max(20, 1000 // len(logs)))).astype(int)
+        qpos.append(s.qpos[rows])
+        qvel.append(s.qvel[rows])
+        qacc.append(s.qacc[rows])
+        u = np.zeros((len(rows), model.nu))
+        for key, values in log.controls.items():
+            u[:, actuator_names(model).index(key.removeprefix("ctrl:"))] = values[rows]
+        ctrl.append(u)
+    qpos, qvel, qacc, ctrl = (np.concatenate(a) for a in (qpos, qvel, qacc, ctrl))
+    needed, pushed, acting = np.zeros((len(qpos), model.nv)), np.zeros((len(qpos), model.nv)), np.zeros((len(qpos), model.nu))
+    driven = np.zeros(model.nv)
+    for k in range(len(qpos)):
+        data.qpos[:], data.qvel[:], data.qacc[:], data.ctrl[:] = qpos[k], qvel[k], qacc[k], ctrl[k]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_mulM(model, data, driven, qacc[k])
+        needed[k] = driven + data.qfrc_bias
+        mujoco.mj_fwdActuation(model, data)
+        pushed[k], acting[k] = data.qfrc_actuator, data.actuator_force
+    rms = lambda a: np.sqrt((a**2).mean(0))  # noqa: E731
+    # An actuator behind a stiff servo may push thousands of newtons in this state-by-state view: what the motion needs counts first.
+    need, push = rms(needed), rms(pushed)
+    force = np.where(need > 1e-9, need, push)
+    first = logs[0]
+    exogenous = {k: float(np.median(np.concatenate([log.exogenous[k] for log in logs]))) for k in first.exogenous}
+    channels = {
+        k: (float(np.std(np.concatenate([log.channels[k].values.reshape(len(log), -1) for log in logs]), axis=0).max()), first.channels[k].noise or 0.0)
+        for k in first.channels
+    }
+    return Scales(force, rms(qvel), ctrl.std(0) + 0.1 * np.abs(ctrl).mean(0), rms(acting), first.interval, exogenous, channels)
+
+
+def candidates(bench: Bench, logs: Sequence[Log]) -> list[Effect]:
+    """Every effect that the model can have and that this kind of problem can show."""
+    choice = bench.dataset.mapping.effects
+    found = propose(bench.plant.model, scales(bench, logs), only=choice.only, exclude=choice.exclude)
+    if bench.mode == "inverse":
+        # Forces are predicted from motion: an effect on commands shows only if it can say what it would ask for instead.
+        hidden = lambda e: (overrides(e, "action") and not overrides(e, "demand")) or overrides(e, "sense")  # noqa: E731
+        found = [e for e in found if not hidden(e)]
+    available = set(logs[0].exogenous)
+    return [e for e in found if set(e.signals) <= available]

@@ -1,0 +1,98 @@
+"""Effects as plain data, and the corrected model as MJCF that plain MuJoCo loads."""
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured.fit import Fit
+from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.each import Each, each
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.rollout import Plant
+
+Array = NDArray[np.float64]
+_HOOKS_OUTSIDE_MJCF = ("action", "friction", "force", "sense", "unsense")
+
+
+def pack(fitted: Fit) -> dict[str, Any]:
+    """Psi and effects of a fit as JSON-able data; `unpack` reads it back."""
+    psi, thetas = fitted.plant.split(fitted.x)
+    return {
+        "psi": dict(zip(fitted.plant.space.names, map(float, psi), strict=True)),
+        "effects": [_pack_effect(e, t) for e, t in zip(fitted.plant.effects, thetas, strict=True)],
+    }
+
+
+def _pack_effect(effect: Effect, theta: Array) -> dict[str, Any]:
+    return {
+        "family": effect.family,
+        "where": list(effect.where),
+        "each": isinstance(effect, Each),
+        "parameters": {p.name: float(v) for p, v in zip(effect.params, theta, strict=True)},
+        "units": {p.name: p.unit for p in effect.params},
+    }
+
+
+def unpack(data: dict[str, Any], plant: Plant) -> tuple[Plant, Array]:
+    """The plant with its effects, and the full parameter vector (size,)."""
+    effects, thetas = [], []
+    for row in data["effects"]:
+        effect = unpack_effect(row)
+        effects.append(effect)
+        thetas.append(np.array([row["parameters"][p.name] for p in effect.params]))
+    whole = plant.with_effects(effects)
+    return whole, np.concatenate([plant.space.vector(data["psi"]), *thetas])
+
+
+def unpack_effect(row: dict[str, Any]) -> Effect:
+    """An effect from its packed form."""
+    if not row["each"]:
+        return build(row["family"], row["where"], row["parameters"], row["units"])
+    members = []
+    for place in row["where"]:
+        of = {k.rpartition("@")[0]: v for k, v in row["parameters"].items() if k.rpartition("@")[2] == place}
+        units = {k.rpartition("@")[0]: v for k, v in row["units"].items() if k.rpartition("@")[2] == place}
+        members.append(build(row["family"], [place], of, units))
+    return each(members)
+
+
+def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array) -> tuple[str, list[Effect]]:
+    """MJCF text with psi and every effect that MJCF can say, and the effects that it cannot.
+
+    Effects that only edit model fields are carried through those fields; effects with a structural edit of their own
+    (delay, lag, dry friction) are carried by it; all others stay outside.
+    """
+    spec = spec.copy()
+    model = spec.compile()
+    fields = ModelFields(model, copy.copy(model))
+    psi, thetas = plant.split(x)
+    plant.space.write(fields, psi)
+    pairs = list(zip(plant.effects, thetas, strict=True))
+    for effect, theta in pairs:
+        if overrides(effect, "model") and not overrides(effect, "spec") and not _outside(effect):
+            effect.model(fields, theta)
+    fields.commit()
+    spec.copy_back(model)
+    outside = [e for e, theta in pairs if not _carried(e, theta, spec)]
+    spec.compile()
+    return spec.to_xml(), outside
+
+
+def _outside(effect: Effect) -> bool:
+    return any(overrides(effect, hook) for hook in _HOOKS_OUTSIDE_MJCF)
+
+
+def _carried(effect: Effect, theta: Array, spec: mujoco.MjSpec) -> bool:
+    if overrides(effect, "spec"):
+        return effect.spec(spec, theta)
+    return overrides(effect, "model") and not _outside(effect)
+
+
+def effects_of(plant: Plant, x: Array, which: Sequence[Effect] | None = None) -> list[tuple[Effect, Array]]:
+    """(effect, theta) pairs of a fitted vector, all or some."""
+    return [(e, t) for e, t in zip(plant.effects, plant.split(x)[1], strict=True) if which is None or e in which]

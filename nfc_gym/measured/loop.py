@@ -1,0 +1,243 @@
+"""`close_loop`: measured logs in; calibrated parameters, named effects, errors before and after, and a corrected model out."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from rich.console import Console
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.measured import verdict as say
+from nfc_gym.measured.bench import Bench, candidates, make_bench, model_path
+from nfc_gym.measured.dataset import Dataset, load
+from nfc_gym.measured.details import details
+from nfc_gym.measured.export import corrected, effects_of, pack, unpack
+from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.metric import metric, unexplained_variance
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.report import render
+from nfc_gym.measured.search import Data, Found, Options, Search
+from nfc_gym.measured.splits import Fold
+from nfc_gym.measured.stages import Stages, digest, write_whole
+from nfc_gym.physics.rollout import Plant
+
+Array = NDArray[np.float64]
+_WORK = 24_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
+_REPLICAS = 4
+
+
+@dataclass
+class _Run:
+    """What the steps of one run share."""
+
+    bench: Bench
+    stages: Stages
+    seed: int
+    say: Callable[[str], None]
+
+
+def close_loop(
+    mapping: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    jobs: int = 0,
+    overwrite: bool = False,
+    resume: bool = True,
+    fold: str | None = None,
+    console: Console | None = None,
+) -> dict[str, Any]:
+    """Close the loop on the logs that a mapping file names.
+
+    Args:
+      mapping: the mapping file.
+      out: folder for `report.json`, `report.html`, `model.xml`, `effects.yaml`; with `split: {by: rotate}` one folder a
+        fold beneath it, and a summary.
+      seed: the same inputs and seed give the same report.
+      jobs: threads of the roll-outs; 0 takes every core.
+      overwrite: replace an earlier run's results.
+      resume: go on from the last finished stage of an interrupted run.
+      fold: only this fold.
+      console: where progress goes; None is silent.
+
+    Returns:
+      The report, as written to `report.json`.
+
+    Raises:
+      InputError: the mapping, the model or the logs cannot be used; nothing is written then.
+    """
+    dataset = load(mapping)
+    bench = make_bench(dataset, jobs)
+    key = digest(mapping, model_path(dataset), *dataset.files, extra=f"{seed} {version('nfc_gym')}")
+    folds = [dataset.fold(fold)] if fold is not None else list(dataset.folds)
+    if len(dataset.folds) == 1:
+        return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)
+    Stages(out, key, overwrite, resume)
+    reports = {}
+    for f in folds:
+        if console:
+            console.print(f"[bold]fold {f.name}[/bold] ({len(reports) + 1} of {len(folds)})")
+        finished = out / f.name / "report.json"
+        if finished.exists() and resume and not overwrite:
+            reports[f.name] = json.loads(finished.read_text())
+            continue
+        reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, digest(extra=key + f.name), overwrite, resume, console)
+    summary = _summary(dataset, reports)
+    write_whole(out / "report.json", json.dumps(summary, indent=1))
+    return summary
+
+
+def _summary(dataset: Dataset, reports: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """One report over the folds: the effects that each found; the first fold's own report carries the rest."""
+    first = next(iter(reports.values()))
+    counts: dict[str, int] = {}
+    for r in reports.values():
+        for e in r["effects"]:
+            counts[e["id"]] = counts.get(e["id"], 0) + 1
+    keys = ("schema", "model", "seed", "versions")
+    return {k: first[k] for k in keys} | {
+        "folds": {name: {"verdict": r["verdict"], "effects": [e["id"] for e in r["effects"]], "chi2": r["chi2"], "error": r["error"]} for name, r in reports.items()},
+        "effects_found_in": {k: f"{n} of {len(reports)} folds" for k, n in sorted(counts.items(), key=lambda kv: -kv[1])},
+        "seconds": sum(r["seconds"] for r in reports.values()),
+    }
+
+
+def _fold(
+    bench: Bench, dataset: Dataset, fold: Fold, out: Path, seed: int, key: str, overwrite: bool, resume: bool, console: Console | None
+) -> dict[str, Any]:
+    began = time.monotonic()
+    stages = Stages(out, key, overwrite, resume)
+
+    def tell(text: str) -> None:
+        if console:
+            console.print(f"[dim]{time.monotonic() - began:6.1f} s[/dim]  {text}")
+
+    run = _Run(bench, stages, seed, tell)
+    fitting, selecting, verifying = (dataset.of(s, fold) for s in ("fit", "select", "verify"))
+    if not verifying:
+        raise InputError("no log verifies: give one `split: verify`, or let `split` divide them")
+    whole = bench.problem(fitting)
+    steps = bench.dataset.mapping.segments.length / bench.plant.model.opt.timestep
+    work = bench.problem(fitting, most=max(40, int(_WORK / steps)))
+    select = bench.problem(selecting, most=max(40, int(_WORK / steps)))
+    found = _search(run, fitting, work, select)
+    final = _final(run, found, whole)
+    report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole)
+    report["seconds"] = round(time.monotonic() - began, 1)
+    _write(out, bench, final, report)
+    tell(f"[bold]{report['verdict']}[/bold]: " + ("; ".join(e["sentence"] for e in report["effects"]) or "no effect claimed"))
+    return report
+
+
+def _calibrate(problem: Problem, plant: Plant, x: Array, tell: Callable[[str], None]) -> tuple[Fit, Array]:
+    """Psi alone, under a metric that is refreshed with what it leaves unexplained, and the noise covariance there."""
+    sigma = problem.covariance(plant, x)
+    current = x
+    fitted = None
+    for turn in range(3):
+        residual = problem.residual(plant, current[None])[0]
+        under = metric(problem, sigma, unexplained_variance(problem, residual, sigma))
+        fitted = fit(problem, under, plant, current, rounds=12)
+        current = fitted.x
+        tell(f"calibrating psi, pass {turn + 1} of 3")
+    assert fitted is not None
+    return fitted, problem.covariance(plant, fitted.x)
+
+
+def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
+    """Calibrate, then search; both are stages. A resumed run repeats the cheap last screening for its tables."""
+    bench, plant = run.bench, run.bench.plant
+    run.say(f"{len(work)} segments to fit, {len(select)} to select on")
+    done = run.stages.get("calibrated")
+    start = plant.space.vector(done["psi"]) if done else plant.null
+    if done:
+        sigma = work.covariance(plant, start)
+        under = metric(work, sigma, unexplained_variance(work, work.residual(plant, start[None])[0], sigma))
+        calibrated = fit(work, under, plant, start, rounds=1)
+    else:
+        calibrated, sigma = _calibrate(work, plant, start, run.say)
+        run.stages.put("calibrated", pack(calibrated))
+    pool = candidates(bench, fitting)
+    data = Data(work, sigma)
+    search = Search(data, Data(select, select.covariance(plant, calibrated.x)), plant, pool, Options(seed=run.seed), run.say)
+    return search.run(calibrated)
+
+
+def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
+    """Calibrated and extended model refitted on every fit segment."""
+    done = run.stages.get("final")
+    out = []
+    for name, start in (("calibrated", found.calibrated), ("extended", found.extended)):
+        plant, x = unpack(done[name], run.bench.plant) if done else (start.plant, start.x)
+        sigma = whole.covariance(plant, x)
+        under = metric(whole, sigma, unexplained_variance(whole, whole.residual(plant, x[None])[0], sigma))
+        run.say(f"fitting the {name} model on all {len(whole)} segments")
+        out.append(fit(whole, under, plant, x, rounds=1 if done else 12))
+    run.stages.put("final", {"calibrated": pack(out[0]), "extended": pack(out[1])})
+    return out[0], out[1]
+
+
+def _report(run: _Run, dataset: Dataset, fold: Fold, found: Found, final: tuple[Fit, Fit], problem: Problem, whole: Problem) -> dict[str, Any]:
+    calibrated, extended = final
+    rng = np.random.default_rng(run.seed)
+    nominal = (run.bench.plant, run.bench.plant.null)
+    models = say.Models(nominal, (calibrated.plant, calibrated.x), (extended.plant, extended.x))
+    run.say(f"verifying on {len(problem)} segments")
+    v = say.verify(problem, models, _REPLICAS, rng)
+    verdict = say.verdict(v, len(extended.plant.effects), found.generic is not None)
+    shares = say.excess_shares(v, problem, extended, models.calibrated)
+    splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
+    return {
+        "schema": 1,
+        "model": dataset.mapping.model_file,
+        "fold": fold.name,
+        "logs": splits,
+        "independent_splits": dataset.independent_splits,
+        "parameters": say.parameter_rows(extended, nominal[1], whole),
+        "effects": say.effect_rows(extended, found.rounds, whole, shares),
+        "verdict": verdict,
+        "unexplained": say.unexplained(v, found) if verdict in ("unexplained", "partly explained") else None,
+        "error": say.errors(v),
+        "chi2": {stage: v.chi2(stage) for stage in v.residual}
+        | {"null": float(v.null.mean()), "null_95": say.null_bound(v), "extended_over_calibrated_95": say.gain_interval(v, rng)},
+        "identifiability": say.identifiability(found),
+        "rounds": [r.__dict__ for r in found.rounds],
+        "noise": _noise(run.bench, dataset, fold),
+        "details": details(run.bench, v, models, dataset.of("verify", fold)),
+        "seed": run.seed,
+        "versions": {"nfc_gym": version("nfc_gym"), "mujoco": mujoco.__version__},
+    }
+
+
+def _noise(bench: Bench, dataset: Dataset, fold: Fold) -> list[dict[str, Any]]:
+    """Noise of each channel and whether it was declared or estimated."""
+    from nfc_gym.measured.states import channel_noise
+
+    log = dataset.of("fit", fold)[0]
+    return [
+        {"channel": k, "noise": channel_noise(log, k), "unit": c.unit, "estimated": c.noise is None} for k, c in log.channels.items()
+    ]
+
+
+def _write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, Any]) -> None:
+    """All outputs, each whole or not at all; `report.json` last, since it marks a finished run."""
+    calibrated, extended = final
+    xml, outside = corrected(bench.spec, extended.plant, extended.x)
+    write_whole(out / "model.xml", xml)
+    rows = {e["id"]: e for e in report["effects"]}
+    listed = [rows[e.id] for e, _ in effects_of(extended.plant, extended.x, outside)]
+    effects = {"version": 1, "model_sha256": digest(out / "model.xml"), "effects": listed, "carried_by_model": [i for i in rows if i not in {e["id"] for e in listed}]}
+    write_whole(out / "effects.yaml", yaml.safe_dump(effects, sort_keys=False, allow_unicode=True))
+    packed = {"nominal": {"psi": {}, "effects": []}, "calibrated": pack(calibrated), "extended": pack(extended)}
+    write_whole(out / "fit.json", json.dumps({"fold": report["fold"], **packed}, indent=1))
+    shown = report.pop("details")
+    write_whole(out / "report.html", render(report, shown))
+    write_whole(out / "report.json", json.dumps(report, indent=1))

@@ -1,0 +1,116 @@
+"""`predict`: what the nominal, calibrated or extended model says of every log, one array a log."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.log import Log
+from nfc_gym.measured.bench import Bench, make_bench
+from nfc_gym.measured.dataset import Dataset, load
+from nfc_gym.measured.export import unpack
+from nfc_gym.measured.instant import ForwardProblem, InverseProblem
+from nfc_gym.measured.problem import RolloutProblem, interpolate
+from nfc_gym.measured.segments import Layout, servos
+from nfc_gym.physics.rollout import Plant
+
+Array = NDArray[np.float64]
+
+
+def predict(mapping: Path, fit: Path | None, mode: str, stage: str, out: Path, *, restart: float | None = None) -> dict[str, Array]:
+    """Predict every log and write one array a log to an npz file.
+
+    Args:
+      mapping: the mapping file.
+      fit: folder that `close_loop` wrote; with folds each log is predicted by the fit that did not see its group.
+      mode: rollout (T, channels' columns in the mapping's order) from each log's first sample; inverse (T, actuators);
+        forward (T, sensors' columns).
+      stage: nominal, calibrated or extended.
+      out: npz file to write.
+      restart: rollout only: start anew from the measured state every so many seconds.
+
+    Raises:
+      InputError: the fit does not belong to the mapping, or a model is unstable on a log.
+    """
+    dataset = load(mapping)
+    bench = make_bench(dataset)
+    models = _models(bench, dataset, fit, stage)
+    results: dict[str, Array] = {}
+    for fold in dataset.folds:
+        logs = [log for log in dataset.logs if len(dataset.folds) == 1 or fold.splits[log.name] == "verify"]
+        if logs:
+            plant, x = models[fold.name]
+            results |= _predict(bench, plant, x, logs, mode, restart)
+    joined = _join(results)
+    part = out.with_name(f".{out.name}.part.npz")
+    np.savez_compressed(part, **joined)  # type: ignore[arg-type]
+    part.replace(out)
+    return joined
+
+
+def _models(bench: Bench, dataset: Dataset, fit: Path | None, stage: str) -> dict[str, tuple[Plant, Array]]:
+    out = {}
+    for fold in dataset.folds:
+        if fit is None or stage == "nominal":
+            out[fold.name] = (bench.plant, bench.plant.null)
+            continue
+        file = fit / fold.name / "fit.json" if len(dataset.folds) > 1 else fit / "fit.json"
+        if not file.exists():
+            raise InputError(f"{file} does not exist: run close-loop on this mapping with --out {fit} first")
+        out[fold.name] = unpack(json.loads(file.read_text())[stage], bench.plant)
+    return out
+
+
+def _predict(bench: Bench, plant: Plant, x: Array, logs: list[Log], mode: str, restart: float | None) -> dict[str, Array]:
+    if mode == "rollout":
+        return {log.name: _roll(bench, plant, x, log, restart) for log in logs}
+    kind = InverseProblem if mode == "inverse" else ForwardProblem
+    states = [bench.states[log.name] for log in logs]
+    problem = kind(bench.plant.model, logs, states, bench.dataset.mapping.segments.length, most=sum(map(len, logs)))
+    values = problem.evaluate(plant, x[None], problem.tracks)
+    return {log.name: v[0] for log, v in zip(logs, values, strict=True)}
+
+
+def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None) -> Array:
+    """One open-loop roll-out of a log, or pieces of `restart` seconds, at the log's own samples."""
+    mapping = bench.dataset.mapping
+    dt = float(plant.model.opt.timestep)
+    length = min(restart, log.duration) if restart else log.duration
+    starts = np.searchsorted(log.time, np.arange(0.0, log.duration, length) - 1e-9) if restart else np.array([0])
+    laws = servos(plant.model, {k: (c.servo.joint, c.servo.limit) for k, c in mapping.controls.items() if c.servo is not None})
+    linear = frozenset(k for k, c in mapping.controls.items() if c.hold == "linear")
+    pieces = []
+    for i, begin in enumerate(starts):
+        end = int(starts[i + 1]) if i + 1 < len(starts) else len(log)
+        part = log.part(int(begin), max(end, int(begin) + 2), log.name)
+        states = _slice(bench.states[log.name], int(begin), max(end, int(begin) + 2))
+        layout = Layout(part.duration, 0.0, (part.duration,), part.duration + 1, dt)
+        problem = RolloutProblem(plant.model, [part], [states], layout, laws, linear, settle=mapping.segments.start == "settled")
+        values, traj = problem.predict(plant, x[None], problem.segments, problem.observers)
+        if not traj.stable.all():
+            raise InputError(f"log {log.name!r}: the simulation is unstable with this model; shorten segments.timestep or use --restart")
+        step = (part.time / dt)[None]
+        columns = [interpolate(v, step, o.quaternion)[0, 0] for v, o in zip(values, problem.observers, strict=True)]
+        pieces.append(np.concatenate(columns, -1)[: end - begin])
+    out = np.concatenate(pieces)
+    return out[:, 0] if out.shape[1] == 1 else out
+
+
+def _slice(states: Any, start: int, stop: int) -> Any:
+    from dataclasses import replace
+
+    keys = ("qpos", "qvel", "qacc", "qpos_sd", "qvel_sd")
+    return replace(states, **{k: getattr(states, k)[start:stop] for k in keys})
+
+
+def _join(results: dict[str, Array]) -> dict[str, Array]:
+    """Parts of a log that was cut by time (`<log>@fit`, ...) become one array again, in the order of time."""
+    order = ["fit", "select", "verify"]
+    out: dict[str, Array] = {}
+    for name in sorted(results, key=lambda n: (n.split("@")[0], order.index(n.split("@")[1]) if "@" in n else 0)):
+        base = name.split("@")[0]
+        out[base] = np.concatenate([out[base], results[name]]) if base in out else results[name]
+    return out

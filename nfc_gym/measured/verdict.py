@@ -1,0 +1,245 @@
+"""What the search found, said on logs nobody fitted to: errors, chi-squared, shares, and a verdict."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured.contest import bootstrap, clusters
+from nfc_gym.measured.fit import Fit, uncertainty
+from nfc_gym.measured.metric import metric
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.search import Found, Round
+from nfc_gym.physics.effects.each import Each
+from nfc_gym.physics.rollout import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Models:
+    """The three models that are compared: (plant, x) each."""
+
+    nominal: tuple[Plant, Array]
+    calibrated: tuple[Plant, Array]
+    extended: tuple[Plant, Array]
+
+    def items(self) -> list[tuple[str, Plant, Array]]:
+        """(stage, plant, x) in order."""
+        return [(n, *getattr(self, n)) for n in ("nominal", "calibrated", "extended")]
+
+
+@dataclass(frozen=True)
+class Verified:
+    """Residuals on the verification logs, in their own units and whitened by the noise alone.
+
+    residual and white: stage -> (S, m); null: (K,) chi-squared of models without any unknown effect.
+    """
+
+    problem: Problem
+    residual: dict[str, Array]
+    white: dict[str, Array]
+    sigma: Array
+    null: Array
+
+    def chi2(self, stage: str) -> float:
+        """Mean square whitened residual; about 1 where noise explains it."""
+        return mean_square(self.problem, self.white[stage])
+
+
+def mean_square(problem: Problem, white: Array) -> float:
+    """Mean of whitened squares over what counts; a block's share is bounded so that one wild block does not decide."""
+    squares = np.minimum(white**2, 1e6)
+    return float(squares[problem.mask].mean())
+
+
+def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Generator) -> Verified:
+    """Predict the verification logs with all three models, and what chi-squared a perfect model would show.
+
+    The null replicas are the extended model's own motion with fresh noise, through the same pipeline.
+    """
+    plant, x = models.extended
+    sigma = problem.covariance(plant, x)
+    measure = metric(problem, sigma)
+    residual, white = {}, {}
+    for stage, p, v in models.items():
+        r = problem.residual(p, v[None])
+        residual[stage], white[stage] = r[0], measure.whiten(r)[0]
+    null = []
+    for _ in range(replicas):
+        twin = problem.synthetic(plant, x, rng)
+        under = metric(twin, twin.covariance(plant, x))
+        null.append(mean_square(twin, under.whiten(twin.residual(plant, x[None]))[0]))
+    return Verified(problem, residual, white, sigma, np.array(null))
+
+
+def errors(v: Verified) -> dict[str, Any]:
+    """Root-mean-square error of each group of quantities at each horizon, before and after, and the noise floor."""
+    c = v.problem.columns
+    levels = sorted(set(c.horizon.tolist()))
+    groups: dict[str, Any] = {}
+    for group in dict.fromkeys(c.group):
+        of = np.array([g == group for g in c.group])
+        row: dict[str, Any] = {"unit": c.unit[int(np.flatnonzero(of)[0])]}
+        for stage, r in v.residual.items():
+            row[stage] = [_rms(r, v.problem.mask & (of & (c.horizon == h))) for h in levels]
+        floor = np.sqrt(np.einsum("sii->si", v.sigma))
+        row["noise_floor"] = [_rms(floor, v.problem.mask & (of & (c.horizon == h))) for h in levels]
+        groups[group] = row
+    return {"horizons_s": levels, "groups": groups}
+
+
+def _rms(values: Array, where: NDArray[np.bool_]) -> float | None:
+    picked = values[where & np.isfinite(values)]
+    return float(np.sqrt((picked**2).mean())) if picked.size else None
+
+
+def verdict(v: Verified, effects: int, generic: bool) -> str:
+    """One of: nothing missing, explained, partly explained, unexplained."""
+    bound = null_bound(v)
+    after = v.chi2("extended")
+    # A tenth above the null's own 95 % bound is not worth alarming anybody: the noise level itself is not known better.
+    settled = after <= 1.1 * bound
+    if effects:
+        return "explained" if settled and not generic else "partly explained"
+    return "nothing missing" if settled else "unexplained"
+
+
+def null_bound(v: Verified) -> float:
+    """95 % bound of chi-squared of a perfect model."""
+    if len(v.null) == 0:
+        return 1.0
+    spread = v.null.std(ddof=1) if len(v.null) > 1 else 0.05
+    return float(v.null.mean() + 1.645 * max(spread, 0.01))
+
+
+def unexplained(v: Verified, found: Found) -> dict[str, Any] | None:
+    """Where the largest remaining misfit sits, and the named effect that comes nearest."""
+    squares = np.where(v.problem.mask, np.minimum(v.white["extended"] ** 2, 1e6), 0.0)
+    c = v.problem.columns
+    keys = list(dict.fromkeys(zip(c.place, c.group, strict=True)))
+    share = [squares[:, [k == key for k in zip(c.place, c.group, strict=True)]].sum() for key in keys]
+    place, group = keys[int(np.argmax(share))]
+    last = found.rounds[-1]
+    nearest = next((r for r in last.ranking if not r["generic"]), None)
+    total = max(float(found.extended.losses.sum()), 1e-9)
+    text = last.reason or "no effect of the library explains it"
+    generic = next((r for r in last.ranking if r["generic"]), None)
+    if found.generic is not None and generic is not None:
+        text = f"looks like a function of {generic['id'].split(':', 1)[1]} ({generic['id'].split(':', 1)[0].replace('_', ' ')})"
+    return {
+        "coordinate": place if place.startswith("sensor") else f"{place} ({group})",
+        "where": place,
+        "description": f"largest share of the remaining misfit: {float(np.max(share) / max(sum(share), 1e-9)):.0%}; {text}",
+        "nearest": nearest["id"] if nearest else None,
+        "nearest_share": max(nearest["gain_fit"], 0.0) / total if nearest else 0.0,
+    }
+
+
+def parameter_rows(fitted: Fit, nominal: Array, problem: Problem) -> list[dict[str, Any]]:
+    """Psi with intervals: estimate, 95 % bounds, whether the data show it, whether it left its prior."""
+    space = fitted.plant.space
+    sd = uncertainty(fitted, clusters(problem))
+    rows = []
+    for i, p in enumerate(space.parameters):
+        value, width = float(fitted.x[i]), p.high - p.low
+        rows.append(
+            {
+                "name": p.name,
+                "unit": p.unit,
+                "nominal": float(nominal[i]),
+                "estimate": value,
+                "low": float(max(p.low, value - 1.96 * sd[i])),
+                "high": float(min(p.high, value + 1.96 * sd[i])),
+                "identifiable": bool(p.anchored or sd[i] < 0.25 * width / np.sqrt(12)),
+                "left_prior": bool(not p.anchored and min(value - p.low, p.high - value) < 0.005 * width),
+            }
+        )
+    return rows
+
+
+def effect_rows(fitted: Fit, rounds: Sequence[Round], problem: Problem, shares: dict[str, float]) -> list[dict[str, Any]]:
+    """Accepted effects with sentences, intervals and equivalents."""
+    sd = uncertainty(fitted, clusters(problem))
+    at = len(fitted.plant.space)
+    equivalents = {r.accepted: r.equivalents for r in rounds if r.accepted}
+    rows = []
+    for effect, theta in zip(fitted.plant.effects, fitted.plant.split(fitted.x)[1], strict=True):
+        spread = sd[at : at + len(theta)]
+        at += len(theta)
+        rows.append(
+            {
+                "id": effect.id,
+                "family": effect.family,
+                "where": effect.where[0] if len(effect.where) == 1 else list(effect.where),
+                "sentence": effect.say(theta, spread),
+                "share_of_excess": shares.get(effect.id, 0.0),
+                "equivalents": equivalents.get(effect.id, []),
+                "own_values": isinstance(effect, Each),
+                "parameters": {
+                    p.name: {
+                        "value": float(t),
+                        "low": float(max(p.low, t - 1.96 * s)),
+                        "high": float(min(p.high, t + 1.96 * s)),
+                        "unit": p.unit,
+                    }
+                    for p, t, s in zip(effect.params, theta, spread, strict=True)
+                },
+            }
+        )
+    return rows
+
+
+def identifiability(found: Found) -> list[dict[str, Any]]:
+    """For each candidate of the last screening the smallest size that would show, and its worst mimic."""
+    kept = [s for s in found.screened if s.columns.shape[1]]
+    columns = [c / max(np.linalg.norm(c), 1e-12) for c in (s.columns @ np.ones(s.columns.shape[1]) for s in kept)]
+    if not columns:
+        return []
+    like = np.abs(np.array(columns) @ np.array(columns).T)
+    np.fill_diagonal(like, 0)
+    rows = []
+    for i, s in enumerate(kept):
+        first = next(j for j, p in enumerate(s.effect.params) if not p.shape)
+        size = float(np.linalg.norm(s.columns[:, 0]))
+        j = int(like[i].argmax())
+        rows.append(
+            {
+                "id": s.effect.id,
+                "smallest_detectable": None if size < 1e-6 else float(abs(s.probe[0]) * 3.3 / size),
+                "unit": s.effect.params[first].unit,
+                "worst_mimic": kept[j].effect.id if len(kept) > 1 else None,
+                "distinguishable": bool(like[i, j] < 0.95),
+            }
+        )
+    return rows
+
+
+def excess_shares(v: Verified, problem: Problem, fitted: Fit, calibrated: tuple[Plant, Array]) -> dict[str, float]:
+    """Share of the excess chi-squared that comes back when each effect alone is taken out, on the verification logs."""
+    measure = metric(problem, v.sigma)
+    floor = float(v.null.mean()) if len(v.null) else 1.0
+    excess = max(v.chi2("calibrated") - floor, 1e-9)
+    shares = {}
+    for effect in fitted.plant.effects:
+        x = fitted.x.copy()
+        at = len(fitted.plant.space)
+        for e in fitted.plant.effects:
+            if e is effect:
+                x[at : at + len(e.params)] = e.null
+            at += len(e.params)
+        worse = mean_square(problem, measure.whiten(problem.residual(fitted.plant, x[None]))[0])
+        shares[effect.id] = float(np.clip((worse - v.chi2("extended")) / excess, 0, 1))
+    return shares
+
+
+def gain_interval(v: Verified, rng: np.random.Generator) -> tuple[float, float]:
+    """95 % interval of the ratio of extended to calibrated chi-squared over the verification logs."""
+    blocks = clusters(v.problem)
+    before = np.minimum(v.white["calibrated"] ** 2, 1e6).sum(1)
+    after = np.minimum(v.white["extended"] ** 2, 1e6).sum(1)
+    seed = int(rng.integers(2**31))
+    ratio = bootstrap(after, blocks, np.random.default_rng(seed)) / np.maximum(bootstrap(before, blocks, np.random.default_rng(seed)), 1e-12)
+    return float(np.quantile(ratio, 0.025)), float(np.quantile(ratio, 0.975))
