@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 _INDEXED = re.compile(r"^(.+)\[(\d+)\]$")
 
 
-class Columns:
+class LogColumns:
     """The columns of one log file.
 
     Every method raises `InputError` for a column that is missing, not numeric or of another length.
@@ -43,7 +43,7 @@ class Columns:
         return values.reshape(self.rows)
 
     def many(self, names: tuple[str, ...]) -> Array:
-        """Columns side by side, (T, k); a name of a two-dimensional array stands for all its columns."""
+        """LogColumns side by side, (T, k); a name of a two-dimensional array stands for all its columns."""
         return np.concatenate([self._rows(name).reshape(self.rows, -1) for name in names], axis=1)
 
     def product(self, names: tuple[str, ...], scale: float) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.measured import units
 from nfc_gym.measured.channels import parse_channel
-from nfc_gym.measured.columns import Columns
+from nfc_gym.measured.columns import LogColumns
 from nfc_gym.measured.entries import Measured, Servo
 from nfc_gym.measured.mapping import Mapping, Split, load_mapping
 from nfc_gym.measured.readers import read_table
@@ -68,7 +68,7 @@ class Dataset:
 
 
 @dataclass(frozen=True)
-class Problem:
+class Defect:
     """Something in a log file that stops it from being used: where in the mapping, and what it is and what to do."""
 
     where: str
@@ -79,16 +79,16 @@ def load(path: Path | str) -> Dataset:
     """Read a mapping file and all its logs.
 
     Raises:
-      InputError: the mapping or a log cannot be used; all problems of the first such log, one a line.
+      InputError: the mapping or a log cannot be used; all that is wrong with the first such log, one a line.
     """
     path = Path(path)
     mapping = load_mapping(path)
     sources = find_logs(mapping, path.parent)
     logs = []
     for source in sources:
-        log, problems = read_log(mapping, source)
+        log, defects = read_log(mapping, source)
         if log is None:
-            raise InputError("\n".join(f"{source.path}: {p.where}: {p.text}" for p in problems))
+            raise InputError("\n".join(f"{source.path}: {p.where}: {p.text}" for p in defects))
         logs.append(log)
     return assemble(mapping, path, sources, logs)
 
@@ -100,24 +100,24 @@ def assemble(mapping: Mapping, path: Path, sources: list[Source], logs: list[Log
     return Dataset(mapping, path, division.logs, division.folds, division.independent, files)
 
 
-def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Problem]]:
+def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]]:
     """One log file as the mapping describes it, or None and everything that is wrong with it."""
-    problems: list[Problem] = []
+    defects: list[Defect] = []
 
     def attempt(where: str, work: Callable[[], T]) -> T | None:
         try:
             return work()
         except InputError as e:
-            problems.append(Problem(where, str(e)))
+            defects.append(Defect(where, str(e)))
             return None
 
     try:
-        columns = Columns(read_table(source.path))
+        columns = LogColumns(read_table(source.path))
     except InputError as e:
-        return None, [Problem("file", str(e).removeprefix(f"{source.path}: "))]
+        return None, [Defect("file", str(e).removeprefix(f"{source.path}: "))]
     time = attempt("time", lambda: _time(mapping, columns))
     if time is None:
-        return None, problems
+        return None, defects
     m = mapping
     controls = {
         k: attempt(f"controls.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.controls.items()
@@ -138,14 +138,14 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Problem
         for k, c in m.controls.items()
         if c.servo
     }
-    if problems:
-        return None, problems
+    if defects:
+        return None, defects
     parts = {"controls": controls, "channels": channels, "exogenous": exogenous, "known": known, "servo": servo}
     log = attempt("log", lambda: Log(name=source.name, time=time, group=source.group, **parts))  # pyright: ignore
-    return log, problems
+    return log, defects
 
 
-def _time(mapping: Mapping, columns: Columns) -> Array:
+def _time(mapping: Mapping, columns: LogColumns) -> Array:
     name = mapping.time.columns[0]
     raw = columns.time(name)
     bad = np.flatnonzero(~np.isfinite(raw))
@@ -186,16 +186,16 @@ def _finite(values: Array, what: str, needed: NDArray[np.bool_] | None = None) -
     return values
 
 
-def _signal(columns: Columns, names: tuple[str, ...], unit: str) -> Array:
+def _signal(columns: LogColumns, names: tuple[str, ...], unit: str) -> Array:
     return units.to_si(_finite(columns.one(names[0]), f"column {names[0]!r}"), unit)
 
 
-def _servo(columns: Columns, servo: Servo) -> dict[str, Array]:
+def _servo(columns: LogColumns, servo: Servo) -> dict[str, Array]:
     terms = {"gain": servo.gain, "supply": servo.supply, "damping": servo.damping}
     return {name: _finite(columns.product(term.columns, term.scale), name) for name, term in terms.items()}
 
 
-def _channel(name: str, entry: Measured, columns: Columns) -> Channel:
+def _channel(name: str, entry: Measured, columns: LogColumns) -> Channel:
     parsed = parse_channel(name)
     raw = columns.many(entry.columns)
     width = len(entry.axes) if entry.axes else parsed.width or (1 if parsed.kind in ("joint", "force") else None)

@@ -1,0 +1,134 @@
+"""`nfc-gym check`: all that is wrong with a mapping, its model and its logs, in one place. Nothing is repaired."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+
+from nfc_gym.core import InputError, Log
+from nfc_gym.measured.dataset import Dataset, assemble, read_log
+from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order
+from nfc_gym.measured.mapping import SPLITS, Mapping, load_mapping
+from nfc_gym.measured.model import load_model
+from nfc_gym.measured.model_checks import model_findings
+from nfc_gym.measured.signal_checks import suspicions
+from nfc_gym.measured.splits import find_logs
+
+__all__ = ["Finding", "check", "examine", "require"]
+
+
+def check(dataset_path: Path | str) -> list[Finding]:
+    """Everything that is wrong or looks wrong, errors first; an empty list where nothing does."""
+    return examine(dataset_path)[1]
+
+
+def require(dataset_path: Path | str) -> tuple[Dataset, list[Finding]]:
+    """The data set, and the warnings and notes about it.
+
+    Raises:
+      InputError: something is wrong that no fit should be built on; all of it, one a line.
+    """
+    dataset, findings = examine(dataset_path)
+    errors = [f for f in findings if f.severity == "error"]
+    if dataset is None or errors:
+        raise InputError("\n".join(map(str, errors)))
+    return dataset, findings
+
+
+def examine(dataset_path: Path | str) -> tuple[Dataset | None, list[Finding]]:
+    """Read a data set once, and say all that is wrong with it; None where it cannot be used at all."""
+    path = Path(dataset_path)
+    try:
+        mapping = load_mapping(path)
+    except InputError as e:
+        return None, [_split_line(line, str(path)) for line in str(e).splitlines()]
+    findings: list[Finding] = []
+    model: mujoco.MjModel | None = None
+    try:
+        model = load_model(mapping.model_file, path.parent)
+        findings += model_findings(mapping, model)
+    except InputError as e:
+        findings.append(_finding("model", str(e).removeprefix("model ")))
+    dataset, found = _logs(mapping, path, model)
+    if dataset is not None:
+        found += _whole(dataset)
+    return dataset, in_order(findings + found)
+
+
+def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[Dataset | None, list[Finding]]:
+    try:
+        sources = find_logs(mapping, path.parent)
+    except InputError as e:
+        return None, [_finding("logs", str(e).removeprefix("logs: "))]
+    found: list[tuple[str, Suspicion]] = []
+    logs: list[Log] = []
+    for source in sources:
+        log, defects = read_log(mapping, source)
+        for defect in defects:
+            message, _, advice = defect.text.partition("; ")
+            found.append((source.name, Suspicion("error", defect.where, "defect", message, advice)))
+        if log is not None:
+            found += [(source.name, s) for s in suspicions(mapping, model, log)]
+            logs.append(log)
+    findings = gather(_promoted(found, len(sources)), len(sources))
+    if len(logs) < len(sources):
+        return None, findings
+    try:
+        return assemble(mapping, path, sources, logs), findings
+    except InputError as e:
+        return None, [*findings, _finding("split", str(e).removeprefix("split: "))]
+
+
+def _promoted(found: list[tuple[str, Suspicion]], logs: int) -> list[tuple[str, Suspicion]]:
+    """A channel that moves in no log says nothing: an error rather than a doubt."""
+    still = Counter(s.where for _, s in found if s.kind == "constant" and s.where.startswith("channels."))
+    return [
+        (log, replace(s, severity="error") if s.kind == "constant" and still[s.where] == logs else s)
+        for log, s in found
+    ]
+
+
+def _whole(dataset: Dataset) -> list[Finding]:
+    """What can only be judged over all logs: lengths, splits, what will be estimated."""
+    findings = []
+    segments, fold = dataset.mapping.segments, dataset.folds[0]
+    if segments.mode == "rollout":
+        for split in SPLITS:
+            longest = max((log.duration for log in dataset.of(split, fold)), default=0.0)
+            if longest < segments.horizons[-1]:
+                message = f"no log that {split if split == 'fit' else split + 's'} is as long as the longest horizon, "
+                message += f"{segments.horizons[-1]:g} s; the longest lasts {longest:.3g} s"
+                advice = "shorten segments.length and segments.horizons, record longer logs, or change `split`"
+                findings.append(Finding("error", "segments", message, advice))
+        short = [log.name for log in dataset.logs if log.duration < segments.horizons[-1]]
+        if short and len(short) < len(dataset.logs):
+            message = f"{len(short)} of {len(dataset.logs)} logs are shorter than the longest horizon, first {short[0]}"
+            findings.append(
+                Finding("warning", "segments", message, "they are left out; shorten the horizons to use them")
+            )
+        slow = max(log.interval for log in dataset.logs)
+        if segments.horizons[0] < 0.5 * slow:
+            message = (
+                f"the shortest horizon, {segments.horizons[0]:g} s, is below half a sampling interval ({slow:.3g} s)"
+            )
+            findings.append(Finding("warning", "segments", message, "begin with a horizon of one interval or more"))
+    if not dataset.independent_splits:
+        message = "some logs are cut by time, so fitting and verification are not independent"
+        findings.append(Finding("note", "split", message, "the report will say so; separate logs prove more"))
+    quiet = [name for name, c in dataset.mapping.channels.items() if c.noise is None]
+    if quiet:
+        advice = "give `noise` (standard deviation of one sample) where you know it"
+        findings.append(Finding("note", "channels", f"noise will be estimated for {', '.join(quiet)}", advice))
+    return findings
+
+
+def _finding(where: str, text: str) -> Finding:
+    message, _, advice = text.partition("; ")
+    return Finding("error", where, message, advice)
+
+
+def _split_line(line: str, path: str) -> Finding:
+    """`file:12: key: message; advice` as a finding."""
+    place, _, rest = line.removeprefix(path).partition(": ")
+    return _finding(path + place, rest or line)

@@ -1,0 +1,109 @@
+"""Whether a mapping and its model fit together: actuators, joints, bodies, sensors, parameters, known fields."""
+
+from collections.abc import Iterator
+from difflib import get_close_matches
+
+import mujoco
+
+from nfc_gym.core import InputError
+from nfc_gym.measured.channels import ChannelName, parse_channel
+from nfc_gym.measured.findings import Finding
+from nfc_gym.measured.mapping import Mapping
+from nfc_gym.measured.observe import observer
+from nfc_gym.measured.units import si_unit
+from nfc_gym.measured.yaml_marks import suggest
+from nfc_gym.physics.fields import names_of
+from nfc_gym.physics.parameters import ParameterSpace, resolve, split_field
+
+_OBJ = mujoco.mjtObj
+
+
+def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
+    """Everything in the mapping that the model does not have, or has otherwise."""
+    names = {
+        "joint": names_of(model, _OBJ.mjOBJ_JOINT, model.njnt),
+        "body": names_of(model, _OBJ.mjOBJ_BODY, model.nbody),
+        "sensor": names_of(model, _OBJ.mjOBJ_SENSOR, model.nsensor),
+        "actuator": names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nu),
+    }
+    yield from _controls(mapping, names)
+    for name, channel in mapping.channels.items():
+        where, parsed = f"channels.{name}", parse_channel(name)
+        absent = _absent(where, "actuator" if parsed.kind == "force" else parsed.kind, parsed.object, names)
+        if absent is not None:
+            yield absent
+            continue
+        try:
+            observer(model, name, channel.axis_indices)
+        except InputError as e:
+            yield Finding("error", where, str(e).removeprefix(f"channel {name!r}: "))
+            continue
+        if parsed.kind == "joint":
+            yield from _joint_unit(where, parsed, si_unit(channel.unit or "1"), model)
+        if parsed.kind == "sensor":
+            size = int(model.sensor_dim[mujoco.mj_name2id(model, _OBJ.mjOBJ_SENSOR, parsed.object)])
+            if channel.axes and max(channel.axis_indices or ()) >= size:
+                yield Finding("error", where, f"axes {list(channel.axes)} where the sensor has {size} components")
+    yield from _fields(mapping, model)
+
+
+def _controls(mapping: Mapping, names: dict[str, list[str]]) -> Iterator[Finding]:
+    driven = set()
+    for name, control in mapping.controls.items():
+        actuator = name.removeprefix("ctrl:")
+        driven.add(actuator)
+        absent = _absent(f"controls.{name}", "actuator", actuator, names)
+        if absent is not None:
+            yield absent
+        if control.servo is not None:
+            absent = _absent(f"controls.{name}.servo.joint", "joint", control.servo.joint, names)
+            if absent is not None:
+                yield absent
+    idle = [repr(a) for a in names["actuator"] if a not in driven]
+    if idle and mapping.segments.mode != "inverse":
+        advice = "name their columns under `controls`, or remove them from the model"
+        yield Finding(
+            "warning", "controls", f"no column drives actuator {', '.join(idle)}: 0 is sent throughout", advice
+        )
+
+
+def _absent(where: str, kind: str, name: str, names: dict[str, list[str]]) -> Finding | None:
+    if name in names[kind]:
+        return None
+    return Finding("error", where, f"the model has no {kind} {name!r}", suggest(name, [n for n in names[kind] if n]))
+
+
+def _joint_unit(where: str, parsed: ChannelName, unit: str, model: mujoco.MjModel) -> Iterator[Finding]:
+    joint = mujoco.mj_name2id(model, _OBJ.mjOBJ_JOINT, parsed.object)
+    slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    wanted = parsed.units[1 if slides else 0]
+    if unit != wanted:
+        kind = "slides" if slides else "turns"
+        yield Finding("error", where, f"joint {parsed.object!r} {kind}, but the unit is {unit!r}", f"want {wanted}")
+
+
+def _fields(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
+    for i, entry in enumerate(mapping.parameters):
+        where = f"parameters.{i} ({entry.name})"
+        try:
+            for parameter in entry.expand():
+                ParameterSpace(model, [parameter])
+        except (InputError, IndexError) as e:
+            yield Finding("error", where, str(e), _field_advice(entry.field, model))
+    for entry in mapping.known:
+        try:
+            resolve(model, entry.field, entry.of)
+        except (InputError, IndexError) as e:
+            yield Finding("error", f"known.{entry.field}", str(e), _field_advice(entry.field, model))
+
+
+def _field_advice(field: str, model: mujoco.MjModel) -> str:
+    """Nearest field name, where the field itself does not exist."""
+    try:
+        name = split_field(field)[0].removeprefix("opt.")
+    except InputError:
+        return ""
+    owner = model.opt if field.startswith("opt.") else model
+    fields = [n for n in dir(owner) if not n.startswith("_")]
+    close = [] if name in fields else get_close_matches(name, fields, 1)
+    return f"did you mean {close[0]!r}?" if close else ""

@@ -1,0 +1,230 @@
+"""What looks wrong in one log's signals: units, orders, clipping, pauses. Judged, never repaired."""
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core import Channel, Log
+from nfc_gym.measured.channels import parse_channel
+from nfc_gym.measured.findings import Severity, Suspicion
+from nfc_gym.measured.mapping import Mapping
+from nfc_gym.measured.rotation_checks import gravity, orientation, rate
+from nfc_gym.measured.smoothing import moving_average
+
+Array = NDArray[np.float64]
+
+DEGREES = 180 / np.pi
+# derivative of the position over the measured speed -> what explains it
+_RATIOS = {
+    DEGREES: "the position is in degrees where radians are declared",
+    1 / DEGREES: "the speed is in degrees/s where rad/s is declared",
+    np.pi / 30: "the speed is in rpm where rad/s is declared",
+    -1.0: "position and speed have opposite signs",
+}
+MANY_TURNS = 4 * np.pi  # rad; a joint that goes further may be in degrees, unless it is a wheel
+
+
+def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iterator[Suspicion]:
+    """Everything in a log that looks wrong, in the order of the mapping; `model` None leaves out what needs one."""
+    yield from _sampling(log)
+    for name, values in log.controls.items():
+        yield from _command(name, values, None if name in log.servo else model)  # a servo's goal is no ctrl
+    for name, channel in log.channels.items():
+        yield from _any_channel(name, channel, mapping)
+        parsed = parse_channel(name)
+        if parsed.kind == "joint" and parsed.quantity == "pos" and channel.unit == "rad":
+            yield from _angle(name, log, model)
+        if parsed.quantity == "quat":
+            yield from orientation(name, log, mapping.channels[name].order == "xyzw")
+        if channel.unit == "rad/s" and parsed.kind in ("sensor", "body"):
+            yield from rate(name, channel)
+        if model is not None and parsed.kind == "sensor":
+            yield from gravity(name, parsed.object, channel, model)
+    yield from _twins(log)
+
+
+def _sampling(log: Log) -> Iterator[Suspicion]:
+    step = np.diff(log.time)
+    median = float(np.median(step))
+    pauses = np.flatnonzero(step > 2.5 * median)
+    if pauses.size:
+        k = int(pauses[0])
+        message = f"{pauses.size} pause{'s' * (pauses.size > 1)} over 2.5 sampling intervals, the first of {step[k]:.3g} s at {log.time[k]:.4g} s"
+        yield Suspicion(
+            "warning", "time", "pause", message, "look for lost samples; segments across them are less certain"
+        )
+    spread = float(np.percentile(step, 95) - np.percentile(step, 5)) / median
+    if spread > 0.5:
+        message = f"sampling is jittered: nine in ten intervals spread over {spread:.0%} of the median {median:.3g} s"
+        yield Suspicion("warning", "time", "jitter", message, "use the sensor's own time stamps, if it has them")
+    if not 1e-5 < median < 1.0:
+        message = f"samples are {median:.3g} s apart"
+        yield Suspicion("warning", "time", "unit", message, "check `time.unit` (s, ms, us or ns)")
+
+
+def _command(name: str, values: Array, model: mujoco.MjModel | None) -> Iterator[Suspicion]:
+    where = f"controls.{name}"
+    if np.ptp(values) == 0:
+        message = f"constant ({values[0]:g})"
+        yield Suspicion(
+            "warning", where, "constant", message, "nothing can be learnt of this actuator; is it the right column?"
+        )
+        return
+    actuator = (
+        -1 if model is None else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name.removeprefix("ctrl:"))
+    )
+    if model is not None and actuator >= 0 and model.actuator_ctrllimited[actuator]:
+        low, high = model.actuator_ctrlrange[actuator]
+        slack = 1e-6 * (high - low)
+        beyond = float(((values < low - slack) | (values > high + slack)).mean())
+        at = float(((values <= low + slack) | (values >= high - slack)).mean())
+        if beyond:
+            message = (
+                f"{beyond:.1%} of the samples lie beyond the actuator's ctrlrange [{low:g}, {high:g}], the farthest "
+            )
+            message += f"{values[np.abs(values - (low + high) / 2).argmax()]:.4g}"
+            yield Suspicion(
+                "warning", where, "beyond", message, "the model clips them: check the unit, or widen ctrlrange"
+            )
+        elif at > 0.05:
+            message = f"saturated: {at:.1%} of the samples sit at the ctrlrange [{low:g}, {high:g}]"
+            yield Suspicion(
+                "warning", where, "saturated", message, "record gentler commands, which say more about the actuator"
+            )
+
+
+def _any_channel(name: str, channel: Channel, mapping: Mapping) -> Iterator[Suspicion]:
+    where = f"channels.{name}"
+    columns = mapping.channels[name].columns
+    values = channel.values.reshape(len(channel.values), -1)
+    compared = values if channel.mask is None else values[channel.mask]
+    if channel.mask is not None and not channel.mask.any():
+        yield Suspicion(
+            "warning", where, "masked", "its mask is false in every row", "name a mask that is true somewhere"
+        )
+        return
+    still = np.flatnonzero(np.ptp(compared, axis=0) == 0)
+    if len(still) == values.shape[1]:
+        message = f"constant ({', '.join(f'{v:g}' for v in compared[0])})"
+        yield Suspicion("warning", where, "constant", message, "name the right column, or leave the channel out")
+    elif mapping.channels[name].order is None:
+        names = [columns[i] if len(columns) == values.shape[1] else f"{columns[0]}[{i}]" for i in still]
+        if names and not name.startswith("body:"):  # a body may well stay in a plane
+            message = f"constant in {', '.join(names)}"
+            yield Suspicion(
+                "warning", where, "constant part", message, "name the right column, or leave the component out"
+            )
+        for i in range(values.shape[1]):
+            if name.startswith(("sensor:", "force:")):  # a joint may well rest at the end of its travel
+                yield from _clipped(where, compared[:, i], 0.02)
+
+
+def _clipped(where: str, values: Array, share: float) -> Iterator[Suspicion]:
+    """Many samples at exactly the largest or smallest value of a signal that otherwise takes many values."""
+    if len(values) < 50 or len(np.unique(values)) < 30:
+        return
+    for edge in (values.max(), values.min()):
+        at = float((values == edge).mean())
+        if at > share:
+            message = f"{at:.1%} of the samples are exactly {edge:.5g}, its extreme: clipped?"
+            yield Suspicion(
+                "warning", where, "clipped", message, "mask the rows where the reading is cut off (`mask: <column>`)"
+            )
+
+
+def _angle(name: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Suspicion]:
+    where, joint = f"channels.{name}", parse_channel(name).object
+    values = log.channels[name].values
+    jump = np.abs(np.diff(values))
+    if ((jump > 5.0) & (jump < 7.5)).any() and jump.max() < 7.5:
+        row = int(jump.argmax()) + 1
+        message = f"jumps by {jump.max():.3g} rad at row {row}: wrapped at a full turn?"
+        yield Suspicion("error", where, "wrapped", message, "unwrap the column (numpy.unwrap) before it is read")
+        return
+    speed = log.channels.get(f"joint:{joint}:vel")
+    if speed is not None and speed.values.shape == values.shape:
+        found = list(_compare_rates(where, log, np.gradient(values, log.time), speed.values))
+        yield from found
+        if found:
+            return
+    for command in _position_commands(joint, log, model):
+        ratio = _ratio(command, values)
+        for factor, what in ((DEGREES, "the angle is in degrees"), (1 / DEGREES, "the command is in degrees")):
+            if ratio is not None and abs(np.log(ratio / factor)) < 0.35:
+                message = f"moves {ratio:.3g} times as far as it is commanded: {what} where radians are declared"
+                yield Suspicion("error", where, "degrees", message, "say `unit: deg`")
+                return
+    yield from _too_far(where, joint, values, model)
+
+
+def _too_far(where: str, joint: str, values: Array, model: mujoco.MjModel | None) -> Iterator[Suspicion]:
+    far = float(np.abs(values).max())
+    j = -1 if model is None else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+    if model is not None and j >= 0 and model.jnt_limited[j]:
+        low, high = model.jnt_range[j]
+        reach = max(abs(low), abs(high))
+        if far > 2 * reach:
+            message = (
+                f"reaches {far:.4g} rad where the model's joint range is [{low:.3g}, {high:.3g}]: degrees for radians?"
+            )
+            yield Suspicion(
+                "error", where, "degrees", message, "say `unit: deg`, or correct the joint's range in the model"
+            )
+            return
+    if far > MANY_TURNS and np.abs(values[-1] - values[0]) < 0.5 * np.abs(np.diff(values)).sum():
+        message = f"reaches {far:.4g} rad, {far / (2 * np.pi):.0f} turns, and comes back: degrees for radians?"
+        yield Suspicion("warning", where, "degrees", message, "say `unit: deg` if so")
+
+
+def _position_commands(joint: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Array]:
+    """Commands that are goals for a joint's position: of position servos in the model."""
+    if model is None:
+        return
+    for name, values in log.controls.items():
+        a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name.removeprefix("ctrl:"))
+        if a < 0 or (model.actuator_biasprm[a, 1] == 0 and name not in log.servo):
+            continue
+        if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, int(model.actuator_trnid[a, 0])) == joint:
+            yield values
+
+
+def _ratio(x: Array, y: Array) -> float | None:
+    """Slope of y over x, of either sign, where the two follow each other (correlation above 0.8); else None."""
+    x, y = x - x.mean(), y - y.mean()
+    spread = float(np.linalg.norm(x) * np.linalg.norm(y))
+    if spread == 0 or abs(float(x @ y)) < 0.8 * spread:
+        return None
+    return float(np.linalg.norm(y) / np.linalg.norm(x)) * float(np.sign(x @ y))
+
+
+def _compare_rates(where: str, log: Log, derived: Array, measured: Array) -> Iterator[Suspicion]:
+    """A position's derivative against the measured speed, both (T,) in rad/s, smoothed over nine samples."""
+    n = min(9, max(len(log) // 10, 1))
+    ratio = _ratio(moving_average(measured, n)[n:-n], moving_average(derived, n)[n:-n])
+    if ratio is None or 0.7 < ratio < 1.4:
+        return
+    for factor, what in _RATIOS.items():
+        if ratio * factor > 0 and abs(np.log(ratio / factor)) < 0.25:
+            message = f"its derivative is {ratio:.3g} times the measured speed: {what}"
+            yield Suspicion(
+                "error", where, "degrees", message, "correct the `unit` (deg, deg/s, rpm), or the column's sign"
+            )
+            return
+    message = f"its derivative is {ratio:.3g} times the measured speed"
+    yield Suspicion("warning", where, "speed", message, "check both columns, their units and any gear ratio")
+
+
+def _twins(log: Log) -> Iterator[Suspicion]:
+    """Two channels, or two controls, with the same numbers throughout."""
+    for part, signals in (("channels", {k: c.values for k, c in log.channels.items()}), ("controls", log.controls)):
+        names = [k for k, v in signals.items() if np.ptp(v) > 0]
+        for i, one in enumerate(names):
+            for other in names[:i]:
+                if np.array_equal(signals[one], signals[other]):
+                    message = f"the same numbers as {other} throughout"
+                    severity: Severity = "error" if part == "channels" else "note"
+                    yield Suspicion(
+                        severity, f"{part}.{one}", "twin", message, "name the right column, or remove one of the two"
+                    )

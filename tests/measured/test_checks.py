@@ -1,0 +1,180 @@
+"""Each way to spoil a data set is found, named, and comes with advice; an unspoilt one passes without a word."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nfc_gym.core import InputError
+from nfc_gym.measured.checks import check, require
+
+Build = Any
+DEGREES = 180 / np.pi
+
+
+def scale(name: str, factor: float) -> Any:
+    return lambda table: table.update({name: table[name] * factor})
+
+
+def change(name: str, rows: slice, value: float) -> Any:
+    def spoil(table: dict[str, np.ndarray]) -> None:
+        table[name] = table[name].copy()
+        table[name][rows] = value
+
+    return spoil
+
+
+def drop(name: str) -> Any:
+    return lambda table: table.pop(name)
+
+
+def swap(a: str, b: str) -> Any:
+    return lambda table: table.update({a: table[b], b: table[a]})
+
+
+def rotate_quaternion(table: dict[str, np.ndarray]) -> None:
+    """The file holds x, y, z, w where the mapping says w, x, y, z."""
+    w, x, y, z = (table[k] for k in ("qw", "qx", "qy", "qz"))
+    table.update(qw=x, qx=y, qy=z, qz=w)
+
+
+def gap(table: dict[str, np.ndarray]) -> None:
+    table["t"] = np.where(np.arange(len(table["t"])) >= 200, table["t"] + 0.5, table["t"])
+
+
+def jitter(table: dict[str, np.ndarray]) -> None:
+    table["t"] = table["t"] + np.random.default_rng(0).uniform(0, 0.009, len(table["t"]))
+
+
+def errors(path: Path) -> list[str]:
+    return [str(f) for f in check(path) if f.severity == "error"]
+
+
+def test_a_sound_data_set_has_no_findings(build: Build) -> None:
+    assert check(build()) == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (drop("v"), ["joint:hinge:vel", "no column 'v'", "valid: t, goal"]),
+        (change("q", slice(None), 0.3), ["joint:hinge:pos", "constant", "right column"]),
+        (lambda t: t.update(v=t["q"]), ["same numbers as joint:hinge:pos"]),
+        (change("t", slice(100, 101), 0.5), ["time", "goes back", "row 100", "cut the file"]),
+        (change("t", slice(100, 101), 0.99), ["time", "stands still", "row 100"]),
+        (change("t", slice(100, 101), np.nan), ["time", "not a number", "row 100"]),
+        (gap, ["time", "gap of 0.51 s", "row 199", "cut the file there"]),
+        (change("q", slice(50, 60), np.nan), ["10 of 400 rows are NaN", "row 50", "mask"]),
+        (change("goal", slice(5, 6), np.inf), ["controls.ctrl:servo", "1 of 400 rows"]),
+        (scale("q", DEGREES), ["joint:hinge:pos", "in degrees", "unit"]),
+        (scale("v", DEGREES), ["joint:hinge:pos", "degrees/s", "unit"]),
+        (scale("v", 30 / np.pi), ["joint:hinge:pos", "rpm"]),
+        (scale("v", -1), ["joint:hinge:pos", "opposite signs"]),
+        (scale("qw", 2.0), ["body:base:quat", "norm", "unit quaternions"]),
+        (rotate_quaternion, ["body:base:quat", "scalar order", "xyzw scalar last"]),
+        (lambda t: t.update(q=np.array(["left"] * 400)), ["not numeric", "row 0", "'left'"]),
+        (lambda t: t.update(q=t["q"][:-1]), ["shape (399,)", "400 rows"]),
+        (lambda t: t.update(q=np.stack([t["q"]] * 2, 1)), ["2 columns where 1 is wanted"]),
+    ],
+)
+def test_a_spoilt_log_is_an_error_that_says_what_to_do(build: Build, spoil: Any, words: list[str]) -> None:
+    found = "\n".join(errors(build(spoil)))
+    for word in words:
+        assert word in found
+
+
+def test_degrees_are_found_without_a_speed(build: Build) -> None:
+    no_speed = ('  "joint:hinge:vel": {column: v, unit: rad/s, noise: 0.01}\n', "")
+    assert "in degrees" in "\n".join(errors(build(scale("q", DEGREES), no_speed)))
+    no_command = ("unit: rad}", "unit: deg}")  # the goal too is in degrees and said to be so: the joint's range decides
+    both = lambda t: (scale("q", DEGREES)(t), scale("goal", DEGREES)(t))  # noqa: E731
+    passive = (
+        (Path(build(both, no_speed, no_command)).parent / "machine.xml").read_text().replace("<position", "<motor")
+    )
+    found = "\n".join(errors(build(both, no_speed, no_command, model=passive.replace(' kp="10"', ""))))
+    assert "joint range" in found
+
+
+def test_scalar_order_is_found_without_rates(build: Build) -> None:
+    no_rates = ('  "sensor:gyro": {columns: [gx, gy, gz], unit: rad/s, noise: 0.01}\n', "")
+    assert check(build(None, no_rates)) == []
+    assert "scalar order" in "\n".join(errors(build(rotate_quaternion, no_rates)))
+    said_so = ("[qw, qx, qy, qz], order: wxyz", "[qw, qx, qy, qz], order: xyzw")
+    assert check(build(rotate_quaternion, no_rates, said_so)) == []
+    assert "scalar order" in "\n".join(errors(build(None, no_rates, said_so)))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (jitter, ["time", "jitter"]),
+        (change("goal", slice(None), 0.1), ["ctrl:servo", "constant"]),
+        (scale("goal", 3.0), ["ctrl:servo", "beyond the actuator's ctrlrange [-2.5, 2.5]"]),
+        (lambda t: t.update(goal=np.clip(10 * t["goal"], -2.5, 2.5)), ["ctrl:servo", "saturated"]),
+        (lambda t: t.update(gz=np.clip(t["gz"], -1.2, 1.2)), ["sensor:gyro", "clipped"]),
+        (lambda t: [t.update({k: t[k][::2]}) for k in t] and t.update(t=np.delete(np.arange(203), [20, 21, 22]) * 0.02),
+         ["time", "pause"]),
+    ],
+)  # fmt: skip
+def test_a_doubtful_log_is_a_warning(build: Build, spoil: Any, words: list[str]) -> None:
+    found = check(build(spoil))
+    assert not [f for f in found if f.severity == "error"]
+    text = "\n".join(str(f) for f in found if f.severity == "warning")
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (('"ctrl:servo"', '"ctrl:sevro"'), ["no actuator 'sevro'", "did you mean 'servo'"]),
+        (("joint:hinge:pos", "joint:hing:pos"), ["no joint 'hing'", "did you mean 'hinge'"]),
+        (("body:base:quat", "body:bas:quat"), ["no body 'bas'", "did you mean 'base'"]),
+        (("sensor:gyro", "sensor:gyroscope"), ["no sensor 'gyroscope'", "valid: gyro, acc"]),
+        (("of: [bob]", "of: [bot]"), ["parameters.0 (mass)", "no body named 'bot'", "bob"]),
+        (("field: body_mass", "field: body_mas"), ["body_mas", "did you mean 'body_mass'"]),
+        (("high: 0.2", "high: 0.06"), ["nominal 0.1 kg lies outside"]),
+        (("machine.xml", "machin.xml"), ["machin.xml", "machine.xml"]),
+        (("column: q, unit: rad,", "column: q, unit: m,"), ["joint 'hinge' turns, but the unit is 'm'"]),
+        (("length: 0.4", "length: 5"), ["as long as the longest horizon, 5 s", "shorten"]),
+        (('"*.npz"', '"*.csv"'), ["no file matches '*.csv'", "run_0.npz"]),
+    ],
+)
+def test_a_mapping_that_does_not_fit_model_or_logs(build: Build, edit: tuple[str, str], words: list[str]) -> None:
+    found = "\n".join(errors(build(None, edit)))
+    for word in words:
+        assert word in found
+
+
+def test_a_model_that_does_not_compile(build: Build) -> None:
+    found = "\n".join(errors(build(model="<mujoco><worldbody><body name='a'><joint/></body></worldbody></mujoco>")))
+    assert "does not compile" in found or "not a model" in found
+
+
+def test_too_few_logs_to_split(build: Build) -> None:
+    found = "\n".join(errors(build(logs=2)))
+    assert "2 logs cannot be split 3 ways" in found
+    assert "by: time" in found
+
+
+def test_cut_by_time_is_noted_as_not_independent(build: Build) -> None:
+    found = check(build(None, ("time: {column: t}", "time: {column: t}\nsplit: {by: time}"), logs=1))
+    assert [f.severity for f in found] == ["note"]
+    assert "not independent" in found[0].message
+
+
+def test_everything_wrong_is_said_at_once_and_once(build: Build) -> None:
+    both = lambda t: (scale("q", DEGREES)(t), change("goal", slice(5, 6), np.nan)(t))  # noqa: E731
+    path = build(both, ("of: [bob]", "of: [bot]"), ("sensor:gyro", "sensor:gyr"))
+    found = errors(path)
+    assert len(found) == 3  # the log is not judged further while a column of it cannot be read
+    assert sum("in 3 of 3 logs" in line for line in found) == 1
+    with pytest.raises(InputError, match=r"(?s)'bot'.*'gyr'|'gyr'.*'bot'"):
+        require(path)
+
+
+def test_require_gives_the_data_set(build: Build) -> None:
+    dataset, findings = require(build())
+    assert sorted(dataset.splits.values()) == ["fit", "select", "verify"]
+    assert findings == []
