@@ -4,6 +4,8 @@ The motion of a body is that of its centre of mass: from the current state where
 MuJoCo's derived fields, which are one substep behind.
 """
 
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray

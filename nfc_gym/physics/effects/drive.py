@@ -1,12 +1,24 @@
 """How much force an actuator makes of its command: gain, loss of effectiveness, and the limits that speed and size set."""
 
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
 from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, actuator_ids, actuator_names, groups
+from nfc_gym.physics.effects.base import (
+    Array,
+    Context,
+    Effect,
+    Forces,
+    Param,
+    Scales,
+    actuator_ids,
+    actuator_names,
+    groups,
+)
 from nfc_gym.physics.effects.places import scale_rows, sized
 from nfc_gym.physics.fields import ModelFields
 
@@ -91,7 +103,7 @@ class Gain(Effect):
         _scale_spec(spec, self.where, float(self.factor(theta)))
         return True
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array]) -> Array:
+    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
         out = np.array(force)
         out[..., self.rows] /= np.maximum(self.factor(theta), 1e-6)[..., None]
         return out

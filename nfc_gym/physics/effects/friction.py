@@ -6,6 +6,8 @@ a step allows (2 dt) and an impedance of 0.99, which leaves a creep of about one
 A joint whose friction the user already declared keeps the user's softness.
 """
 
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
 from typing import Any
 
 import mujoco

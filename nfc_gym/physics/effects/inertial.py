@@ -4,6 +4,8 @@ Payload and shift move a body off the place that MuJoCo's "simple body" short cu
 compiled with `simple="false"` (`complete_inertia` does it to a spec), else `bind` raises.
 """
 
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
 import mujoco
 import numpy as np
 

@@ -1,10 +1,20 @@
 """Forces of joints other than dry friction: damping, rotor inertia, springs, cogging."""
 
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
 import mujoco
 import numpy as np
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, joint_dofs
-from nfc_gym.physics.effects.places import angle_unit, force_unit, joint_places, joint_scales, sized, typical, with_units
+from nfc_gym.physics.effects.places import (
+    angle_unit,
+    force_unit,
+    joint_places,
+    joint_scales,
+    sized,
+    typical,
+    with_units,
+)
 from nfc_gym.physics.fields import ModelFields, rows_of
 
 
@@ -130,7 +140,9 @@ class SpringOffset(_OnJoint):
                 "stiffness": {"probes": (0.1 * size, 0.5 * size), "high": 5 * size, "resolution": 2e-3 * size},
                 "rest": {"probes": rests, "low": min(rests) - 2 * reach, "high": max(rests) + 2 * reach},
             }
-            out.append(cls(where, with_units(sized(cls.PARAMS, **changes), {"stiffness": f"{unit}/{per}", "rest": per})))
+            out.append(
+                cls(where, with_units(sized(cls.PARAMS, **changes), {"stiffness": f"{unit}/{per}", "rest": per}))
+            )
         return out
 
 

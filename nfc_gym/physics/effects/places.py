@@ -77,7 +77,9 @@ def base_bodies(model: mujoco.MjModel) -> list[str]:
     """Moving bodies that stand on the world itself: free bases, planar bases, the first link of an arm."""
     names = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
     moving = set(moving_bodies(model))
-    free = [int(model.jnt_bodyid[j]) for j in range(model.njnt) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)]
+    free = [
+        int(model.jnt_bodyid[j]) for j in range(model.njnt) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    ]
     return [names[b] for b in range(1, model.nbody) if names[b] in moving and (b in free or _is_carrier(model, b))]
 
 

@@ -1,5 +1,7 @@
 """Commands that arrive late: a first-order lag and a pure delay."""
 
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
 from collections.abc import Mapping
 from typing import Any
 
@@ -55,12 +57,20 @@ class Lag(_Late):
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         return self._commands(ctrl)
 
-    def action(self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float) -> tuple[Array, Any]:
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
         wish = self._commands(ctrl)
         tau = theta[..., :1]
         keep = np.where(tau > 0, np.exp(-dt / np.maximum(tau, 1e-12)), 0.0)
         made = wish + keep * (memory - wish)
         return self._replace(ctrl, made), made
+
+    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        # u = y + tau dy/dt, exactly; the rate by central differences
+        out = np.array(force)
+        out[:, self.rows] += theta[0] * np.gradient(force[:, self.rows], dt, axis=0)
+        return out
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
         actuators = [spec.actuator(n) for n in self.where]
@@ -84,13 +94,21 @@ class Delay(_Late):
         length = int(np.ceil(np.max(theta[..., 0], initial=0.0) / dt - 1e-9)) + 1
         return (self._commands(ctrl),) * length
 
-    def action(self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float) -> tuple[Array, Any]:
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
         past = (self._commands(ctrl), *memory[:-1]) if len(memory) > 1 else (self._commands(ctrl),)
         steps = theta[..., :1] / dt
         made = np.zeros_like(past[0])
         for age, values in enumerate(past):
             made = made + np.maximum(0.0, 1.0 - np.abs(steps - age)) * values
         return self._replace(ctrl, made), past
+
+    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        out, time = np.array(force), np.arange(len(force)) * dt
+        for a in self.rows:  # u(t) = y(t + delay); the last value is held
+            out[:, a] = np.interp(time + theta[0], time, force[:, a])
+        return out
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
         dt, delay = spec.option.timestep, float(theta[0])

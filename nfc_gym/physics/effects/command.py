@@ -1,0 +1,251 @@
+"""What reaches the actuator in place of the command: offset, dead zone, saturation, sag of the supply."""
+
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names
+from nfc_gym.physics.effects.drive import actuator_places, command_unit, is_position, plain
+from nfc_gym.physics.effects.places import sized, with_units
+from nfc_gym.physics.fields import ModelFields
+
+_NONE, _AFFINE = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+_ENDLESS = 1e12  # a force that no actuator reaches
+
+
+class _OnCommand(Effect):
+    """What the laws share: some actuators' commands, each (..., n) in its own unit."""
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.rows = actuator_ids(model, self.where)
+
+    @staticmethod
+    def _spread(model: mujoco.MjModel, scales: Scales, where: Sequence[str]) -> float:
+        return max(float(np.median(np.abs(scales.command[actuator_ids(model, where)]))), 1e-6)
+
+
+class Offset(_OnCommand):
+    """A constant added to the command: a badly zeroed position servo, a motor that pushes at zero."""
+
+    family = "offset"
+    summary = "Constant offset of the command"
+    PARAMS = (Param("offset", "1", -1e3, 1e3, probes=(0.05,)),)
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        super().bind(model)
+        self.gain = model.actuator_gainprm[self.rows, 0].copy()
+
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
+        out = np.array(ctrl)
+        out[..., self.rows] += theta[..., :1]
+        return out, memory
+
+    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        out = np.array(force)
+        out[..., self.rows] -= self.gain * theta[..., :1]
+        return out
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        actuators = [spec.actuator(n) for n in self.where]
+        if any(int(a.biastype) not in (_NONE, _AFFINE) for a in actuators):
+            return False
+        for actuator in actuators:
+            bias = np.asarray(actuator.biasprm).copy()
+            if int(actuator.biastype) == _NONE:
+                bias[:3] = 0
+            bias[0] += float(actuator.gainprm[0] * theta[0])
+            actuator.biastype, actuator.biasprm = mujoco.mjtBias.mjBIAS_AFFINE, bias
+            # clip(u + offset, low, high) = clip(u, low - offset, high - offset) + offset
+            actuator.ctrlrange = np.asarray(actuator.ctrlrange) - float(theta[0])
+        return True
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        known = actuator_names(model)
+        out: list[Effect] = []
+        for where in actuator_places(model, plain(model)):
+            size = cls._spread(model, scales, where)
+            change = {"probes": (0.15 * size,), "low": -3 * size, "high": 3 * size, "resolution": 2e-3 * size}
+            unit = command_unit(model, known.index(where[0]))
+            out.append(cls(where, with_units(sized(cls.PARAMS, offset=change), {"offset": unit})))
+        return out
+
+
+class DeadZone(_OnCommand):
+    """Commands within +- width do nothing, larger ones lose the width. Not for position targets, whose zero is no rest."""
+
+    family = "dead_zone"
+    summary = "Dead zone of the command"
+    PARAMS = (Param("width", "1", 0.0, 1e3, probes=(0.05,)),)
+
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
+        out, width = np.array(ctrl), theta[..., :1]
+        out[..., self.rows] -= np.clip(out[..., self.rows], -width, width)
+        return out, memory
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        known = actuator_names(model)
+        out: list[Effect] = []
+        for where in actuator_places(model, [n for n in plain(model) if not is_position(model, known.index(n))]):
+            size = cls._spread(model, scales, where)
+            change = {"probes": (0.1 * size, 0.3 * size), "high": 2 * size, "resolution": 2e-3 * size}
+            unit = command_unit(model, known.index(where[0]))
+            out.append(cls(where, with_units(sized(cls.PARAMS, width=change), {"width": unit})))
+        return out
+
+
+class Saturation(_OnCommand):
+    """A limit that the model lacks, in one of two forms.
+
+    `removed`: the share of the command range that is out of reach, half at each end (actuators with a command range).
+    `inverse_limit`: one over the largest force (position servos, and actuators without a command range); its null 0 is no
+    limit, and a limit above every force that occurs changes nothing.
+    """
+
+    family = "saturation"
+    summary = "Saturation below the model's limits"
+    PARAMS = (Param("removed", "1", 0.0, 0.95, probes=(0.2, 0.5), resolution=0.005),)
+    ON_FORCE = (Param("inverse_limit", "1/(N m)", 0.0, 1e6, probes=(1.0,)),)
+
+    @classmethod
+    def declare(cls, names: Sequence[str]) -> tuple[Param, ...]:
+        return cls.ON_FORCE if tuple(names) == ("inverse_limit",) else super().declare(names)
+
+    @property
+    def on_force(self) -> bool:
+        """Whether the force is limited rather than the command."""
+        return self.params[0].name == "inverse_limit"
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        super().bind(model)
+        if not self.on_force and not model.actuator_ctrllimited[self.rows].all():
+            raise InputError(
+                f"saturation of {self.place}: `removed` is a share of a command range, which the model does not give"
+            )
+        self.range_low, self.range_high = model.actuator_ctrlrange[self.rows].T.copy()
+
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
+        if self.on_force:
+            return ctrl, memory
+        out = np.array(ctrl)
+        cut = theta[..., :1] * (self.range_high - self.range_low) / 2
+        out[..., self.rows] = np.clip(out[..., self.rows], self.range_low + cut, self.range_high - cut)
+        return out, memory
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        if not self.on_force:
+            return
+        limit = 1 / np.maximum(theta[..., :1], 1 / _ENDLESS)
+        limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
+        free = ~fields.nominal("actuator_forcelimited")[self.rows].astype(bool)
+        low = np.where(free, -_ENDLESS, ranges[..., self.rows, 0])
+        high = np.where(free, _ENDLESS, ranges[..., self.rows, 1])
+        ranges[..., self.rows, 0], ranges[..., self.rows, 1] = np.maximum(low, -limit), np.minimum(high, limit)
+        limited[..., self.rows] = True
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        for actuator in (spec.actuator(n) for n in self.where):
+            if self.on_force:
+                limit = 1 / max(float(theta[0]), 1 / _ENDLESS)
+                low, high = actuator.forcerange if np.any(actuator.forcerange) else (-limit, limit)
+                actuator.forcerange, actuator.forcelimited = (max(low, -limit), min(high, limit)), True
+            else:
+                low, high = actuator.ctrlrange
+                cut = float(theta[0]) * (high - low) / 2
+                actuator.ctrlrange = (low + cut, high - cut)
+        return True
+
+    def say(self, theta: Array, sd: Array | None = None) -> str:
+        if not self.on_force:
+            return super().say(theta, sd)
+        return f"{self.summary} at {' and '.join(self.where)}: force limited to {1 / max(theta[0], 1e-12):.3g}."
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        known = actuator_names(model)
+        ranged = [
+            n for n in plain(model) if model.actuator_ctrllimited[i := known.index(n)] and not is_position(model, i)
+        ]
+        out: list[Effect] = [cls(where, cls.PARAMS) for where in actuator_places(model, ranged)]
+        for where in actuator_places(model, [n for n in plain(model) if n not in ranged]):
+            force = max(float(np.median(np.abs(scales.actuation[actuator_ids(model, where)]))), 1e-6)
+            # The scale is a root mean square: forces reach two or three times as high, where a limit begins to bite.
+            change = {"probes": (0.7 / force, 1.2 / force), "high": 20 / force, "resolution": 2e-3 / force}
+            out.append(cls(where, sized(cls.ON_FORCE, inverse_limit=change)))
+        return out
+
+
+def find_supply(names: Iterable[str]) -> str | None:
+    """The exogenous signal that is a supply voltage, by its name: `exo:supply` first, else one that speaks of volts."""
+    names = list(names)
+    if "exo:supply" in names:
+        return "exo:supply"
+    return next((n for n in names if any(w in n.lower() for w in ("supply", "volt", "vbat", "batt", "vbus"))), None)
+
+
+class SupplySag(_OnCommand):
+    """Commands times (V / reference)^exponent, V the measured supply: a drive that follows its battery.
+
+    The exponent is 0 for a regulated drive, 1 for a motor on the bare battery, 2 for the thrust of such a rotor.
+    """
+
+    family = "supply_sag"
+    summary = "Drive follows the supply voltage"
+    PARAMS = (
+        Param("exponent", "1", -1.0, 4.0, probes=(1.0, 2.0), resolution=0.02),
+        Param("reference", "V", 1e-3, 1e4, probes=(12.0,), shape=True),
+    )
+    signal = "exo:supply"
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        return (self.signal,)
+
+    def _factor(self, theta: Array, exogenous: Mapping[str, Array]) -> Array:
+        name = self.signal if self.signal in exogenous else find_supply(exogenous)
+        if name is None:
+            raise InputError(
+                f"supply_sag reads the supply voltage {self.signal!r}; the log has: {', '.join(exogenous) or 'none'}"
+            )
+        return np.power(np.maximum(exogenous[name] / theta[..., 1], 1e-6), theta[..., 0])[..., None]
+
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
+        out = np.array(ctrl)
+        out[..., self.rows] *= self._factor(theta, exogenous)
+        return out, memory
+
+    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        out = np.array(force)
+        out[..., self.rows] /= self._factor(theta, exogenous)
+        return out
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        signal = find_supply(scales.exogenous)
+        if signal is None:
+            return []
+        volts = float(scales.exogenous[signal])
+        known = actuator_names(model)
+        names = [n for n in plain(model) if not is_position(model, known.index(n))]
+        # The reference only names the voltage at which nothing changes: free, it would be a gain under another name.
+        change = {"probes": (volts,), "low": volts * (1 - 1e-3), "high": volts * (1 + 1e-3)}
+        out: list[Effect] = []
+        for where in actuator_places(model, names):
+            effect = cls(where, sized(cls.PARAMS, reference=change))
+            effect.signal = signal
+            out.append(effect)
+        return out

@@ -1,0 +1,142 @@
+"""Generic alternatives: a smooth function of one variable as a force on one degree of freedom.
+
+They stand for whatever the library lacks. One that beats every named effect says where, and as a function of what, the
+model is wrong, without a claim about the cause. `where` is a scalar joint, or one of the six components of a free joint,
+written `name[0]` to `name[5]`.
+"""
+
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
+import mujoco
+import numpy as np
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.places import sized
+from nfc_gym.physics.fields import names_of, object_id
+
+TIME = "exo:time"  # seconds since the log began, where the logs carry it
+_COUNT = 6
+_FREE, _HINGE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_HINGE)
+
+
+def coordinates(model: mujoco.MjModel) -> list[tuple[str, int, int | None]]:
+    """(place, dof, coordinate) of every degree of freedom of named joints; rotations of a free joint have no coordinate."""
+    out: list[tuple[str, int, int | None]] = []
+    for j, name in enumerate(names_of(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)):
+        dof, q = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
+        kind = int(model.jnt_type[j])
+        if name and kind >= int(mujoco.mjtJoint.mjJNT_SLIDE):
+            out.append((name, dof, q))
+        elif name and kind == _FREE:
+            out += [(f"{name}[{i}]", dof + i, q + i if i < 3 else None) for i in range(6)]
+    return out
+
+
+class _Generic(Effect):
+    """Force sum_k c_k phi_k(x): bumps of a Gaussian's shape over the variable's range, or waves for a turning joint."""
+
+    generic = True
+    PARAMS = tuple(Param(f"c{k}", "N m", -1e6, 1e6, probes=(0.1,)) for k in range(_COUNT))
+    low_end, high_end, turning = -1.0, 1.0, False
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        found = {place: (dof, q) for place, dof, q in coordinates(model)}
+        if self.where[0] not in found:
+            name = self.where[0].partition("[")[0]
+            object_id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+            raise InputError(f"{self.family}: {self.where[0]!r} is no degree of freedom; there are: {', '.join(found)}")
+        self.dof, self.coordinate = found[self.where[0]]
+
+    def variable(self, ctx: Context) -> Array:
+        """(...,) what the force is a function of."""
+        raise NotImplementedError
+
+    def basis(self, x: Array) -> Array:
+        """(..., 6) functions of x (...,)."""
+        if self.turning:
+            waves = np.arange(1, _COUNT // 2 + 1) * x[..., None]
+            return np.concatenate([np.cos(waves), np.sin(waves)], -1)
+        centres = np.linspace(self.low_end, self.high_end, _COUNT)
+        width = (self.high_end - self.low_end) / (_COUNT - 1)
+        return np.exp(-(((x[..., None] - centres) / width) ** 2))
+
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        out.qfrc[..., self.dof] += (theta * self.basis(self.variable(ctx))).sum(-1)
+
+    @classmethod
+    def _on(cls, place: str, dof: int, scales: Scales, low: float, high: float) -> "_Generic":
+        force = max(float(scales.force[dof]), 1e-3)
+        size = {"probes": (0.1 * force,), "low": -3 * force, "high": 3 * force}
+        effect = cls((place,), sized(cls.PARAMS, **{p.name: size for p in cls.PARAMS}))
+        effect.low_end, effect.high_end = low, high
+        return effect
+
+
+class GenericPosition(_Generic):
+    """A force that depends on the position of its own degree of freedom."""
+
+    family = "generic_position"
+    summary = "A force that depends on position"
+
+    def variable(self, ctx: Context) -> Array:
+        return ctx.q[..., self.coordinate]
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        for place, dof, q in coordinates(model):
+            if q is None:
+                continue
+            joint = int(model.dof_jntid[dof])
+            spread, _ = scales.channels.get(f"joint:{place}:pos", (0.0, 0.0))
+            if model.jnt_limited[joint] and int(model.jnt_type[joint]) != _FREE:
+                low, high = (float(e) for e in model.jnt_range[joint])
+            else:
+                middle, reach = float(model.qpos0[q]), max(2.5 * spread, 1.0)
+                low, high = middle - reach, middle + reach
+            effect = cls._on(place, dof, scales, low, high)
+            effect.turning = int(model.jnt_type[joint]) == _HINGE and not model.jnt_limited[joint]
+            out.append(effect)
+        return out
+
+
+class GenericVelocity(_Generic):
+    """A force that depends on the speed of its own degree of freedom."""
+
+    family = "generic_velocity"
+    summary = "A force that depends on speed"
+
+    def variable(self, ctx: Context) -> Array:
+        return ctx.v[..., self.dof]
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        for place, dof, _ in coordinates(model):
+            top = 2 * max(float(scales.speed[dof]), 1e-2)
+            out.append(cls._on(place, dof, scales, -top, top))
+        return out
+
+
+class GenericTime(_Generic):
+    """A force that depends on the time since the log began, read from the signal `exo:time`."""
+
+    family = "generic_time"
+    summary = "A force that depends on time"
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        return (TIME,)
+
+    def variable(self, ctx: Context) -> Array:
+        if TIME not in ctx.exogenous:
+            raise InputError(f"{self.family} reads the signal {TIME!r}, which the log does not carry")
+        return ctx.exogenous[TIME]
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        if TIME not in scales.exogenous:
+            return []
+        end = max(2 * float(scales.exogenous[TIME]), 1e-3)  # the signal's median lies half-way through the log
+        return [cls._on(place, dof, scales, 0.0, end) for place, dof, _ in coordinates(model)]

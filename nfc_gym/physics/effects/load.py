@@ -1,0 +1,143 @@
+"""Forces from outside: a constant push, steady wind, and gravity that does not point down the model's z."""
+
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from nfc_gym.physics.effects.air import body_motion, body_scales, translating
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, joint_dofs
+from nfc_gym.physics.effects.places import (
+    body_ids,
+    force_unit,
+    joint_places,
+    joint_scales,
+    moving_bodies,
+    sized,
+    with_units,
+)
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.state import rotate, vector_to_quat
+
+
+class ExternalForce(Effect):
+    """A constant force: (x, y, z) in the world at a body's centre of mass, or one number along a scalar joint (a preload)."""
+
+    family = "external_force"
+    summary = "Constant external force"
+    PARAMS = tuple(Param(axis, "N", -1e5, 1e5, probes=(0.1,)) for axis in "xyz")
+    ON_JOINT = (Param("force", "N m", -1e5, 1e5, probes=(0.1,)),)
+
+    @classmethod
+    def declare(cls, names: Sequence[str]) -> tuple[Param, ...]:
+        return cls.ON_JOINT if tuple(names) == ("force",) else super().declare(names)
+
+    @property
+    def on_joint(self) -> bool:
+        """Whether it acts along joints rather than on bodies."""
+        return self.params[0].name == "force"
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.rows = joint_dofs(model, self.where) if self.on_joint else body_ids(model, self.where)
+
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        if self.on_joint:
+            out.qfrc[..., self.rows] += theta
+        else:
+            out.xfrc[..., self.rows, :3] += theta[..., None, :]
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        bodies = translating(model) or _ends(model)
+        for name, b in zip(bodies, body_ids(model, bodies), strict=True):
+            force = body_scales(model, scales, int(b))[0]
+            size = {"probes": (0.05 * force,), "low": -2 * force, "high": 2 * force, "resolution": 1e-3 * force}
+            out.append(cls((name,), sized(cls.PARAMS, x=size, y=size, z=size)))
+        for where in joint_places(model):
+            if len(where) > 1 or where[0] in bodies:
+                continue  # two candidates of one id could not be told apart
+            force, _ = joint_scales(model, scales, where)
+            size = {"probes": (0.1 * force,), "low": -3 * force, "high": 3 * force, "resolution": 2e-3 * force}
+            out.append(cls(where, with_units(sized(cls.ON_JOINT, force=size), {"force": force_unit(model, where[0])})))
+        return out
+
+
+def _ends(model: mujoco.MjModel) -> list[str]:
+    """Moving bodies that carry no other moving body: the tips of an arm on a fixed base."""
+    moving = moving_bodies(model)
+    ids = body_ids(model, moving)
+    parents = {int(model.body_weldid[model.body_parentid[b]]) for b in ids}
+    return [n for n, b in zip(moving, ids, strict=True) if int(b) not in parents]
+
+
+class Wind(Effect):
+    """Steady wind on a body: F = push - drag v, in the world, at the centre of mass.
+
+    It is drag relative to air that moves at push / drag, written so that the force is linear in all four parameters: a body
+    that moves with the wind feels nothing, a body at rest feels `push`.
+    """
+
+    family = "wind"
+    summary = "Steady wind"
+    PARAMS = (
+        *(Param(f"push_{axis}", "N", -1e5, 1e5, probes=(0.1,)) for axis in "xyz"),
+        Param("drag", "N s/m", 0.0, 1e4, probes=(0.1,)),
+    )
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.body = int(body_ids(model, self.where)[0])
+
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        out.xfrc[..., self.body, :3] += theta[..., :3] - theta[..., 3:] * body_motion(ctx, self.body)[1]
+
+    def say(self, theta: Array, sd: Array | None = None) -> str:
+        if theta[3] <= 0:
+            return super().say(theta, sd)
+        wind = theta[:3] / theta[3]
+        speed = float(np.linalg.norm(wind))
+        heading = ", ".join(f"{w:.3g}" for w in wind)
+        return f"{self.summary} at {self.place}: {speed:.3g} m/s along ({heading}), drag {theta[3]:.3g} N s/m."
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        names = translating(model)
+        for name, b in zip(names, body_ids(model, names), strict=True):
+            force, speed = body_scales(model, scales, int(b))
+            push = {"probes": (0.05 * force,), "low": -2 * force, "high": 2 * force, "resolution": 1e-3 * force}
+            drag = {"probes": (0.1 * force / speed,), "high": 5 * force / speed, "resolution": 2e-3 * force / speed}
+            out.append(cls((name,), sized(cls.PARAMS, push_x=push, push_y=push, push_z=push, drag=drag)))
+        return out
+
+
+class Slope(Effect):
+    """Gravity turned about the world's x (`roll`) and y (`pitch`): a tilted floor, or a base that is not mounted level.
+
+    A positive pitch pulls towards -x, as on a floor that rises along x; a positive roll pulls towards +y.
+    """
+
+    family = "slope"
+    summary = "Gravity tilted against the model's vertical"
+    PARAMS = (
+        Param("roll", "rad", -0.6, 0.6, probes=(0.05,), resolution=1e-3),
+        Param("pitch", "rad", -0.6, 0.6, probes=(0.05,), resolution=1e-3),
+    )
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        gravity = fields["opt.gravity"]
+        gravity[...] = rotate(_tilt(theta), gravity)
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        spec.option.gravity = rotate(_tilt(theta), np.asarray(spec.option.gravity))
+        return True
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        return [cls(("world",), cls.PARAMS)] if np.any(model.opt.gravity) else []
+
+
+def _tilt(theta: Array) -> Array:
+    return vector_to_quat(np.concatenate([theta, np.zeros_like(theta[..., :1])], -1))

@@ -1,0 +1,235 @@
+"""Sensors that report something else than the truth: bias, gain, delay, misalignment. `where` is a channel name.
+
+A channel that the start state is read from carries its fault into that state: `unsense` takes it out again.
+"""
+
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Array, Effect, Param, Scales
+from nfc_gym.physics.effects.places import sized
+from nfc_gym.physics.fields import object_id
+from nfc_gym.physics.state import quat_conjugate, quat_multiply, rotate, vector_to_quat
+
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_UNITS = {"pos": "m", "linvel": "m/s", "angvel": "rad/s", "vel": "rad/s", "acc": "rad/s^2"}
+
+
+@dataclass(frozen=True)
+class Place:
+    """A channel resolved against a model: its width, and where the state holds it (None where it does not)."""
+
+    kind: str
+    quantity: str
+    dim: int
+    q: int | None = None
+    v: int | None = None
+
+
+def resolve_channel(model: mujoco.MjModel, channel: str) -> Place:
+    """Width and place in the state of a channel; an unknown object raises `InputError`."""
+    kind, _, rest = channel.partition(":")
+    name, _, quantity = rest.partition(":")
+    if kind == "joint":
+        joint = object_id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+        return Place(kind, quantity, 1, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+    if kind == "body":
+        body = object_id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+        joint = int(model.body_jntadr[body])
+        dim = 4 if quantity == "quat" else 3
+        if joint < 0 or int(model.jnt_type[joint]) != _FREE:
+            return Place(kind, quantity, dim)
+        return Place(kind, quantity, dim, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+    if kind == "sensor":
+        return Place(kind, "", int(model.sensor_dim[object_id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)]))
+    if kind == "force":
+        object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+        return Place(kind, "", 1)
+    raise InputError(f"channel {channel!r}: want joint:<name>:..., body:<name>:..., sensor:<name> or force:<actuator>")
+
+
+class _OnChannel(Effect):
+    """What the faults share: one channel, resolved."""
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.at = resolve_channel(model, self.where[0])
+
+    @staticmethod
+    def _channels(model: mujoco.MjModel, scales: Scales) -> list[tuple[str, Place, float, float]]:
+        """(channel, place, spread, noise) of every measured channel of one or three numbers that is no world position."""
+        out = []
+        for channel, (spread, noise) in scales.channels.items():
+            at = resolve_channel(model, channel)
+            if at.dim in (1, 3) and not (at.kind == "body" and at.quantity == "pos"):
+                out.append((channel, at, max(spread, noise, 1e-9), noise))
+        return out
+
+
+class SensorBias(_OnChannel):
+    """A constant added to what is measured, for each axis."""
+
+    family = "sensor_bias"
+    summary = "Sensor bias"
+    PARAMS = (Param("bias", "1", -1e6, 1e6, probes=(0.01,)),)
+    ON_VECTOR = tuple(Param(axis, "1", -1e6, 1e6, probes=(0.01,)) for axis in "xyz")
+
+    @classmethod
+    def declare(cls, names: tuple[str, ...]) -> tuple[Param, ...]:  # type: ignore[override]
+        return cls.ON_VECTOR if set(names) == set("xyz") else super().declare(names)
+
+    def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
+        return values + theta[..., None, :] if channel == self.where[0] else values
+
+    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        if self.at.kind == "joint" and self.at.quantity in ("pos", "vel"):
+            q, v = np.array(q), np.array(v)
+            target, at = (q, self.at.q) if self.at.quantity == "pos" else (v, self.at.v)
+            target[..., at] -= theta[..., 0]
+        elif self.at.kind == "body" and self.at.quantity == "linvel" and self.at.v is not None:
+            v = np.array(v)
+            v[..., self.at.v : self.at.v + 3] -= theta
+        elif self.at.kind == "body" and self.at.quantity == "angvel@body" and self.at.v is not None:
+            v = np.array(v)
+            v[..., self.at.v + 3 : self.at.v + 6] -= theta
+        return q, v
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        for channel, at, spread, noise in cls._channels(model, scales):
+            params = cls.PARAMS if at.dim == 1 else cls.ON_VECTOR
+            size = {
+                "probes": (0.1 * spread + noise,),
+                "low": -5 * spread,
+                "high": 5 * spread,
+                "resolution": 2e-3 * spread,
+            }
+            size["unit"] = _UNITS.get(at.quantity.split("@")[0], "1")
+            out.append(cls((channel,), sized(params, **{p.name: size for p in params})))
+        return out
+
+
+class SensorGain(_OnChannel):
+    """What is measured times `gain`."""
+
+    family = "sensor_gain"
+    summary = "Sensor gain"
+    PARAMS = (Param("gain", "1", 0.3, 3.0, null=1.0, probes=(1.05,), resolution=1e-3),)
+    # A joint whose speed is not measured has its speed from the position channel, and with it the gain.
+    with_speed = True
+
+    def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
+        return values * theta[..., None, :] if channel == self.where[0] else values
+
+    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        if self.at.kind == "joint" and self.at.quantity in ("pos", "vel"):
+            q, v = np.array(q), np.array(v)
+            if self.at.quantity == "pos":
+                q[..., self.at.q] /= theta[..., 0]
+            if self.at.quantity == "vel" or self.with_speed:
+                v[..., self.at.v] /= theta[..., 0]
+        elif (
+            self.at.kind == "body" and self.at.quantity in ("linvel", "angvel@body", "angvel") and self.at.v is not None
+        ):
+            v = np.array(v)
+            first = self.at.v + (0 if self.at.quantity == "linvel" else 3)
+            v[..., first : first + 3] /= theta
+        return q, v
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        for channel, at, _, _ in cls._channels(model, scales):
+            effect = cls((channel,), cls.PARAMS)
+            if at.kind == "joint" and at.quantity == "pos":
+                effect.with_speed = f"{channel.removesuffix(':pos')}:vel" not in scales.channels
+            out.append(effect)
+        return out
+
+
+class SensorDelay(_OnChannel):
+    """The channel reports what was `delay` ago. Before the first sample the trajectory is continued in a straight line."""
+
+    family = "sensor_delay"
+    summary = "Delayed sensor"
+    PARAMS = (Param("delay", "s", 0.0, 0.5, probes=(0.02,)),)
+
+    def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
+        if channel != self.where[0]:
+            return values
+        count = values.shape[-2]
+        when = np.arange(count) - theta[..., :1] / dt
+        before = np.clip(np.floor(when), 0, max(count - 2, 0)).astype(np.intp)
+        # The last sample lies at a whole index: reading it as "before plus one step" would not be exact without delay.
+        before = np.where(when >= count - 1, count - 1, before)
+        after = np.minimum(before + 1, count - 1)
+        here = np.take_along_axis(values, np.broadcast_to(before[..., None], values.shape), -2)
+        there = np.take_along_axis(values, np.broadcast_to(after[..., None], values.shape), -2)
+        return here + (when - before)[..., None] * (there - here)
+
+    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        if self.at.q is None or self.at.v is None or self.at.quantity not in ("pos", "quat"):
+            return q, v
+        q = np.array(q)
+        late = theta[..., :1]
+        if self.at.kind == "joint":
+            q[..., self.at.q : self.at.q + 1] += late * v[..., self.at.v : self.at.v + 1]
+        elif self.at.quantity == "pos":
+            q[..., self.at.q : self.at.q + 3] += late * v[..., self.at.v : self.at.v + 3]
+        else:
+            turn = vector_to_quat(late * v[..., self.at.v + 3 : self.at.v + 6])
+            quat = q[..., self.at.q + 3 : self.at.q + 7]
+            q[..., self.at.q + 3 : self.at.q + 7] = quat_multiply(quat, turn)
+        return q, v
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        size = {"probes": (max(scales.interval, 0.01),), "resolution": 0.05 * scales.interval}
+        return [cls((channel,), sized(cls.PARAMS, delay=size)) for channel in scales.channels]
+
+
+class Misalignment(_OnChannel):
+    """A sensor mounted turned by the rotation vector (x, y, z): vectors are read in the turned frame, as is orientation."""
+
+    family = "misalignment"
+    summary = "Sensor mounted at an angle"
+    PARAMS = tuple(Param(axis, "rad", -1.6, 1.6, probes=(0.03,), resolution=5e-4) for axis in "xyz")
+
+    def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
+        if channel != self.where[0]:
+            return values
+        mount = vector_to_quat(theta)[..., None, :]
+        if self.at.dim == 4:
+            return quat_multiply(values, np.broadcast_to(mount, values.shape))
+        return rotate(np.broadcast_to(quat_conjugate(mount), (*values.shape[:-1], 4)), values)
+
+    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        if self.at.kind != "body" or self.at.q is None or self.at.v is None:
+            return q, v
+        mount = vector_to_quat(theta)
+        if self.at.quantity == "quat":
+            q = np.array(q)
+            quat = q[..., self.at.q + 3 : self.at.q + 7]
+            q[..., self.at.q + 3 : self.at.q + 7] = quat_multiply(
+                quat, np.broadcast_to(quat_conjugate(mount), quat.shape)
+            )
+        elif self.at.quantity in ("linvel", "angvel@body"):
+            v = np.array(v)
+            first = self.at.v + (0 if self.at.quantity == "linvel" else 3)
+            part = v[..., first : first + 3]
+            v[..., first : first + 3] = rotate(np.broadcast_to(mount, (*part.shape[:-1], 4)), part)
+        return q, v
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        for channel in scales.channels:
+            at = resolve_channel(model, channel)
+            if at.dim == 4 or (at.dim == 3 and at.kind == "sensor"):
+                out.append(cls((channel,), cls.PARAMS))
+        return out

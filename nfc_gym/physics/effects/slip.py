@@ -1,0 +1,143 @@
+"""Wheels that grip less than their friction coefficient says, and differently across and along.
+
+MuJoCo's contact friction is the same in both directions of a geom's surface (only `pair` elements have two coefficients, and
+their directions do not turn with a wheel), and `geom_surfacevel` is a velocity imposed on the surface, not a loss of grip. The
+effect therefore gives back, as a force at the contact patch, the share of the sliding friction that the wheel does not have:
+
+    F = mu N (lateral v_lat e_lat + longitudinal v_long e_long) / sqrt(|v|^2 + eps^2),
+
+v the velocity of the patch over the ground, N an even share of the vehicle's weight, mu the contact's friction, eps 0.02 m/s. A
+patch that sticks (v = 0) is left to the solver.
+"""
+
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, groups
+from nfc_gym.physics.fields import names_of
+
+_EPS = 0.02  # m/s: below it the patch is taken to stick
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+
+
+def wheels(model: mujoco.MjModel) -> list[int]:
+    """Geoms that touch the ground as wheels: colliding, round about an unlimited hinge that is their body's only joint."""
+    out = []
+    for g in range(model.ngeom):
+        body = int(model.geom_bodyid[g])
+        if body == 0 or model.body_jntnum[body] != 1 or not (model.geom_contype[g] or model.geom_conaffinity[g]):
+            continue
+        joint = int(model.body_jntadr[body])
+        if int(model.jnt_type[joint]) != _HINGE or model.jnt_limited[joint]:
+            continue
+        if int(model.body_rootid[body]) == body:
+            continue  # a crank on the ground is no wheel of a vehicle
+        away = np.linalg.norm(np.cross(model.geom_pos[g] - model.jnt_pos[joint], model.jnt_axis[joint]))
+        if away < 0.2 * _radius(model, g):
+            out.append(g)
+    return out
+
+
+def _radius(model: mujoco.MjModel, geom: int) -> float:
+    """Half extent of a geom across its body's hinge, m."""
+    axis = np.zeros(3)
+    mujoco.mju_rotVecQuat(
+        axis, model.jnt_axis[int(model.body_jntadr[model.geom_bodyid[geom]])], _inverse(model.geom_quat[geom])
+    )
+    half = np.asarray(model.geom_aabb[geom]).reshape(-1)[3:]
+    return float(np.sort(np.where(np.abs(axis) > 0.7, 0.0, half))[-1])
+
+
+def _inverse(quat: Array) -> Array:
+    out = np.zeros(4)
+    mujoco.mju_negQuat(out, quat)
+    return out
+
+
+class Slip(Effect):
+    """Shares of the sliding friction that are missing across and along the wheels; `ground` means every wheel."""
+
+    family = "slip"
+    summary = "Wheels grip less than their friction says"
+    PARAMS = tuple(Param(n, "1", -0.5, 0.98, probes=(0.3,), resolution=0.005) for n in ("lateral", "longitudinal"))
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        found = wheels(model)
+        if not found:
+            raise InputError("slip: the model has no wheels (round colliding geoms on an unlimited hinge)")
+        names = names_of(model, mujoco.mjtObj.mjOBJ_GEOM, model.ngeom)
+        if self.where == ("ground",):
+            self.geoms = found
+        else:
+            unknown = [n for n in self.where if n not in names]
+            if unknown:
+                raise InputError(
+                    f"the model has no geom named {unknown[0]!r}; its wheels: {', '.join(names[g] for g in found)}"
+                )
+            self.geoms = [names.index(n) for n in self.where]
+        self.radius = [_radius(model, g) for g in self.geoms]
+        self.trees = [_tree(model, g) for g in self.geoms]
+        self.sharing = [
+            sum(int(model.body_rootid[model.geom_bodyid[o]]) == int(t[0]) for o in found) for t in self.trees
+        ]
+        ground = [g for g in range(model.ngeom) if int(model.body_weldid[model.geom_bodyid[g]]) == 0]
+        self.ground = [g for g in ground if model.geom_contype[g] or model.geom_conaffinity[g]]
+
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        gravity = ctx.nominal("opt.gravity")
+        weight = np.linalg.norm(gravity, axis=-1)
+        up = -gravity / np.maximum(weight, 1e-9)[..., None]
+        for geom, radius, tree, sharing in zip(self.geoms, self.radius, self.trees, self.sharing, strict=True):
+            model, body = ctx.model, int(ctx.model.geom_bodyid[geom])
+            normal = ctx.nominal("body_mass")[..., tree].sum(-1) * weight / sharing
+            across = ctx.data("xaxis")[..., int(model.body_jntadr[body]), :]
+            across = _unit(across - (across * up).sum(-1, keepdims=True) * up)
+            ahead = np.cross(across, up)
+            arm = ctx.data("geom_xpos")[..., geom, :] - ctx.data("xipos")[..., body, :] - radius * up
+            spatial = ctx.data("cvel")[..., body, :]
+            from_root = (
+                ctx.data("xipos")[..., body, :] + arm - ctx.data("subtree_com")[..., int(model.body_rootid[body]), :]
+            )
+            velocity = spatial[..., 3:] + np.cross(spatial[..., :3], from_root)
+            lateral, along = (velocity * across).sum(-1), (velocity * ahead).sum(-1)
+            grip = self._friction(ctx, geom) * normal / np.sqrt(lateral**2 + along**2 + _EPS**2)
+            push = (grip * theta[..., 0] * lateral)[..., None] * across + (grip * theta[..., 1] * along)[
+                ..., None
+            ] * ahead
+            out.xfrc[..., body, :3] += push
+            out.xfrc[..., body, 3:] += np.cross(arm, push)
+
+    def _friction(self, ctx: Context, geom: int) -> Array:
+        """Sliding friction of the wheel's contact with the ground: the geom of higher priority, else the larger."""
+        friction, priority = ctx.nominal("geom_friction"), ctx.model.geom_priority
+        own = friction[..., geom, 0]
+        for other in self.ground[:1]:
+            if priority[other] > priority[geom]:
+                return friction[..., other, 0]
+            if priority[other] == priority[geom]:
+                return np.maximum(own, friction[..., other, 0])
+        return own
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        names = names_of(model, mujoco.mjtObj.mjOBJ_GEOM, model.ngeom)
+        named = [names[g] for g in wheels(model) if names[g]]
+        if not wheels(model):
+            return []
+        places: Sequence[tuple[str, ...]] = [p for p in groups(named) if len(p) < len(named)] if named else []
+        return [cls(where, cls.PARAMS) for where in [("ground",), *places]]
+
+
+def _tree(model: mujoco.MjModel, geom: int) -> NDArray[np.intp]:
+    """Bodies of the vehicle that a geom belongs to, its root first."""
+    return np.flatnonzero(model.body_rootid == model.body_rootid[model.geom_bodyid[geom]])
+
+
+def _unit(v: Array) -> Array:
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
