@@ -15,7 +15,7 @@ ALLOWED: dict[str, set[str]] = {
     "core": set(),
     "physics": {"core"},
     "terrain": {"core"},
-    "assets": set(),
+    "assets": {"core"},
     "inference": {"core"},
     "envs": {"core", "physics", "terrain", "assets"},
     "wrappers": {"core", "physics", "terrain"},

@@ -10,7 +10,7 @@ from nfc_gym.core import InputError, Log
 from nfc_gym.measured.dataset import Dataset, assemble, read_log
 from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order
 from nfc_gym.measured.mapping import SPLITS, Mapping, load_mapping
-from nfc_gym.measured.model import load_model
+from nfc_gym.measured.model import compile_model, read_spec
 from nfc_gym.measured.model_checks import model_findings
 from nfc_gym.measured.signal_checks import suspicions
 from nfc_gym.measured.splits import find_logs
@@ -46,7 +46,7 @@ def examine(dataset_path: Path | str) -> tuple[Dataset | None, list[Finding]]:
     findings: list[Finding] = []
     model: mujoco.MjModel | None = None
     try:
-        model = load_model(mapping.model_file, path.parent)
+        model = compile_model(read_spec(mapping.model_file, path.parent), mapping.model_file)
         findings += model_findings(mapping, model)
     except InputError as e:
         findings.append(_finding("model", str(e).removeprefix("model ")))

@@ -1,44 +1,37 @@
-"""The model that a mapping names: an MJCF or URDF file beside it, or a registered environment's id."""
+"""The model that a mapping names: an MJCF or URDF file beside it, or the id of a robot of ours."""
 
 from pathlib import Path
 
-import gymnasium
 import mujoco
 
+from nfc_gym import assets
 from nfc_gym.core import InputError
 
 
+def registered(name: str) -> str | None:
+    """Robot of a registered id (`nfc_gym/JackalFlat-v0` -> `jackal`), or None."""
+    short = name.rsplit("/", 1)[-1].lower()
+    return next((r for r in assets.ROBOTS if short in (f"{r}flat-v0", r)), None)
+
+
 def model_path(name: str, folder: Path) -> Path:
-    """The model's file: `folder / name`, or the file of a registered MuJoCo environment.
+    """The model's file: a robot's of ours, or `folder / name`.
 
     Raises:
-      InputError: no such file, and no such environment whose model is a file.
+      InputError: there is no such file; with the models that lie there.
     """
-    path = folder / name
+    robot = registered(name)
+    path = assets.path(robot) if robot else folder / name
     if path.is_file():
         return path
-    if name.split(":")[-1] not in gymnasium.registry and ":" not in name:
-        there = (
-            sorted(p.name for p in path.parent.glob("*") if p.suffix in (".xml", ".urdf"))
-            if path.parent.is_dir()
-            else []
-        )
-        raise InputError(
-            f"model {name!r}: no such file in {folder}, nor a registered environment; "
-            f"models there: {', '.join(there) or 'none'}"
-        )
-    try:
-        env = gymnasium.make(name)
-    except (gymnasium.error.Error, ImportError) as e:
-        raise InputError(f"model {name!r}: the environment cannot be made: {e}") from None
-    file = getattr(env.unwrapped, "fullpath", None)
-    env.close()
-    if file is None:
-        raise InputError(f"model {name!r}: the environment does not say which model file it uses; name the file itself")
-    return Path(file)
+    there = sorted(p.name for p in path.parent.glob("*") if p.suffix in (".xml", ".urdf"))
+    raise InputError(
+        f"model {name!r}: no such file in {folder}, and no robot has that id; "
+        f"models there: {', '.join(there) or 'none'}; robots: {', '.join(assets.ROBOTS)}"
+    )
 
 
-def load_spec(name: str, folder: Path) -> mujoco.MjSpec:
+def read_spec(name: str, folder: Path) -> mujoco.MjSpec:
     """The model as an editable `MjSpec`; raises `InputError` where there is no file or it cannot be parsed."""
     path = model_path(name, folder)
     try:
@@ -47,13 +40,12 @@ def load_spec(name: str, folder: Path) -> mujoco.MjSpec:
         raise InputError(f"model {path}: not a model that MuJoCo can read: {_one_line(e)}") from None
 
 
-def load_model(name: str, folder: Path) -> mujoco.MjModel:
+def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
     """The compiled model; raises `InputError` with MuJoCo's own words where it does not compile."""
-    spec = load_spec(name, folder)
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as e:
-        raise InputError(f"model {folder / name}: does not compile: {_one_line(e)}") from None
+        raise InputError(f"model {name}: does not compile: {_one_line(e)}") from None
 
 
 def _one_line(error: Exception) -> str:

@@ -51,7 +51,8 @@ def _sampling(log: Log) -> Iterator[Suspicion]:
     pauses = np.flatnonzero(step > 2.5 * median)
     if pauses.size:
         k = int(pauses[0])
-        message = f"{pauses.size} pause{'s' * (pauses.size > 1)} over 2.5 sampling intervals, the first of {step[k]:.3g} s at {log.time[k]:.4g} s"
+        many = f"{pauses.size} pause{'s' * (pauses.size > 1)} over 2.5 sampling intervals"
+        message = f"{many}, the first of {step[k]:.3g} s at {log.time[k]:.4g} s"
         yield Suspicion(
             "warning", "time", "pause", message, "look for lost samples; segments across them are less certain"
         )

@@ -33,8 +33,8 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
         raise InputError(f"{path} is a folder: name the mapping file in it") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; a mapping is YAML in UTF-8") from None
-    loader = yaml.SafeLoader(text)
     try:
+        loader = yaml.SafeLoader(text)
         node = loader.get_single_node()
         lines: dict[Place, int] = {(): 1}
         return (None if node is None else _build(path, loader, node, (), lines)), lines
@@ -43,8 +43,6 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
         raise InputError(f"{path}{line}: not valid YAML: {e.problem or e.context}") from None
     except (yaml.YAMLError, RecursionError, ValueError) as e:
         raise InputError(f"{path}: not valid YAML: {e}") from None
-    finally:
-        loader.dispose()
 
 
 def _build(path: Path, loader: yaml.SafeLoader, node: yaml.Node, place: Place, lines: dict[Place, int]) -> Any:

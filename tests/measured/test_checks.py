@@ -178,3 +178,65 @@ def test_require_gives_the_data_set(build: Build) -> None:
     dataset, findings = require(build())
     assert sorted(dataset.splits.values()) == ["fit", "select", "verify"]
     assert findings == []
+
+
+def wrap(table: dict[str, np.ndarray]) -> None:
+    table["q"] = (np.linspace(0, 20, 400) + np.pi) % (2 * np.pi) - np.pi
+
+
+def test_wrapped_angles_are_found(build: Build) -> None:
+    found = "\n".join(errors(build(wrap)))
+    assert "wrapped at a full turn" in found
+    assert "unwrap" in found
+
+
+@pytest.mark.parametrize(("unit", "wrong"), [("m/s^2", True), ("g", False)])
+def test_gravity_of_one_is_in_g(build: Build, unit: str, wrong: bool) -> None:
+    def rest(table: dict[str, np.ndarray]) -> None:
+        table["az"] = 1 + 0.01 * np.random.default_rng(0).standard_normal(400)
+
+    channel = f'"sensor:acc": {{column: az, unit: {unit}, axes: [z], noise: 0.1}}'
+    found = errors(build(rest, ("segments:", f"  {channel}\nsegments:")))
+    assert [("in g?" in line) for line in found] == [True] * wrong
+
+
+def test_a_constant_channel_in_one_log_of_many_is_a_doubt(build: Build, tmp_path: Path) -> None:
+    path = build()
+    table = dict(np.load(tmp_path / "run_1.npz"))
+    table["q"] = np.full(400, 0.2)
+    np.savez(tmp_path / "run_1.npz", **table)
+    found = [f for f in check(path) if "constant" in f.message]
+    assert [(f.severity, f.where) for f in found] == [("warning", "run_1: channels.joint:hinge:pos")]
+
+
+RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data"
+CRAZYFLIE = """
+version: 1
+model: machine.xml
+logs: [{path: "%s/nanobench_crazyflie/*circle*.npz"}]
+time: {column: t}
+channels:
+  "body:base:quat": {columns: [qx, qy, qz, qw], order: %s, noise: 0.01}
+  "sensor:gyro": {columns: [imu_gyro_x, imu_gyro_y, imu_gyro_z], unit: rad/s, noise: 0.05}
+"""
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+def test_scalar_order_of_recorded_flights(build: Build, order: str) -> None:
+    path = build()
+    path.write_text(CRAZYFLIE % (RECORDINGS, order))
+    found = [line for line in errors(path) if "scalar order" in line]
+    assert bool(found) == (order == "wxyz")
+
+
+@pytest.mark.recordings
+def test_a_recorded_matlab_file_reads_without_error(build: Build) -> None:
+    path = build()
+    model = '<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body></worldbody></mujoco>'
+    (path.parent / "machine.xml").write_text(model)
+    path.write_text(
+        f'version: 1\nmodel: machine.xml\nlogs: [{{path: "{RECORDINGS}/emps/DATA_EMPS.mat"}}]\ntime: {{column: t}}\n'
+        'split: {by: time}\nchannels: {"joint:x:pos": {column: qm, unit: m, noise: 1.0e-6}}\n'
+    )
+    assert errors(path) == []
