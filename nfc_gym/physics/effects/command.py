@@ -79,7 +79,7 @@ class Offset(_OnCommand):
 
 
 class DeadZone(_OnCommand):
-    """Commands within +- width do nothing, larger ones lose the width. Not for position targets, whose zero is no rest."""
+    """Commands within +- width do nothing, larger ones lose it. Not for position servos: their zero is no rest."""
 
     family = "dead_zone"
     summary = "Dead zone of the command"
@@ -108,8 +108,8 @@ class Saturation(_OnCommand):
     """A limit that the model lacks, in one of two forms.
 
     `removed`: the share of the command range that is out of reach, half at each end (actuators with a command range).
-    `inverse_limit`: one over the largest force (position servos, and actuators without a command range); its null 0 is no
-    limit, and a limit above every force that occurs changes nothing.
+    `inverse_limit`: one over the largest force (position servos, and actuators without a command range); its null 0 is
+    no limit, and a limit above every force that occurs changes nothing.
     """
 
     family = "saturation"

@@ -1,4 +1,4 @@
-"""How much force an actuator makes of its command: gain, loss of effectiveness, and the limits that speed and size set."""
+"""How much force an actuator makes of its command: gain, loss of effectiveness, and the limit that speed sets."""
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
 
@@ -114,7 +114,7 @@ class Gain(Effect):
 
 
 class Loss(Gain):
-    """Share of an actuator's force that never arrives: 0 healthy, 1 a broken axle or a dead motor. One actuator each."""
+    """Share of an actuator's force that never arrives: 0 healthy, 1 a broken axle or dead motor. One actuator each."""
 
     family = "loss"
     summary = "Loss of actuator effectiveness"
@@ -131,9 +131,9 @@ class Loss(Gain):
 class TorqueSpeed(Effect):
     """Force limit that falls with speed in the driving direction: |force| <= peak (1 - fall * speed).
 
-    `peak` is what the model allows at rest (its force range, else the command range times the gain); `fall` is the share of
-    it that is gone for each rad/s (m/s), the inverse of the no-load speed. What exceeds the line, by the force of the
-    substep before, is taken off at the joint. Braking is not limited.
+    `peak` is what the model allows at rest (its force range, else the command range times the gain); `fall` is the
+    share of it that is gone for each rad/s (m/s), the inverse of the no-load speed. What exceeds the line, by the force
+    of the substep before, is taken off at the joint. Braking is not limited.
     """
 
     family = "torque_speed"
@@ -151,7 +151,8 @@ class TorqueSpeed(Effect):
         driving = np.maximum(0.0, np.sign(made * self.gear) * ctx.v[..., self.dofs])
         lost = np.minimum(theta[..., :1] * driving, 1.0) * self.peak
         excess = np.clip(np.abs(made) - (self.peak - lost), 0.0, lost)
-        np.add.at(out.qfrc, (..., self.dofs), -np.sign(made) * excess * self.gear)
+        for i, dof in enumerate(self.dofs):  # one joint may have several actuators
+            out.qfrc[..., dof] -= np.sign(made[..., i]) * excess[..., i] * self.gear[i]
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:

@@ -1,9 +1,9 @@
 """Dry friction of joints. All four laws set the level that MuJoCo's constraint solver may use to hold or brake a joint.
 
-MuJoCo's default friction is soft (a time constant of 20 ms): a joint creeps under a load that real friction would hold.
-Where the nominal model has no friction of its own the effects therefore make it sharp, with the shortest time constant that
-a step allows (2 dt) and an impedance of 0.99, which leaves a creep of about one per cent of the acceleration in a step.
-A joint whose friction the user already declared keeps the user's softness.
+MuJoCo's default friction is soft (a time constant of 20 ms): a joint creeps under a load that real friction holds.
+Where the nominal model has no friction of its own the effects therefore make it sharp, with the shortest time constant
+that a step allows (2 dt) and an impedance of 0.99, which leaves a creep speed of about one per cent of what the load
+would add in a step. A joint whose friction the user already declared keeps the user's softness.
 """
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
@@ -84,7 +84,10 @@ class Coulomb(_JointFriction):
 
 
 class Stribeck(_JointFriction):
-    """Friction that is higher at rest: level + rise exp(-(v / speed)^2). Armstrong-Helouvry et al., Automatica 30 (1994)."""
+    """Friction that is higher at rest: level + rise exp(-(v / speed)^2).
+
+    Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994).
+    """
 
     family = "stribeck"
     summary = "Dry friction with a Stribeck rise at low speed"
@@ -110,8 +113,8 @@ class LoadFriction(_JointFriction):
 
     The actuator pushes the gear's one side (`qfrc_actuator`); gravity, Coriolis and centrifugal forces push the other
     (`qfrc_bias`, the torque that must be applied to balance them). A joint held still has both equal, and they add up.
-    With `motor` alone the gear is loaded by its own drive only. Contact forces are not counted: MuJoCo does not tell them
-    apart from the friction itself. Law: load-dependent models of Duclusaud et al., arXiv:2410.08650 (2024).
+    With `motor` alone the gear is loaded by its own drive only. Contact forces are not counted: MuJoCo does not tell
+    them apart from the friction itself. Law: load-dependent models of Duclusaud et al., arXiv:2410.08650 (2024).
     """
 
     family = "load_friction"

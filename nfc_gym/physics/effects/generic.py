@@ -1,8 +1,8 @@
 """Generic alternatives: a smooth function of one variable as a force on one degree of freedom.
 
 They stand for whatever the library lacks. One that beats every named effect says where, and as a function of what, the
-model is wrong, without a claim about the cause. `where` is a scalar joint, or one of the six components of a free joint,
-written `name[0]` to `name[5]`.
+model is wrong, without a claim about the cause. `where` is a scalar joint, or one of the six components of a free
+joint, written `name[0]` to `name[5]`.
 """
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
@@ -21,7 +21,7 @@ _FREE, _HINGE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_HINGE
 
 
 def coordinates(model: mujoco.MjModel) -> list[tuple[str, int, int | None]]:
-    """(place, dof, coordinate) of every degree of freedom of named joints; rotations of a free joint have no coordinate."""
+    """(place, dof, coordinate) of named joints' degrees of freedom; rotations of a free joint lack a coordinate."""
     out: list[tuple[str, int, int | None]] = []
     for j, name in enumerate(names_of(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)):
         dof, q = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])

@@ -19,7 +19,7 @@ _SWEEPS = 6  # cyclic Jacobi on 3 x 3 converges quadratically; six sweeps reach 
 
 
 def complete_inertia(spec: mujoco.MjSpec) -> None:
-    """Compile every body of a spec without the "simple body" short cut, so that its centre of mass may move afterwards."""
+    """Compile all bodies of a spec without the "simple body" short cut, so that centres of mass may move afterwards."""
     for body in spec.bodies:
         if body.name != "world":
             body.simple = 0
@@ -28,8 +28,8 @@ def complete_inertia(spec: mujoco.MjSpec) -> None:
 def principal(matrix: Array) -> tuple[Array, Array]:
     """Eigenvalues (..., 3) and rotation quaternion (..., 4) of symmetric matrices (..., 3, 3), by Jacobi rotations.
 
-    A diagonal matrix gives its own diagonal and exactly no rotation, and a matrix close to it a small rotation: unlike a
-    library's sorted eigenvectors, the result is continuous in the payload.
+    A diagonal matrix gives its own diagonal and exactly no rotation, and a matrix close to it a small rotation: unlike
+    a library's sorted eigenvectors, the result is continuous in the payload.
     """
     a = np.array(matrix, float)
     quat = np.zeros((*a.shape[:-2], 4))
@@ -63,6 +63,24 @@ def _jacobi(a: Array, p: int, q: int) -> tuple[Array, Array]:
     return turned, quat
 
 
+def turns(model: mujoco.MjModel, name: str) -> bool:
+    """Whether a body can rotate in the world: one that only slides hides where its mass is."""
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    while body > 0:
+        first = int(model.body_jntadr[body])
+        kinds = model.jnt_type[first : first + int(model.body_jntnum[body])] if first >= 0 else []
+        if any(int(k) != int(mujoco.mjtJoint.mjJNT_SLIDE) for k in kinds):
+            return True
+        body = int(model.body_parentid[body])
+    return False
+
+
+def _complete(model: mujoco.MjModel) -> list[str]:
+    """Moving bodies whose centre of mass may be moved (see `complete_inertia`)."""
+    names = moving_bodies(model)
+    return [n for n, b in zip(names, body_ids(model, names), strict=True) if not model.body_simple[b]]
+
+
 class _Inertial(Effect):
     """What the three share: named bodies, and a spec that takes the edited inertia as an explicit one."""
 
@@ -73,8 +91,9 @@ class _Inertial(Effect):
         for name, body in zip(self.where, self.bodies, strict=True):
             if model.body_simple[body]:
                 raise InputError(
-                    f"{self.family} at body {name!r}: the model was compiled with MuJoCo's simple-body short cut, which "
-                    "fixes the centre of mass; compile it with simple='false' (inertial.complete_inertia does so to a spec)"
+                    f"{self.family} at body {name!r}: the model was compiled with MuJoCo's simple-body "
+                    "short cut, which fixes the centre of mass; compile it with simple='false' "
+                    "(inertial.complete_inertia does so to a spec)"
                 )
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
@@ -114,7 +133,7 @@ class Payload(_Inertial):
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         out: list[Effect] = []
-        names = moving_bodies(model)
+        names = _complete(model)
         for name, b in zip(names, body_ids(model, names), strict=True):
             mass, centre, extent = float(model.body_mass[b]), model.body_ipos[b], gyration(model, int(b))
             sizes = {"mass": {"probes": (0.15 * mass,), "high": 3 * mass, "resolution": 2e-3 * mass}}
@@ -163,7 +182,7 @@ class ComShift(_Inertial):
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         out: list[Effect] = []
-        names = moving_bodies(model)
+        names = [n for n in _complete(model) if turns(model, n)]
         for name, b in zip(names, body_ids(model, names), strict=True):
             extent = gyration(model, int(b))
             size = {"probes": (0.2 * extent,), "low": -3 * extent, "high": 3 * extent, "resolution": 5e-3 * extent}
@@ -183,4 +202,4 @@ class Inertia(_Inertial):
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
-        return [cls((name,), cls.PARAMS) for name in moving_bodies(model)]
+        return [cls((name,), cls.PARAMS) for name in moving_bodies(model) if turns(model, name)]

@@ -57,7 +57,7 @@ class DampingPoly(_OnJoint):
             changes, units = {}, {}
             for power, name in enumerate(("linear", "quadratic", "cubic"), 1):
                 size = force / speed**power
-                # Less damping than the model's is allowed; a negative cubic may not outweigh it at five times the speed.
+                # Less damping than the model's is allowed; a negative cubic must not outweigh it at 5 times the speed.
                 low = -0.95 * has / (1.0 if power == 1 else 25.0 * speed ** (power - 1))
                 changes[name] = {"probes": (0.1 * size,), "low": low, "high": 5 * size, "resolution": 2e-3 * size}
                 units[name] = f"{unit} s/{per}" if power == 1 else f"{unit} s^{power}/{per}^{power}"
@@ -170,7 +170,7 @@ class Cogging(_OnJoint):
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         angle = theta[..., 2:3] * ctx.q[..., self.coordinates]
-        np.add.at(out.qfrc, (..., self.dofs), theta[..., 0:1] * np.cos(angle) + theta[..., 1:2] * np.sin(angle))
+        out.qfrc[..., self.dofs] += theta[..., 0:1] * np.cos(angle) + theta[..., 1:2] * np.sin(angle)
 
     def bind(self, model: mujoco.MjModel) -> None:
         super().bind(model)

@@ -23,7 +23,7 @@ from nfc_gym.physics.state import rotate, vector_to_quat
 
 
 class ExternalForce(Effect):
-    """A constant force: (x, y, z) in the world at a body's centre of mass, or one number along a scalar joint (a preload)."""
+    """A constant force: (x, y, z) in the world at a body's centre of mass, or one number along a joint (a preload)."""
 
     family = "external_force"
     summary = "Constant external force"
@@ -57,7 +57,7 @@ class ExternalForce(Effect):
             size = {"probes": (0.05 * force,), "low": -2 * force, "high": 2 * force, "resolution": 1e-3 * force}
             out.append(cls((name,), sized(cls.PARAMS, x=size, y=size, z=size)))
         for where in joint_places(model):
-            if len(where) > 1 or where[0] in bodies:
+            if len(where) != 1 or where[0] in bodies:
                 continue  # two candidates of one id could not be told apart
             force, _ = joint_scales(model, scales, where)
             size = {"probes": (0.1 * force,), "low": -3 * force, "high": 3 * force, "resolution": 2e-3 * force}
@@ -76,8 +76,8 @@ def _ends(model: mujoco.MjModel) -> list[str]:
 class Wind(Effect):
     """Steady wind on a body: F = push - drag v, in the world, at the centre of mass.
 
-    It is drag relative to air that moves at push / drag, written so that the force is linear in all four parameters: a body
-    that moves with the wind feels nothing, a body at rest feels `push`.
+    It is drag relative to air that moves at push / drag, written so that the force is linear in all four parameters: a
+    body that moves with the wind feels nothing, a body at rest feels `push`.
     """
 
     family = "wind"

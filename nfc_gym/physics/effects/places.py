@@ -84,7 +84,7 @@ def base_bodies(model: mujoco.MjModel) -> list[str]:
 
 
 def _is_carrier(model: mujoco.MjModel, body: int) -> bool:
-    """A body that slides in the world along at least one axis, through joints of its own or of massless carriers above."""
+    """A body that slides in the world along at least one axis, by joints of its own or of massless carriers above."""
     while body > 0:
         first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
         if any(int(model.jnt_type[j]) == _SLIDE for j in range(first, first + count)):

@@ -16,8 +16,11 @@ _SITE = int(mujoco.mjtTrn.mjTRN_SITE)
 
 
 def thrusters(model: mujoco.MjModel, body: int) -> tuple[list[int], Array]:
-    """Actuators that push at sites of a body or of what it carries: their ids (n,), and the force of each for a unit input
-    in the body's frame (n, 3), joints in their reference position (rotor mounts give little)."""
+    """Actuators that push at sites of a body or of what it carries.
+
+    Returns their ids (n,), and the force of each for a unit input in the body's frame (n, 3), with joints in their
+    reference position (rotor mounts give little).
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     frame = data.xmat[body].reshape(3, 3)
@@ -64,7 +67,7 @@ class _Rotor(Effect):
 
 
 class RotorDrag(_Rotor):
-    """F = -T (drag v_plane + inflow v_axis), T the total thrust, v the body's velocity across and along the rotors' axis.
+    """F = -T (drag v_plane + inflow v_axis), T total thrust, v the body's velocity across and along the rotors' axis.
 
     Blade flapping and induced drag of a rotor, linear in speed and thrust: Faessler et al., RA-L 3 (2018).
     """

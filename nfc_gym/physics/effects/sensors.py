@@ -61,7 +61,7 @@ class _OnChannel(Effect):
 
     @staticmethod
     def _channels(model: mujoco.MjModel, scales: Scales) -> list[tuple[str, Place, float, float]]:
-        """(channel, place, spread, noise) of every measured channel of one or three numbers that is no world position."""
+        """(channel, place, spread, noise) of every measured channel of one or three numbers but world positions."""
         out = []
         for channel, (spread, noise) in scales.channels.items():
             at = resolve_channel(model, channel)
@@ -153,7 +153,7 @@ class SensorGain(_OnChannel):
 
 
 class SensorDelay(_OnChannel):
-    """The channel reports what was `delay` ago. Before the first sample the trajectory is continued in a straight line."""
+    """The channel reports what was `delay` ago; before the first sample the trajectory goes on in a straight line."""
 
     family = "sensor_delay"
     summary = "Delayed sensor"
@@ -194,7 +194,7 @@ class SensorDelay(_OnChannel):
 
 
 class Misalignment(_OnChannel):
-    """A sensor mounted turned by the rotation vector (x, y, z): vectors are read in the turned frame, as is orientation."""
+    """A sensor mounted turned by the rotation vector (x, y, z); vectors and orientation are read in that frame."""
 
     family = "misalignment"
     summary = "Sensor mounted at an angle"

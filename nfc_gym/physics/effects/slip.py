@@ -1,13 +1,14 @@
 """Wheels that grip less than their friction coefficient says, and differently across and along.
 
-MuJoCo's contact friction is the same in both directions of a geom's surface (only `pair` elements have two coefficients, and
-their directions do not turn with a wheel), and `geom_surfacevel` is a velocity imposed on the surface, not a loss of grip. The
-effect therefore gives back, as a force at the contact patch, the share of the sliding friction that the wheel does not have:
+MuJoCo's contact friction is the same in both directions of a geom's surface (only `pair` elements have two
+coefficients, and their directions do not turn with a wheel), and `geom_surfacevel` is a velocity imposed on the
+surface, not a loss of grip. The effect therefore gives back, as a force at the contact patch, the share of the sliding
+friction that the wheel does not have:
 
     F = mu N (lateral v_lat e_lat + longitudinal v_long e_long) / sqrt(|v|^2 + eps^2),
 
-v the velocity of the patch over the ground, N an even share of the vehicle's weight, mu the contact's friction, eps 0.02 m/s. A
-patch that sticks (v = 0) is left to the solver.
+v the velocity of the patch over the ground, N an even share of the vehicle's weight, mu the contact's friction, eps
+0.02 m/s. A patch that sticks (v = 0) is left to the solver.
 """
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
@@ -27,7 +28,7 @@ _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
 def wheels(model: mujoco.MjModel) -> list[int]:
-    """Geoms that touch the ground as wheels: colliding, round about an unlimited hinge that is their body's only joint."""
+    """Geoms that touch the ground as wheels: colliding, about an unlimited hinge that is their body's only joint."""
     out = []
     for g in range(model.ngeom):
         body = int(model.geom_bodyid[g])

@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names
 from nfc_gym.physics.effects.drive import actuator_places
@@ -15,7 +16,7 @@ from nfc_gym.physics.effects.places import sized
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
 
 
-def command_limits(model: mujoco.MjModel, rows: Array) -> tuple[Array, Array]:
+def command_limits(model: mujoco.MjModel, rows: NDArray[np.intp]) -> tuple[Array, Array]:
     """(low, high) that MuJoCo itself clips the commands of some actuators to, infinite where it does not."""
     off = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL))
     limited = model.actuator_ctrllimited[rows].astype(bool) & (not off)
