@@ -71,7 +71,7 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
         if log is not None:
             found += [(source.name, s) for s in suspicions(mapping, model, log)]
             logs.append(log)
-    findings = gather(_promoted(found, len(sources)), len(sources))
+    findings = gather(_weighed(found, len(sources)), len(sources))
     if len(logs) < len(sources):
         return None, findings
     try:
@@ -80,13 +80,17 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
         return None, [*findings, _finding("split", str(e).removeprefix("split: "))]
 
 
-def _promoted(found: list[tuple[str, Suspicion]], logs: int) -> list[tuple[str, Suspicion]]:
-    """A channel that moves in no log says nothing: an error rather than a doubt."""
-    still = Counter(s.where for _, s in found if s.kind == "constant" and s.where.startswith("channels."))
-    return [
-        (log, replace(s, severity="error") if s.kind == "constant" and still[s.where] == logs else s)
-        for log, s in found
-    ]
+def _weighed(found: list[tuple[str, Suspicion]], logs: int) -> list[tuple[str, Suspicion]]:
+    """What moves in no log is worse than what rests in some: a channel is then an error, a command no mere note."""
+    still = Counter(s.where for _, s in found if s.kind == "constant")
+
+    def weigh(s: Suspicion) -> Suspicion:
+        everywhere, measured = still[s.where] == logs, s.where.startswith("channels.")
+        if s.kind != "constant" or everywhere != measured:
+            return s
+        return replace(s, severity="error" if measured else "note")
+
+    return [(log, weigh(s)) for log, s in found]
 
 
 def _whole(dataset: Dataset) -> list[Finding]:

@@ -1,6 +1,7 @@
 """What looks wrong in one log's signals: units, orders, clipping, pauses. Judged, never repaired."""
 
 from collections.abc import Iterator
+from collections.abc import Mapping as Dict
 
 import mujoco
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.channels import parse_channel
-from nfc_gym.measured.findings import Severity, Suspicion
+from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
 from nfc_gym.measured.smoothing import moving_average
@@ -80,7 +81,8 @@ def _command(name: str, values: Array, model: mujoco.MjModel | None) -> Iterator
         low, high = model.actuator_ctrlrange[actuator]
         slack = 1e-6 * (high - low)
         beyond = float(((values < low - slack) | (values > high + slack)).mean())
-        at = float(((values <= low + slack) | (values >= high - slack)).mean())
+        stops = [stop for stop in (low, high) if stop != 0]  # a command of 0 is an idle actuator, not a saturated one
+        at = float(np.any([np.abs(values - stop) <= slack for stop in stops], axis=0).mean())
         if beyond:
             message = (
                 f"{beyond:.1%} of the samples lie beyond the actuator's ctrlrange [{low:g}, {high:g}], the farthest "
@@ -218,14 +220,25 @@ def _compare_rates(where: str, log: Log, derived: Array, measured: Array) -> Ite
 
 
 def _twins(log: Log) -> Iterator[Suspicion]:
-    """Two channels, or two controls, with the same numbers throughout."""
-    for part, signals in (("channels", {k: c.values for k, c in log.channels.items()}), ("controls", log.controls)):
-        names = [k for k, v in signals.items() if np.ptp(v) > 0]
-        for i, one in enumerate(names):
-            for other in names[:i]:
-                if np.array_equal(signals[one], signals[other]):
-                    message = f"the same numbers as {other} throughout"
-                    severity: Severity = "error" if part == "channels" else "note"
-                    yield Suspicion(
-                        severity, f"{part}.{one}", "twin", message, "name the right column, or remove one of the two"
-                    )
+    """Channels with the same numbers throughout are a slip; commands may be meant so, and are told in one note."""
+    channels = {name: c.values for name, c in log.channels.items()}
+    for name, other in _same(channels).items():
+        advice = "name the right column, or remove one of the two"
+        yield Suspicion("error", f"channels.{name}", "twin", f"the same numbers as {other} throughout", advice)
+    same = _same(log.controls)
+    if same:
+        message = ", ".join(f"{name} commands what {other} does" for name, other in same.items())
+        advice = "if that is not meant, name the right columns; if it is, their effects are hard to tell apart"
+        yield Suspicion("note", "controls", "twin", message, advice)
+
+
+def _same(signals: Dict[str, Array]) -> dict[str, str]:
+    """Signal -> the first one before it that has the same numbers; constant ones are left out."""
+    moving = {name: values for name, values in signals.items() if np.ptp(values) > 0}
+    names = list(moving)
+    found = {}
+    for i, name in enumerate(names):
+        other = next((n for n in names[:i] if np.array_equal(moving[n], moving[name])), None)
+        if other is not None:
+            found[name] = other
+    return found

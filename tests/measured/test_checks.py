@@ -240,3 +240,12 @@ def test_a_recorded_matlab_file_reads_without_error(build: Build) -> None:
         'split: {by: time}\nchannels: {"joint:x:pos": {column: qm, unit: m, noise: 1.0e-6}}\n'
     )
     assert errors(path) == []
+
+
+def test_idle_commands_are_no_alarm(build: Build, tmp_path: Path) -> None:
+    """A motor that is off part of the time is not saturated, and one log without commands is only worth a note."""
+    from_zero = (Path(build()).parent / "machine.xml").read_text().replace('ctrlrange="-2.5 2.5"', 'ctrlrange="0 2.5"')
+    assert check(build(lambda t: t.update(goal=np.clip(t["goal"], 0, 2)), model=from_zero)) == []
+    table = dict(np.load(tmp_path / "run_1.npz"))
+    np.savez(tmp_path / "run_1.npz", **(table | {"goal": np.zeros(400)}))
+    assert [(f.severity, f.where) for f in check(tmp_path / "mapping.yaml")] == [("note", "run_1: controls.ctrl:servo")]
