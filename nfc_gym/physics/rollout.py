@@ -173,9 +173,26 @@ class _Run:
         self.pushing = [i for i, e in enumerate(plant.effects) if overrides(e, "force")]
         if self.rubbing:
             self.base_friction = self.fields["dof_frictionloss"].copy()
+        self.derived: set[str] = set()
+        if sensors:
+            self.batch.bind("sensordata")
+
+    def _derived(self, name: str) -> Array:
+        """A field of `MjData`.
+
+        A batch fills a derived field from the first call after its binding on, and it is zero until then. Whoever reads
+        one first therefore has it computed for the state as it is; the solver's warm start stays what it was.
+        """
+        array = self.batch.bind(name)
+        if name not in self.derived:
+            self.derived.add(name)
+            warm = self.batch.qacc_warmstart.copy()
+            self.batch.forward()
+            self.batch.qacc_warmstart[...] = warm
+        return array
 
     def _tile(self, array: Array) -> Array:
-        return np.broadcast_to(array, (self.count, *array.shape)).reshape(-1, *array.shape[1:])
+        return np.broadcast_to(array, (self.count, *array.shape)).reshape(self.count * len(array), *array.shape[1:])
 
     def _write_known(self) -> list[tuple[Any, Array]]:
         """Constant known fields are written once; those that vary through a segment are returned."""
@@ -247,6 +264,7 @@ class _Run:
                 self._advance(0, first=k == 0)
             batch.qpos[...] = start
             batch.qacc_warmstart[...] = 0
+            self.derived.clear()
         for k in range(steps):
             qpos[k], qvel[k] = batch.qpos, batch.qvel
             self._advance(k, first=k == 0)
@@ -264,15 +282,12 @@ class _Run:
         for bound, values in self.varying:
             write_field(self.fields, bound, self._tile(values[:, self.segments.history + k]))
         batch.ctrl[...] = self._serve(k, self._command(k, exogenous))
-        feedback = bool(self.rubbing or self.pushing)
-        if first:
-            # Without a history actuator states begin settled; derived fields become current where hooks read them.
-            if self.segments.history == 0 and self.segments.settle == 0:
-                advance_activations(model, batch.ctrl, batch.act, self.segments.dt, settle=True)
-            if feedback:
-                batch.forward()
-        if feedback:
-            self._apply(Context(model, self.segments.dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, batch.bind, self._nominal))
+        # Without a history actuator states begin settled.
+        if first and self.segments.history == 0 and self.segments.settle == 0:
+            advance_activations(model, batch.ctrl, batch.act, self.segments.dt, settle=True)
+        if self.rubbing or self.pushing:
+            state = (batch.qpos, batch.qvel, batch.ctrl)
+            self._apply(Context(model, self.segments.dt, *state, exogenous, self._derived, self._nominal))
         batch.step()
 
     def _result(self, qpos: Array, qvel: Array, sensed: Array | None) -> Trajectory:
