@@ -1,0 +1,181 @@
+"""Effects on commands and on what actuators make of them, against closed forms."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from machines import plant_of, run
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects import build
+from nfc_gym.physics.rollout import Segments
+
+DT, MASS = 0.002, 2.0
+RAIL = f"""
+<mujoco><option timestep="{DT}" gravity="0 0 0"/><worldbody><body><joint name="rail" type="slide" axis="1 0 0"/>
+<geom type="sphere" size=".1" mass="{MASS}"/></body></worldbody>
+<actuator><motor name="push" joint="rail" gear="2" ctrlrange="-5 5"/></actuator>
+<sensor><actuatorfrc name="made" actuator="push"/></sensor></mujoco>"""
+
+
+def _made(family: str, parameters: dict[str, float], ctrl: np.ndarray, history: int = 0, **more: object) -> np.ndarray:
+    """Force that the motor makes at every step."""
+    effect, theta = build(family, "push", parameters)
+    t = run(RAIL, effect, theta, len(ctrl) - history, ctrl=ctrl[:, None], history=history, **more)  # type: ignore[arg-type]
+    assert t.sensordata is not None
+    return t.sensordata[0, 0, :-1, 0]
+
+
+RNG = np.random.default_rng(5)
+NOISE = RNG.uniform(-4, 4, 60)
+
+
+def test_gain_and_loss_scale_the_force() -> None:
+    np.testing.assert_allclose(_made("gain", {"gain": 1.3}, NOISE), 1.3 * NOISE)
+    np.testing.assert_allclose(_made("loss", {"fraction": 0.4}, NOISE), 0.6 * NOISE)
+    np.testing.assert_array_equal(_made("loss", {"fraction": 1.0}, NOISE), 0 * NOISE)
+
+
+def test_gain_scales_a_servo_as_a_whole() -> None:
+    """Half the force of a position servo at any state, its limit included: not half the target."""
+    text = RAIL.replace(
+        '<motor name="push" joint="rail" gear="2" ctrlrange="-5 5"/>',
+        '<position name="push" joint="rail" kp="30" kv="2" forcerange="-8 8"/>',
+    )
+    effect, theta = build("gain", "push", {"gain": 0.5})
+    for q, v, u in ((0.1, 0.3, 0.2), (-0.4, -1.0, 0.5), (0.0, 0.0, 2.0)):
+        arguments = {"qpos": np.array([q]), "qvel": [v], "ctrl": [u]}
+        half = run(text, effect, theta, 1, **arguments).sensordata
+        full = run(text, None, [], 1, **arguments).sensordata
+        assert half is not None
+        assert full is not None
+        assert half[0, 0, 0, 0] == pytest.approx(0.5 * full[0, 0, 0, 0], rel=1e-12)
+
+
+def test_offset_and_dead_zone_shift_the_command() -> None:
+    np.testing.assert_allclose(_made("offset", {"offset": 0.7}, NOISE), NOISE + 0.7)
+    dead = _made("dead_zone", {"width": 1.0}, NOISE)
+    np.testing.assert_allclose(dead, np.sign(NOISE) * np.maximum(np.abs(NOISE) - 1.0, 0))
+
+
+def test_saturation_removes_its_share_of_the_range() -> None:
+    np.testing.assert_allclose(_made("saturation", {"removed": 0.5}, NOISE), np.clip(NOISE, -2.5, 2.5))
+    np.testing.assert_allclose(_made("saturation", {"inverse_limit": 0.5}, NOISE), np.clip(NOISE, -2, 2))
+
+
+def test_saturation_of_an_unlimited_command_is_refused() -> None:
+    effect, _ = build("saturation", "push", {"removed": 0.5})
+    with pytest.raises(InputError, match="range"):
+        effect.bind(mujoco.MjModel.from_xml_string(RAIL.replace('ctrlrange="-5 5"', "")))
+
+
+def test_lag_answers_a_step_exponentially() -> None:
+    tau = 0.03
+    ctrl = np.r_[np.zeros(10), np.ones(80)]
+    time = np.arange(1, 81) * DT
+    made = _made("lag", {"time_constant": tau}, ctrl)
+    np.testing.assert_array_equal(made[:10], 0)
+    np.testing.assert_allclose(made[10:], 1 - np.exp(-time / tau), atol=1e-12)
+
+
+def test_lag_starts_in_the_state_that_history_left() -> None:
+    """History's commands live on in the start; without history the first command is held since ever."""
+    tau = 0.03
+    made = _made("lag", {"time_constant": tau}, np.r_[np.zeros(5), np.ones(20), np.zeros(30)], history=25)
+    left = 1 - np.exp(-20 * DT / tau)
+    np.testing.assert_allclose(made, left * np.exp(-np.arange(1, 31) * DT / tau), atol=1e-12)
+    np.testing.assert_allclose(_made("lag", {"time_constant": tau}, np.full(20, 2.0)), 2.0)
+
+
+def test_lag_is_the_native_filter() -> None:
+    """The same commands through MuJoCo's own exact filter: same force at every step."""
+    spec = mujoco.MjSpec.from_string(RAIL)
+    effect, theta = build("lag", "push", {"time_constant": 0.05})
+    assert effect.spec(spec, theta)
+    native = run(spec.compile(), None, [], 60, ctrl=10 * NOISE[:, None]).sensordata  # beyond the command range, too
+    assert native is not None
+    np.testing.assert_allclose(_made("lag", {"time_constant": 0.05}, 10 * NOISE), native[0, 0, :-1, 0], atol=1e-12)
+
+
+def test_delay_shifts_and_interpolates() -> None:
+    whole = _made("delay", {"delay": 7 * DT}, NOISE)
+    np.testing.assert_allclose(whole[7:], NOISE[:-7], atol=1e-9)
+    np.testing.assert_allclose(whole[:7], NOISE[0], atol=1e-9)
+    part = _made("delay", {"delay": 2.25 * DT}, NOISE)
+    np.testing.assert_allclose(part[3:], 0.75 * NOISE[1:-2] + 0.25 * NOISE[:-3], atol=1e-9)
+    with_history = _made("delay", {"delay": 7 * DT}, NOISE, history=10)
+    np.testing.assert_allclose(with_history, NOISE[3:-7], atol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [1, 3, 4.5])
+def test_delay_is_the_native_one(delay: float) -> None:
+    """From rest at zero command MuJoCo's own buffer gives the same, also between two steps."""
+    ctrl = np.r_[np.zeros(10), NOISE]
+    spec = mujoco.MjSpec.from_string(RAIL)
+    effect, theta = build("delay", "push", {"delay": delay * DT})
+    assert effect.spec(spec, theta)
+    native = run(spec.compile(), None, [], len(ctrl), ctrl=ctrl[:, None]).sensordata
+    assert native is not None
+    np.testing.assert_allclose(_made("delay", {"delay": delay * DT}, ctrl), native[0, 0, :-1, 0], atol=1e-9)
+
+
+def test_delay_shorter_than_a_step_is_not_native() -> None:
+    effect, theta = build("delay", "push", {"delay": DT / 2})
+    assert not effect.spec(mujoco.MjSpec.from_string(RAIL), theta)
+
+
+def test_rows_of_one_batch_keep_their_own_delays() -> None:
+    model = mujoco.MjModel.from_xml_string(RAIL)
+    effect, _ = build("delay", "push", {"delay": 0.0})
+    segments = Segments(DT, 0, np.zeros((1, 1)), np.zeros((1, 1)), NOISE[None, :, None])
+    delays = np.array([[0.0], [3 * DT], [8 * DT]])
+    t = plant_of(model, effect).shoot(delays, segments, sensors=True)
+    for row, steps in enumerate((0, 3, 8)):
+        assert t.sensordata is not None
+        np.testing.assert_allclose(t.sensordata[row, 0, steps:-1, 0], NOISE[: 60 - steps], atol=1e-9)
+
+
+def test_torque_speed_line_limits_driving_but_not_braking() -> None:
+    """peak 5: at fall * speed = 0.6 a driving force is at most 2, a braking one still 5."""
+    heavy = RAIL.replace(f'mass="{MASS}"', 'mass="1e6"')
+    effect, theta = build("torque_speed", "push", {"fall": 0.3})
+    effect_of = lambda u, v: run(heavy, effect, theta, 5, qvel=[v], ctrl=[u]).qvel[0, 0, :, 0]  # noqa: E731
+    force = lambda u, v: np.diff(effect_of(u, v))[1:] / DT * 1e6 / 2  # noqa: E731
+    np.testing.assert_allclose(force(5.0, 2.0), 2.0, rtol=1e-3)
+    np.testing.assert_allclose(force(1.5, 2.0), 1.5, rtol=1e-3)
+    np.testing.assert_allclose(force(-5.0, 2.0), -5.0, rtol=1e-3)
+    np.testing.assert_allclose(force(-5.0, -2.0), -2.0, rtol=1e-3)
+    np.testing.assert_allclose(force(5.0, 0.0), 5.0, rtol=1e-3)
+
+
+def test_supply_sag_follows_the_measured_voltage() -> None:
+    volts = np.linspace(12.6, 9.0, 60)
+    made = _made("supply_sag", {"exponent": 2.0, "reference": 12.0}, NOISE, exogenous={"exo:supply": volts})
+    np.testing.assert_allclose(made, NOISE * (volts / 12.0) ** 2, rtol=1e-12)
+
+
+def test_supply_sag_without_a_voltage_says_so() -> None:
+    with pytest.raises(InputError, match="exo:supply"):
+        _made("supply_sag", {"exponent": 2.0, "reference": 12.0}, NOISE)
+
+
+@pytest.mark.parametrize(
+    ("family", "parameters"),
+    [
+        ("gain", {"gain": 1.3}),
+        ("loss", {"fraction": 0.4}),
+        ("offset", {"offset": 0.3}),
+        ("supply_sag", {"exponent": 1.0, "reference": 12.0}),
+        ("lag", {"time_constant": 0.02}),
+        ("delay", {"delay": 0.01}),
+    ],
+)
+def test_demand_inverts_the_effect(family: str, parameters: dict[str, float]) -> None:
+    """From the force that was made back to the command (a smooth one, so that rates can be taken), ends aside."""
+    time = np.arange(400) * DT
+    ctrl = 2 * np.sin(6 * time)
+    volts = 12.6 - time
+    made = _made(family, parameters, ctrl, exogenous={"exo:supply": volts})
+    effect, theta = build(family, "push", parameters)
+    effect.bind(mujoco.MjModel.from_xml_string(RAIL))
+    back = effect.demand(made[:, None], theta, {"exo:supply": volts}, DT)[:, 0]
+    np.testing.assert_allclose(back[50:-50], ctrl[50:-50], atol=0.02)
