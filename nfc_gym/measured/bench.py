@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -12,10 +11,11 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.instant import ForwardProblem, InverseProblem
+from nfc_gym.measured.model import compile_model, read_spec, registered
 from nfc_gym.measured.problem import Problem, RolloutProblem
 from nfc_gym.measured.segments import Layout, servos
 from nfc_gym.measured.states import States, estimate_states
-from nfc_gym.physics.effects import propose
+from nfc_gym.physics.effects import complete_inertia, propose
 from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrides
 from nfc_gym.physics.parameters import ParameterSpace, parameters_from_toml
 from nfc_gym.physics.rollout import Plant
@@ -58,45 +58,17 @@ class Bench:
         return whole.take(np.unique(np.linspace(0, len(whole) - 1, most).round().astype(int)))
 
 
-def load_spec(dataset: Dataset) -> mujoco.MjSpec:
-    """The model as written: a file beside the mapping, or a registered id."""
-    name = dataset.mapping.model_file
-    path = model_path(dataset)
-    if not path.exists():
-        raise InputError(f"model {name!r}: no such file beside the mapping ({path}), and no registered robot has that id")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        step = dataset.mapping.segments.timestep
-        if step is not None:
-            spec.option.timestep = step
-        return spec
-    except ValueError as error:
-        raise InputError(f"model {path}: MuJoCo cannot read it: {error}") from error
-
-
-def registered(name: str) -> str | None:
-    """Robot of a registered id (`nfc_gym/JackalFlat-v0` -> `jackal`), or None."""
-    short = name.rsplit("/", 1)[-1].lower()
-    return next((r for r in assets.ROBOTS if short in (f"{r}flat-v0", r)), None)
-
-
-def model_path(dataset: Dataset) -> Path:
-    """Where the model lies."""
-    robot = registered(dataset.mapping.model_file)
-    return assets.path(robot) if robot else dataset.folder / dataset.mapping.model_file
-
-
 def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
     """Compile the model, bind psi, and estimate the states along every log.
 
     Raises:
       InputError: the model does not compile, or names of the mapping do not exist in it.
     """
-    spec = load_spec(dataset)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise InputError(f"model {dataset.mapping.model_file}: does not compile: {error}") from error
+    spec = read_spec(dataset.mapping.model_file, dataset.folder)
+    if dataset.mapping.segments.timestep is not None:
+        spec.option.timestep = dataset.mapping.segments.timestep
+    complete_inertia(spec)  # centres of mass must be free to move: psi and effects shift them
+    model = compile_model(spec, dataset.mapping.model_file)
     known = actuator_names(model)
     for control in dataset.mapping.controls:
         if control.removeprefix("ctrl:") not in known:

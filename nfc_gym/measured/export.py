@@ -33,32 +33,28 @@ def _pack_effect(effect: Effect, theta: Array) -> dict[str, Any]:
         "family": effect.family,
         "where": list(effect.where),
         "each": isinstance(effect, Each),
-        "parameters": {p.name: float(v) for p, v in zip(effect.params, theta, strict=True)},
-        "units": {p.name: p.unit for p in effect.params},
+        "parameters": {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(effect.params, theta, strict=True)},
     }
 
 
 def unpack(data: dict[str, Any], plant: Plant) -> tuple[Plant, Array]:
     """The plant with its effects, and the full parameter vector (size,)."""
-    effects, thetas = [], []
-    for row in data["effects"]:
-        effect = unpack_effect(row)
-        effects.append(effect)
-        thetas.append(np.array([row["parameters"][p.name] for p in effect.params]))
-    whole = plant.with_effects(effects)
-    return whole, np.concatenate([plant.space.vector(data["psi"]), *thetas])
+    pairs = [unpack_effect(row) for row in data["effects"]]
+    whole = plant.with_effects([e for e, _ in pairs])
+    return whole, np.concatenate([plant.space.vector(data["psi"]), *(theta for _, theta in pairs)])
 
 
-def unpack_effect(row: dict[str, Any]) -> Effect:
-    """An effect from its packed form."""
+def unpack_effect(row: dict[str, Any]) -> tuple[Effect, Array]:
+    """An effect and its parameters from their packed form."""
     if not row["each"]:
-        return build(row["family"], row["where"], row["parameters"], row["units"])
-    members = []
+        return build(row["family"], row["where"], row["parameters"])
+    members, thetas = [], []
     for place in row["where"]:
-        of = {k.rpartition("@")[0]: v for k, v in row["parameters"].items() if k.rpartition("@")[2] == place}
-        units = {k.rpartition("@")[0]: v for k, v in row["units"].items() if k.rpartition("@")[2] == place}
-        members.append(build(row["family"], [place], of, units))
-    return each(members)
+        own = {k.rpartition("@")[0]: v for k, v in row["parameters"].items() if k.rpartition("@")[2] == place}
+        member, theta = build(row["family"], [place], own)
+        members.append(member)
+        thetas.append(theta)
+    return each(members), np.concatenate(thetas)
 
 
 def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array) -> tuple[str, list[Effect]]:

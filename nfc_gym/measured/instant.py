@@ -218,7 +218,7 @@ def actuator_forces(plant: Plant, x: Array, t: Track) -> Array:
         out = Forces(np.zeros((len(t.time), model.nv)), np.zeros((len(t.time), model.nbody, 6)))
         for effect, theta in pushing:
             effect.force(ctx, np.broadcast_to(theta, (len(t.time), len(theta))), out)
-        force = force - out.qfrc
+        force = force - out.qfrc - motion.carried(out.xfrc)
     dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     actuation = force[:, dofs] / model.actuator_gear[:, 0]
     for effect, theta in zip(plant.effects, thetas, strict=True):
@@ -253,10 +253,28 @@ class _Motion:
         return out
 
     def data(self, name: str) -> Array:
-        """A derived field (T, nv)."""
+        """A derived field (T, ...) of positions and velocities, computed along the track when first asked for."""
         if name not in self.fields:
-            raise KeyError(f"{name} is not known in inverse mode")
+            batch = self._placed()
+            values = batch.bind(name)
+            batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+            self.fields[name] = values.copy()
         return self.fields[name]
+
+    def _placed(self) -> Batch:
+        batch = Batch(self.model, len(self._track.time))
+        batch.qpos[...], batch.qvel[...] = self._track.qpos, self._track.qvel
+        return batch
+
+    def carried(self, wrenches: Array) -> Array:
+        """(T, nv) generalised forces of body wrenches (T, nbody, 6) at the centres of mass."""
+        if not wrenches.any():
+            return np.zeros((len(wrenches), self.model.nv))
+        batch = self._placed()
+        smooth, passive, bias, actuator = (batch.bind(f"qfrc_{n}") for n in ("smooth", "passive", "bias", "actuator"))
+        batch.xfrc_applied[...] = wrenches
+        batch.forward()
+        return smooth - passive + bias - actuator  # MuJoCo's sum of forces, less everything but the wrenches
 
 
 class ForwardProblem(InstantProblem):

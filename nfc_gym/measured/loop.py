@@ -16,12 +16,14 @@ from rich.console import Console
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured import verdict as say
-from nfc_gym.measured.bench import Bench, candidates, make_bench, model_path
-from nfc_gym.measured.dataset import Dataset, load
+from nfc_gym.measured.bench import Bench, candidates, make_bench
+from nfc_gym.measured.checks import require
+from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.details import details
 from nfc_gym.measured.export import corrected, effects_of, pack, unpack
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import metric, unexplained_variance
+from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.report import render
 from nfc_gym.measured.search import Data, Found, Options, Search
@@ -74,9 +76,9 @@ def close_loop(
     Raises:
       InputError: the mapping, the model or the logs cannot be used; nothing is written then.
     """
-    dataset = load(mapping)
+    dataset = require(mapping)[0]
     bench = make_bench(dataset, jobs)
-    key = digest(mapping, model_path(dataset), *dataset.files, extra=f"{seed} {version('nfc_gym')}")
+    key = digest(mapping, model_path(dataset.mapping.model_file, dataset.folder), *dataset.files, extra=f"{seed} {version('nfc_gym')}")
     folds = [dataset.fold(fold)] if fold is not None else list(dataset.folds)
     if len(dataset.folds) == 1:
         return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)

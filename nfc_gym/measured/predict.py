@@ -71,7 +71,7 @@ def _predict(bench: Bench, plant: Plant, x: Array, logs: list[Log], mode: str, r
     states = [bench.states[log.name] for log in logs]
     problem = kind(bench.plant.model, logs, states, bench.dataset.mapping.segments.length, most=sum(map(len, logs)))
     values = problem.evaluate(plant, x[None], problem.tracks)
-    return {log.name: v[0] for log, v in zip(logs, values, strict=True)}
+    return {log.name: v[0][:, 0] if v.shape[-1] == 1 else v[0] for log, v in zip(logs, values, strict=True)}
 
 
 def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None) -> Array:

@@ -108,21 +108,26 @@ class Screen:
         return gain, np.clip(theta, effect.low, effect.high)
 
     def chance(self, found: Sequence[Screened], blocks: NDArray[np.intp], rng: np.random.Generator, draws: int = 99) -> Array:
-        """(draws,) best gain over all candidates when every block of the residual takes a random sign.
+        """(draws,) best gain over all candidates on residuals that hold no effect.
 
-        A residual whose sign is random from block to block holds no effect, yet the best of many candidates gains from it:
-        that is the gain to be beaten.
+        What the best candidate leaves over takes a random sign in every block: such a residual is as large and as correlated
+        as the real one and holds nothing, yet the best of many candidates gains from it. That is the gain to be beaten.
         """
-        width = self.current.white.shape[1]
+        kept = [s for s in found if s.columns.shape[1]]
+        if not kept:
+            return np.zeros(draws)
+        spans = [_span(s.columns) for s in kept]
+        rest = self.projected - spans[0] @ (spans[0].T @ self.projected)
         signs = rng.choice([-1.0, 1.0], (draws, int(blocks.max()) + 1))[:, blocks]
-        targets = (signs[:, :, None] * self.projected.reshape(-1, width)).reshape(draws, -1)
-        best = np.zeros(draws)
-        for s in found:
-            if s.columns.shape[1]:
-                q, r = np.linalg.qr(s.columns)
-                keep = np.abs(np.diag(r)) > 1e-9
-                best = np.maximum(best, ((targets @ q[:, keep]) ** 2).sum(1))
-        return best
+        targets = (signs[:, :, None] * rest.reshape(-1, self.current.white.shape[1])).reshape(draws, -1)
+        return np.max([((targets @ q) ** 2).sum(1) for q in spans], axis=0)
+
+
+def _span(columns: Array) -> Array:
+    """Orthonormal basis of the columns that are not nearly zero or nearly copies."""
+    norms = np.linalg.norm(columns, axis=0)
+    u, size, _ = np.linalg.svd(columns[:, norms > 1e-9] / norms[norms > 1e-9], full_matrices=False)
+    return u[:, size > 1e-6]
 
 
 def screen_all(

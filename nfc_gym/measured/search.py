@@ -86,7 +86,9 @@ class Search:
 
     def __init__(self, fit_data: Data, select: Data, plant: Plant, candidates: Sequence[Effect], options: Options, say: Say) -> None:
         self.fit_data, self.select, self.plant = fit_data, select, plant
-        self.candidates, self.options, self.say = list(candidates), options, say
+        self.named = [e for e in candidates if not e.generic]
+        self.generics = [e for e in candidates if e.generic]
+        self.options, self.say = options, say
         self.rng = np.random.default_rng(options.seed)
         self.fit_blocks, self.select_blocks = clusters(fit_data.problem), clusters(select.problem)
 
@@ -102,29 +104,60 @@ class Search:
         return fit(self.fit_data.problem, under, plant, start, rounds)
 
     def run(self, calibrated: Fit) -> Found:
-        """Greedy rounds from a calibrated model until nothing more is believed."""
+        """Greedy rounds from a calibrated model until nothing more is believed; then the generic alternatives' turn."""
         current, rounds = calibrated, []
-        generic: Judged | None = None
         while True:
             fit_metric, select_metric = self.metrics(current)
             current = self.refit(current, fit_metric, rounds=6)
             screen = Screen(self.fit_data.problem, fit_metric, current)
-            screened = self._screen(screen, current)
-            outcome, best, generic = self._round(screen, screened, current, fit_metric, select_metric)
+            screened = self._screen(screen, self.named, current)
+            outcome, best = self._round(screen, screened, current, fit_metric, select_metric)
             rounds.append(outcome)
             if best is None or len(current.plant.effects) >= self.options.most:
-                return Found(calibrated, current, rounds, generic, screened, fit_metric, screen)
+                break
             current = self._prune(self.refit(best.fitted, fit_metric), fit_metric, select_metric)
+        generic = self._generic(screen, current, fit_metric, select_metric, outcome)
+        if generic is not None and current.plant.effects and self._outdone(generic, calibrated, current, fit_metric, select_metric):
+            self.say("a generic law explains clearly more than all named effects: none is claimed")
+            current = self.refit(calibrated, fit_metric, rounds=6)
+        return Found(calibrated, current, rounds, generic, screened, fit_metric, screen)
 
-    def _screen(self, screen: Screen, current: Fit) -> list[Screened]:
-        taken = {e.id for e in current.plant.effects}
-        left = [e for e in self.candidates if e.id not in taken]
+    def _screen(self, screen: Screen, pool: Sequence[Effect], current: Fit) -> list[Screened]:
+        taken = {e.id.removesuffix(":each") for e in current.plant.effects}
+        left = [e for e in pool if e.id not in taken]
         self.say(f"screening {len(left)} candidates")
         return screen_all(screen, left)
 
+    def _generic(self, screen: Screen, current: Fit, fit_metric: Metric, select_metric: Metric, outcome: Round) -> Judged | None:
+        """The smooth law of position, speed or time that still adds most to the accepted effects, if it is believed."""
+        screened = self._screen(screen, self.generics, current)
+        if not screened:
+            return None
+        base_losses = losses(self.select.problem, select_metric, current)
+        judged = [
+            self._try(current, [*current.plant.effects, s.effect], s.theta, screen, fit_metric, select_metric, base_losses)
+            for s in screened[:3]
+            if s.gain > 0
+        ]
+        judged.sort(key=lambda j: -j.total)
+        outcome.ranking += [self._row(j, current) for j in judged]
+        chance = float(np.quantile(screen.chance(screened, self.fit_blocks, self.rng), 0.99))
+        return judged[0] if judged and self._believed(judged[0], chance, current, base_losses) else None
+
+    def _outdone(self, generic: Judged, calibrated: Fit, current: Fit, fit_metric: Metric, select_metric: Metric) -> bool:
+        """Whether that generic law alone explains clearly more than all accepted effects together."""
+        base = self.refit(calibrated, fit_metric, rounds=6)
+        base_losses = losses(self.select.problem, select_metric, base)
+        effect = self._newest(generic, current)
+        plant = base.plant.with_effects([effect])
+        alone = fit(self.fit_data.problem, fit_metric, plant, np.concatenate([base.x, effect.null]), 10)
+        rival = judge(alone, base, self.select.problem, select_metric, base_losses, self.rng)
+        named = judge(current, base, self.select.problem, select_metric, base_losses, self.rng)
+        return rival.total > 1.25 * named.total and not not_worse(rival, named, self.fit_blocks, self.select_blocks, self.rng)
+
     def _round(
         self, screen: Screen, screened: list[Screened], current: Fit, fit_metric: Metric, select_metric: Metric
-    ) -> tuple[Round, Judged | None, Judged | None]:
+    ) -> tuple[Round, Judged | None]:
         """Refit the shortlist, judge it on the selection logs, and decide."""
         chance = float(np.quantile(screen.chance(screened, self.fit_blocks, self.rng), 0.99))
         base_losses = losses(self.select.problem, select_metric, current)
@@ -139,25 +172,20 @@ class Search:
         judged.sort(key=lambda j: -j.total)
         ranking = [self._row(j, current) for j in judged]
         outcome = Round(None, 0.0, ranking)
-        named = [j for j in judged if not self._newest(j, current).generic]
-        if not named:
+        if not judged:
             outcome.reason = "no candidate reduces the misfit"
-            return outcome, None, None
-        generics = [j for j in judged if self._newest(j, current).generic and self._believed(j, chance, current, base_losses)]
-        best = named[0]
-        if generics and generics[0].total > best.total and not not_worse(generics[0], best, self.fit_blocks, self.select_blocks, self.rng) and generics[0].total > 1.25 * best.total:
-            outcome.reason = f"{self._newest(generics[0], current).id} explains clearly more than any named effect"
-            return outcome, None, generics[0]
+            return outcome, None
+        best = judged[0]
         if not self._believed(best, chance, current, base_losses):
             outcome.reason = f"the best candidate, {self._newest(best, current).id}, gains no more on unseen logs than chance"
-            return outcome, None, None
+            return outcome, None
         outcome.accepted = self._newest(best, current).id
         outcome.share = best.gain / max(float(base_losses.sum()), 1e-9)
         outcome.equivalents = [
-            self._newest(j, current).id for j in named[1:] if j.gain > 0 and not_worse(best, j, self.fit_blocks, self.select_blocks, self.rng)
+            self._newest(j, current).id for j in judged[1:] if j.gain > 0 and not_worse(best, j, self.fit_blocks, self.select_blocks, self.rng)
         ]
         self.say(f"accepted {outcome.accepted}")
-        return outcome, best, None
+        return outcome, best
 
     def _try(
         self, current: Fit, effects: Sequence[Effect], theta: Array, screen: Screen, fit_metric: Metric, select_metric: Metric, base_losses: Array

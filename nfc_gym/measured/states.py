@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Channel, Log
-from nfc_gym.measured.smoothing import Local, estimate_noise, fresh_samples, local_polynomial
+from nfc_gym.measured.smoothing import Local, estimate_noise, fresh_samples, local_polynomial, moving_average
 from nfc_gym.physics.state import rotate, rotate_back, vector_to_quat, quat_conjugate, quat_multiply, quat_to_vector
 
 Array = NDArray[np.float64]
@@ -85,7 +85,7 @@ class _Builder:
                 steps = np.diff(self.log.time) * (self.qvel[1:, v] + self.qvel[:-1, v]) / 2
                 self.qpos[:, q] = self.model.qpos0[q] + np.concatenate([[0], np.cumsum(steps)])
         if acceleration is not None:
-            self.qacc[:, v] = acceleration[1].values
+            self.qacc[:, v] = moving_average(acceleration[1].values, acceleration[1].smooth)
 
     def free(self, body: str, q: int, v: int) -> None:
         """A free joint: position and world velocity, quaternion and body-frame rates."""

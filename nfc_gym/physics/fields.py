@@ -75,6 +75,7 @@ class ModelFields:
         model = target.model if isinstance(target, Batch) else target
         self.nominal_model = nominal if nominal is not None else _copy(model)
         self._arrays: dict[str, NDArray] = {}
+        self._scalars: set[str] = set()  # options of one model that are plain numbers: written back at `commit`
         self._dirty = False
 
     def nominal(self, name: str) -> NDArray:
@@ -88,7 +89,10 @@ class ModelFields:
                 self._arrays[name] = self._target.expand(name)
             else:
                 owner = self._target.opt if name.startswith("opt.") else self._target
-                self._arrays[name] = getattr(owner, name.removeprefix("opt."))
+                value = getattr(owner, name.removeprefix("opt."))
+                if not isinstance(value, np.ndarray):
+                    self._scalars.add(name)
+                self._arrays[name] = np.asarray(value, float) if name in self._scalars else value
         if name in _SETCONST:
             self._dirty = True
         return self._arrays[name]
@@ -101,6 +105,9 @@ class ModelFields:
 
     def commit(self) -> None:
         """Recompute the constants that MuJoCo derives from the fields written since the last commit."""
+        if not isinstance(self._target, Batch):
+            for name in self._scalars:
+                setattr(self._target.opt, name[4:], float(self._arrays[name]))
         if not self._dirty:
             return
         if isinstance(self._target, Batch):

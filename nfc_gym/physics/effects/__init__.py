@@ -19,13 +19,14 @@ from nfc_gym.physics.effects.load import ExternalForce, Slope, Wind
 from nfc_gym.physics.effects.rotor import GroundEffect, RotorDrag
 from nfc_gym.physics.effects.sensors import Misalignment, SensorBias, SensorDelay, SensorGain
 from nfc_gym.physics.effects.slip import Slip
+from nfc_gym.physics.effects.thermal import Thermal
 from nfc_gym.physics.effects.timing import Delay, Lag
 
 __all__ = ["FAMILIES", "Context", "Effect", "Forces", "Param", "Scales", "build", "complete_inertia", "propose"]
 
 _TYPES: tuple[type[Effect], ...] = (
     Coulomb, Stribeck, LoadFriction, DirectionalFriction, DampingPoly, Armature, SpringOffset, Cogging,
-    Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag,
+    Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
     Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, RotorDrag, GroundEffect, ExternalForce, Slope,
     Slip, SensorBias, SensorGain, SensorDelay, Misalignment, GenericPosition, GenericVelocity, GenericTime,
 )  # fmt: skip

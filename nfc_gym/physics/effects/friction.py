@@ -48,7 +48,9 @@ class _JointFriction(Effect):
             force, speed = joint_scales(model, scales, where)
             unit = force_unit(model, where[0])
             params = sized(cls.PARAMS, **cls._sizes(force, speed))
-            units = dict.fromkeys(cls.LEVELS, unit) | {"speed": f"{angle_unit(model, where[0])}/s"}
+            angle = angle_unit(model, where[0])
+            units = dict.fromkeys(cls.LEVELS, unit) | {"speed": f"{angle}/s", "square": f"1/({unit})"}
+            units |= dict.fromkeys(("forward_viscous", "backward_viscous"), f"{unit} s/{angle}")
             out.append(cls(where, with_units(params, units)))
         return out
 
@@ -109,11 +111,11 @@ class Stribeck(_JointFriction):
 
 
 class LoadFriction(_JointFriction):
-    """Friction of a loaded gear: level + |motor * actuator torque + external * bias torque|.
+    """Friction of a loaded gear: level + |motor * actuator torque + external * bias torque| + square * actuator torque^2.
 
     The actuator pushes the gear's one side (`qfrc_actuator`); gravity, Coriolis and centrifugal forces push the other
     (`qfrc_bias`, the torque that must be applied to balance them). A joint held still has both equal, and they add up.
-    With `motor` alone the gear is loaded by its own drive only. Contact forces are not counted: MuJoCo does not tell
+    With `motor` alone the gear is loaded by its own drive only; `square` is what a gear loses near its limit. Contact forces are not counted: MuJoCo does not tell
     them apart from the friction itself. Law: load-dependent models of Duclusaud et al., arXiv:2410.08650 (2024).
     """
 
@@ -123,16 +125,26 @@ class LoadFriction(_JointFriction):
         Param("level", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
         Param("motor", "1", 0.0, 0.8, probes=(0.05, 0.2), resolution=2e-3),
         Param("external", "1", 0.0, 0.8, probes=(0.05, 0.2), resolution=2e-3),
+        Param("square", "1/(N m)", 0.0, 1e3, probes=(0.05, 0.2)),
     )
 
     def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
-        drive = theta[..., 1:2] * ctx.data("qfrc_actuator")[..., self.dofs]
+        torque = ctx.data("qfrc_actuator")[..., self.dofs]
+        drive = theta[..., 1:2] * torque
         load = theta[..., 2:3] * ctx.data("qfrc_bias")[..., self.dofs]
-        return self.dofs, theta[..., 0:1] + np.abs(drive + load)
+        return self.dofs, theta[..., 0:1] + np.abs(drive + load) + theta[..., 3:4] * torque**2
+
+    @classmethod
+    def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
+        square = {"probes": (0.05 / force, 0.2 / force), "high": 1 / force, "resolution": 2e-3 / force}
+        return super()._sizes(force, speed) | {"square": square}
 
 
 class DirectionalFriction(_JointFriction):
-    """Friction with a level of its own for each direction of motion; both meet within 0.01 rad/s (m/s) of rest."""
+    """Friction with laws of its own for each direction of motion: level + viscous |v|; they meet within 0.01 rad/s (m/s) of rest.
+
+    Preloaded screws and gears do so in both parts: Janot, Gautier and Brunot (2019) report it of such a drive.
+    """
 
     family = "directional_friction"
     summary = "Dry friction that differs by direction of motion"
@@ -140,8 +152,18 @@ class DirectionalFriction(_JointFriction):
     PARAMS = (
         Param("forward", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
         Param("backward", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
+        Param("forward_viscous", "N m s/rad", 0.0, 1e5, probes=(0.01, 0.1)),
+        Param("backward_viscous", "N m s/rad", 0.0, 1e5, probes=(0.01, 0.1)),
     )
 
     def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
-        ahead = (1 + np.tanh(ctx.v[..., self.dofs] / _TURN)) / 2
-        return self.dofs, theta[..., 0:1] * ahead + theta[..., 1:2] * (1 - ahead)
+        v = ctx.v[..., self.dofs]
+        ahead, speed = (1 + np.tanh(v / _TURN)) / 2, np.abs(v)
+        forward = theta[..., 0:1] + theta[..., 2:3] * speed
+        backward = theta[..., 1:2] + theta[..., 3:4] * speed
+        return self.dofs, forward * ahead + backward * (1 - ahead)
+
+    @classmethod
+    def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
+        viscous = level_size(force / speed)
+        return super()._sizes(force, speed) | {"forward_viscous": viscous, "backward_viscous": viscous}

@@ -67,23 +67,27 @@ class _Rotor(Effect):
 
 
 class RotorDrag(_Rotor):
-    """F = -T (drag v_plane + inflow v_axis), T total thrust, v the body's velocity across and along the rotors' axis.
+    """F = -T (drag v_plane + inflow v_axis) + T lift |v_plane|^2, T total thrust, v the velocity across and along the axis.
 
-    Blade flapping and induced drag of a rotor, linear in speed and thrust: Faessler et al., RA-L 3 (2018).
+    Blade flapping and induced drag of a rotor, linear in speed and thrust: Faessler et al., RA-L 3 (2018). `lift` is the
+    thrust that a rotor gains in forward flight (translational lift: Leishman, Principles of Helicopter Aerodynamics, 2.14).
     """
 
     family = "rotor_drag"
-    summary = "Drag of the rotors"
+    summary = "Aerodynamic forces of the moving rotors"
     PARAMS = (
         Param("drag", "s/m", 0.0, 1.0, probes=(0.02,), resolution=2e-4),
         Param("inflow", "s/m", 0.0, 1.0, probes=(0.02,), resolution=2e-4),
+        Param("lift", "s^2/m^2", 0.0, 1.0, probes=(0.02,), resolution=2e-4),
     )
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         quat, velocity = body_motion(ctx, self.body)
         velocity = rotate_back(quat, velocity)
         axial = (velocity @ self.axis)[..., None] * self.axis
-        pull = -self.thrust(ctx) * (theta[..., 0:1] * (velocity - axial) + theta[..., 1:2] * axial)
+        plane = velocity - axial
+        lift = theta[..., 2:3] * (plane**2).sum(-1, keepdims=True) * self.axis
+        pull = self.thrust(ctx) * (lift - theta[..., 0:1] * plane - theta[..., 1:2] * axial)
         out.xfrc[..., self.body, :3] += rotate(quat, pull)
 
     @classmethod
@@ -92,7 +96,8 @@ class RotorDrag(_Rotor):
         for name in cls.places(model):
             speed = body_scales(model, scales, int(body_ids(model, (name,))[0]))[1]
             size = {"probes": (0.03 / speed,), "high": 2 / speed, "resolution": 5e-4 / speed}
-            out.append(cls((name,), sized(cls.PARAMS, drag=size, inflow=size)))
+            lift = {"probes": (0.03 / speed**2,), "high": 2 / speed**2, "resolution": 5e-4 / speed**2}
+            out.append(cls((name,), sized(cls.PARAMS, drag=size, inflow=size, lift=lift)))
         return out
 
 

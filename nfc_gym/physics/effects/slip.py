@@ -9,6 +9,9 @@ friction that the wheel does not have:
 
 v the velocity of the patch over the ground, N an even share of the vehicle's weight, mu the contact's friction, eps
 0.02 m/s. A patch that sticks (v = 0) is left to the solver.
+
+Rubber also creeps before it slides: its sliding speed grows with the force. `creep` softens the tangential part of every
+contact, `impratio / (1 + creep)`, so that the friction cone's edge is reached only at a finite sliding speed.
 """
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
@@ -21,7 +24,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, groups
-from nfc_gym.physics.fields import names_of
+from nfc_gym.physics.fields import ModelFields, names_of
 
 _EPS = 0.02  # m/s: below it the patch is taken to stick
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -66,7 +69,10 @@ class Slip(Effect):
 
     family = "slip"
     summary = "Wheels grip less than their friction says"
-    PARAMS = tuple(Param(n, "1", -0.5, 0.98, probes=(0.3,), resolution=0.005) for n in ("lateral", "longitudinal"))
+    PARAMS = (
+        *(Param(n, "1", -0.5, 0.98, probes=(0.3,), resolution=0.005) for n in ("lateral", "longitudinal")),
+        Param("creep", "1", 0.0, 1e3, probes=(3.0, 30.0), resolution=0.1),
+    )
 
     def bind(self, model: mujoco.MjModel) -> None:
         found = wheels(model)
@@ -89,6 +95,10 @@ class Slip(Effect):
         ]
         ground = [g for g in range(model.ngeom) if int(model.body_weldid[model.geom_bodyid[g]]) == 0]
         self.ground = [g for g in ground if model.geom_contype[g] or model.geom_conaffinity[g]]
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        ratio = fields["opt.impratio"]
+        ratio[...] = ratio / (1 + theta[..., 2])
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         gravity = ctx.nominal("opt.gravity")

@@ -1,0 +1,56 @@
+"""Drives that fade as they warm up."""
+
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names
+from nfc_gym.physics.effects.drive import actuator_places, plain
+from nfc_gym.physics.effects.places import sized
+
+
+class Thermal(Effect):
+    """Commands times 1 - fade h, heat h following (u / reference)^2 with a time constant: dh/dt = ((u / ref)^2 - h) / tau.
+
+    One thermal mass heated by the losses of the winding, which go with the square of the current; the resistance that
+    rises with it takes from the force. The heat starts settled at the first command.
+    """
+
+    family = "thermal"
+    summary = "Drive fades as it warms up"
+    PARAMS = (
+        Param("fade", "1", -0.5, 0.9, probes=(0.05, 0.2), resolution=0.002),
+        Param("time_constant", "s", 0.05, 300.0, probes=(0.5, 3.0, 20.0), shape=True),
+        Param("reference", "1", 1e-6, 1e6, probes=(1.0,), shape=True),
+    )
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.rows = actuator_ids(model, self.where)
+
+    def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
+        return (ctrl[..., self.rows] / theta[..., 2:3]) ** 2
+
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
+        wish = ctrl[..., self.rows]
+        target = (wish / theta[..., 2:3]) ** 2
+        heat = target + np.exp(-dt / theta[..., 1:2]) * (memory - target)
+        out = np.array(ctrl)
+        out[..., self.rows] = wish * (1 - theta[..., 0:1] * heat)
+        return out, heat
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        known = actuator_names(model)
+        out: list[Effect] = []
+        for where in actuator_places(model, plain(model)):
+            size = max(float(np.max(scales.command[[known.index(n) for n in where]])), 1e-6)
+            # The reference only sets the unit of heat: free, it would be the fade under another name.
+            fixed = {"probes": (size,), "low": size * (1 - 1e-3), "high": size * (1 + 1e-3)}
+            out.append(cls(where, sized(cls.PARAMS, reference=fixed)))
+        return out
