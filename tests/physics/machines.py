@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.physics.effects import FAMILIES, Effect, Scales, propose
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects import FAMILIES, Effect, Scales, build, propose
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant, Segments, Trajectory
 
@@ -109,6 +110,15 @@ def zoo_segments(model: mujoco.MjModel, seed: int, size: int = 2, history: int =
 
 def plant_of(model: mujoco.MjModel, *effects: Effect) -> Plant:
     return Plant(model, ParameterSpace(model, []), effects, nthread=1)
+
+
+def make(family: str, where: str | list[str], parameters: dict[str, float]) -> tuple[Effect, Array]:
+    """`build`, with every parameter of the family that is not given at null."""
+    try:
+        return build(family, where, parameters)
+    except InputError:
+        rest = {p.name: p.null for p in FAMILIES[family].PARAMS if not p.shape}
+        return build(family, where, rest | parameters)
 
 
 def probe(effect: Effect) -> Array:

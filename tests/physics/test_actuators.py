@@ -3,10 +3,9 @@
 import mujoco
 import numpy as np
 import pytest
+from machines import make, plant_of, run
 
-from machines import plant_of, run
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects import build
 from nfc_gym.physics.rollout import Segments
 
 DT, MASS = 0.002, 2.0
@@ -19,7 +18,7 @@ RAIL = f"""
 
 def _made(family: str, parameters: dict[str, float], ctrl: np.ndarray, history: int = 0, **more: object) -> np.ndarray:
     """Force that the motor makes at every step."""
-    effect, theta = build(family, "push", parameters)
+    effect, theta = make(family, "push", parameters)
     t = run(RAIL, effect, theta, len(ctrl) - history, ctrl=ctrl[:, None], history=history, **more)  # type: ignore[arg-type]
     assert t.sensordata is not None
     return t.sensordata[0, 0, :-1, 0]
@@ -41,7 +40,7 @@ def test_gain_scales_a_servo_as_a_whole() -> None:
         '<motor name="push" joint="rail" gear="2" ctrlrange="-5 5"/>',
         '<position name="push" joint="rail" kp="30" kv="2" forcerange="-8 8"/>',
     )
-    effect, theta = build("gain", "push", {"gain": 0.5})
+    effect, theta = make("gain", "push", {"gain": 0.5})
     for q, v, u in ((0.1, 0.3, 0.2), (-0.4, -1.0, 0.5), (0.0, 0.0, 2.0)):
         arguments = {"qpos": np.array([q]), "qvel": [v], "ctrl": [u]}
         half = run(text, effect, theta, 1, **arguments).sensordata
@@ -63,7 +62,7 @@ def test_saturation_removes_its_share_of_the_range() -> None:
 
 
 def test_saturation_of_an_unlimited_command_is_refused() -> None:
-    effect, _ = build("saturation", "push", {"removed": 0.5})
+    effect, _ = make("saturation", "push", {"removed": 0.5})
     with pytest.raises(InputError, match="range"):
         effect.bind(mujoco.MjModel.from_xml_string(RAIL.replace('ctrlrange="-5 5"', "")))
 
@@ -89,7 +88,7 @@ def test_lag_starts_in_the_state_that_history_left() -> None:
 def test_lag_is_the_native_filter() -> None:
     """The same commands through MuJoCo's own exact filter: same force at every step."""
     spec = mujoco.MjSpec.from_string(RAIL)
-    effect, theta = build("lag", "push", {"time_constant": 0.05})
+    effect, theta = make("lag", "push", {"time_constant": 0.05})
     assert effect.spec(spec, theta)
     native = run(spec.compile(), None, [], 60, ctrl=10 * NOISE[:, None]).sensordata  # beyond the command range, too
     assert native is not None
@@ -111,7 +110,7 @@ def test_delay_is_the_native_one(delay: float) -> None:
     """From rest at zero command MuJoCo's own buffer gives the same, also between two steps."""
     ctrl = np.r_[np.zeros(10), NOISE]
     spec = mujoco.MjSpec.from_string(RAIL)
-    effect, theta = build("delay", "push", {"delay": delay * DT})
+    effect, theta = make("delay", "push", {"delay": delay * DT})
     assert effect.spec(spec, theta)
     native = run(spec.compile(), None, [], len(ctrl), ctrl=ctrl[:, None]).sensordata
     assert native is not None
@@ -119,13 +118,13 @@ def test_delay_is_the_native_one(delay: float) -> None:
 
 
 def test_delay_shorter_than_a_step_is_not_native() -> None:
-    effect, theta = build("delay", "push", {"delay": DT / 2})
+    effect, theta = make("delay", "push", {"delay": DT / 2})
     assert not effect.spec(mujoco.MjSpec.from_string(RAIL), theta)
 
 
 def test_rows_of_one_batch_keep_their_own_delays() -> None:
     model = mujoco.MjModel.from_xml_string(RAIL)
-    effect, _ = build("delay", "push", {"delay": 0.0})
+    effect, _ = make("delay", "push", {"delay": 0.0})
     segments = Segments(DT, 0, np.zeros((1, 1)), np.zeros((1, 1)), NOISE[None, :, None])
     delays = np.array([[0.0], [3 * DT], [8 * DT]])
     t = plant_of(model, effect).shoot(delays, segments, sensors=True)
@@ -137,7 +136,7 @@ def test_rows_of_one_batch_keep_their_own_delays() -> None:
 def test_torque_speed_line_limits_driving_but_not_braking() -> None:
     """peak 5: at fall * speed = 0.6 a driving force is at most 2, a braking one still 5."""
     heavy = RAIL.replace(f'mass="{MASS}"', 'mass="1e6"')
-    effect, theta = build("torque_speed", "push", {"fall": 0.3})
+    effect, theta = make("torque_speed", "push", {"fall": 0.3})
     effect_of = lambda u, v: run(heavy, effect, theta, 5, qvel=[v], ctrl=[u]).qvel[0, 0, :, 0]  # noqa: E731
     force = lambda u, v: np.diff(effect_of(u, v))[1:] / DT * 1e6 / 2  # noqa: E731
     np.testing.assert_allclose(force(5.0, 2.0), 2.0, rtol=1e-3)
@@ -175,7 +174,15 @@ def test_demand_inverts_the_effect(family: str, parameters: dict[str, float]) ->
     ctrl = 2 * np.sin(6 * time)
     volts = 12.6 - time
     made = _made(family, parameters, ctrl, exogenous={"exo:supply": volts})
-    effect, theta = build(family, "push", parameters)
+    effect, theta = make(family, "push", parameters)
     effect.bind(mujoco.MjModel.from_xml_string(RAIL))
     back = effect.demand(made[:, None], theta, {"exo:supply": volts}, DT)[:, 0]
     np.testing.assert_allclose(back[50:-50], ctrl[50:-50], atol=0.02)
+
+
+def test_thermal_fades_a_step_as_it_heats_up() -> None:
+    """After a step to the reference the heat rises as 1 - exp(-t / tau), and the force falls with it."""
+    ctrl = np.r_[np.zeros(5), np.full(100, 2.0)]
+    made = _made("thermal", {"fade": 0.3, "time_constant": 0.1, "reference": 2.0}, ctrl)
+    time = np.arange(1, 101) * DT
+    np.testing.assert_allclose(made[5:], 2 * (1 - 0.3 * (1 - np.exp(-time / 0.1))), atol=1e-12)

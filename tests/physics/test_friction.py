@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-
-from machines import run
-from nfc_gym.physics.effects import build
+from machines import make, run
 
 DT, MASS = 0.001, 2.0
 RAIL = f"""
@@ -16,7 +14,7 @@ RAIL = f"""
 def _rail(
     family: str, parameters: dict[str, float], speed: float, steps: int, push: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    effect, theta = build(family, "rail", parameters)
+    effect, theta = make(family, "rail", parameters)
     t = run(RAIL, effect, theta, steps, qvel=[speed], ctrl=[push])
     return t.qpos[0, 0, :, 0], t.qvel[0, 0, :, 0]
 
@@ -44,7 +42,7 @@ def test_coulomb_holds_below_its_level_and_slides_above() -> None:
 
 
 def test_coulomb_adds_to_declared_friction() -> None:
-    effect, theta = build("coulomb", "rail", {"level": 1.0})
+    effect, theta = make("coulomb", "rail", {"level": 1.0})
     declared = RAIL.replace('type="slide"', 'type="slide" frictionloss="2" solreffriction=".002 1"')
     v = run(declared, effect, theta, 200, qvel=[1.0]).qvel[0, 0, :, 0]
     assert v[-1] == pytest.approx(1.0 - 3.0 / MASS * 200 * DT, rel=1e-3)
@@ -88,7 +86,7 @@ def test_load_friction_takes_its_share_of_the_drive() -> None:
 def test_load_friction_counts_gravity_as_load() -> None:
     """A hoist: the mass falls with g (1 - external), since friction is external * weight."""
     text = RAIL.replace('gravity="0 0 0"', 'gravity="-10 0 0"')
-    effect, theta = build("load_friction", "rail", {"level": 0.0, "motor": 0.0, "external": 0.3})
+    effect, theta = make("load_friction", "rail", {"level": 0.0, "motor": 0.0, "external": 0.3})
     v = run(text, effect, theta, 300, ctrl=[0.0]).qvel[0, 0, :, 0]
     assert v[-1] == pytest.approx(-10 * 0.7 * 300 * DT, rel=5e-3)
 
@@ -98,9 +96,22 @@ def test_load_friction_adds_both_sides_of_a_held_gear() -> None:
     text = RAIL.replace('gravity="0 0 0"', 'gravity="-10 0 0"')
     weight = 10 * MASS
     for motor, external in ((0.2, 0.15), (0.0, 0.35)):
-        effect, theta = build("load_friction", "rail", {"level": 0.0, "motor": motor, "external": external})
+        effect, theta = make("load_friction", "rail", {"level": 0.0, "motor": motor, "external": external})
         # the motor carries 75 % of the weight, 25 % is left for friction
         carried = 0.75 * motor + external
         v = run(text, effect, theta, 300, ctrl=[0.75 * weight]).qvel[0, 0, :, 0]
         assert carried > 0.25
         assert np.abs(v[10:]).max() < 1e-3
+
+
+def test_load_friction_grows_with_the_square_of_the_drive() -> None:
+    effect, theta = make("load_friction", "rail", {"square": 0.1})
+    v = run(RAIL, effect, theta, 400, qvel=[1.0], ctrl=[4.0]).qvel[0, 0, :, 0]
+    assert v[-1] == pytest.approx(1.0 + (4.0 - 0.1 * 16.0) / MASS * 400 * DT, rel=2e-3)
+
+
+def test_directional_friction_has_two_viscous_parts() -> None:
+    time = np.arange(301) * DT
+    for start, k in ((1.0, 2.0), (-1.0, 5.0)):
+        v = _rail("directional_friction", {"forward_viscous": 2.0, "backward_viscous": 5.0}, start, 300)[1]
+        np.testing.assert_allclose(v, start * np.exp(-k / MASS * time), atol=2e-3)

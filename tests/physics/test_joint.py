@@ -3,9 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-
-from machines import run
-from nfc_gym.physics.effects import build
+from machines import make, run
 
 DT, MASS = 0.001, 2.0
 RAIL = f"""
@@ -18,7 +16,7 @@ INERTIA = 0.01
 
 
 def _decay(**parameters: float) -> np.ndarray:
-    effect, theta = build("damping_poly", "rail", {"linear": 0.0, "quadratic": 0.0, "cubic": 0.0} | parameters)
+    effect, theta = make("damping_poly", "rail", {"linear": 0.0, "quadratic": 0.0, "cubic": 0.0} | parameters)
     return run(RAIL, effect, theta, 1000, qvel=[1.0]).qvel[0, 0, :, 0]
 
 
@@ -39,7 +37,7 @@ def test_cubic_damping_decays_as_one_over_root_time() -> None:
 
 def _period(family: str, parameters: dict[str, float], text: str, joint: str, start: float) -> float:
     """Period of an oscillation about zero from its upward zero crossings, interpolated."""
-    effect, theta = build(family, joint, parameters)
+    effect, theta = make(family, joint, parameters)
     t = run(text, effect, theta, 6000, qpos=np.array([start]))
     q = t.qpos[0, 0, :, 0]
     up = np.flatnonzero((q[:-1] < 0) & (q[1:] >= 0))
@@ -61,7 +59,7 @@ def test_two_springs_balance_at_their_weighted_mean() -> None:
     """A spring of 3 at rest 0.2 beside the model's 1 at rest -0.2: force as the sum of both."""
     text = ROTOR.replace('axis="0 0 1"', 'axis="0 0 1" stiffness="1" springref="-.2"').replace("RK4", "Euler")
     text = text.replace('springref="-.2"', f'springref="{np.degrees(-0.2)}"')
-    effect, theta = build("spring_offset", "turn", {"stiffness": 3.0, "rest": 0.2})
+    effect, theta = make("spring_offset", "turn", {"stiffness": 3.0, "rest": 0.2})
     for q in (-0.3, 0.1, 0.5):
         v = run(text, effect, theta, 1, qpos=np.array([q])).qvel[0, 0, 1, 0]
         assert v / DT * INERTIA == pytest.approx(-(q + 0.2) - 3 * (q - 0.2), rel=1e-6, abs=1e-9)
@@ -70,7 +68,7 @@ def test_two_springs_balance_at_their_weighted_mean() -> None:
 def test_cogging_does_its_work_and_returns_it() -> None:
     """Energy is conserved: 1/2 I v^2 + U(q), U the integral of the cogging torque."""
     cosine, sine, order = 0.02, 0.03, 3
-    effect, theta = build("cogging", "turn", {"cosine": cosine, "sine": sine, "order": order})
+    effect, theta = make("cogging", "turn", {"cosine": cosine, "sine": sine, "order": order})
     t = run(ROTOR.replace("RK4", "Euler"), effect, theta, 2000, qvel=[3.0])
     q, v = t.qpos[0, 0, :, 0], t.qvel[0, 0, :, 0]
     potential = -(cosine * np.sin(order * q) - sine * np.cos(order * q)) / order
@@ -83,7 +81,7 @@ def test_cogging_does_its_work_and_returns_it() -> None:
 def test_groups_share_one_value() -> None:
     text = """<mujoco><worldbody><body><joint name="hip_l" axis="0 0 1"/><geom size=".1"/></body>
     <body><joint name="hip_r" axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>"""
-    effect, theta = build("damping_poly", ["hip_l", "hip_r"], {"linear": 0.3, "quadratic": 0.0, "cubic": 0.0})
+    effect, theta = make("damping_poly", ["hip_l", "hip_r"], {"linear": 0.3, "quadratic": 0.0, "cubic": 0.0})
     v = run(mujoco.MjModel.from_xml_string(text), effect, theta, 100, qvel=[1.0, 2.0]).qvel[0, 0]
     np.testing.assert_allclose(v[:, 1], 2 * v[:, 0])
     assert v[-1, 0] < 0.95

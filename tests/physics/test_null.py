@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 import pytest
-
 from machines import ZOO, candidates, plant_of, probe, zoo, zoo_scales, zoo_segments
+
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects import FAMILIES, build, complete_inertia, propose
 from nfc_gym.physics.effects.base import Effect, overrides

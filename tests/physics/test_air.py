@@ -1,0 +1,142 @@
+"""Air, wind, rotors and outside forces against closed forms."""
+
+import mujoco
+import numpy as np
+import pytest
+from machines import make, run
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Scales
+from nfc_gym.physics.effects.load import Wind
+from nfc_gym.physics.effects.places import base_bodies
+from nfc_gym.physics.effects.rotor import RotorDrag
+
+DT, MASS = 0.001, 2.0
+FLYER = f"""
+<mujoco><option timestep="{DT}" gravity="0 0 %s"/><worldbody><body name="b" simple="false"><freejoint align="false"/>
+<inertial pos=".05 0 0" mass="{MASS}" diaginertia=".02 .02 .02"/><site name="up"/></body></worldbody>
+<actuator><motor name="lift" site="up" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
+SLED = f"""
+<mujoco><option timestep="{DT}" gravity="0 0 0"/><worldbody><body name="cart"><joint type="slide" axis="0 1 0"/><joint type="slide" axis="1 0 0"/>
+<body name="b"><joint axis="0 0 1"/><inertial pos=".1 0 0" mass="{MASS}" diaginertia=".02 .02 .02"/></body>
+<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody></mujoco>"""
+XYZ = dict.fromkeys("xyz", 0.0)
+
+
+def test_linear_drag_decays_exponentially_along_each_axis() -> None:
+    effect, theta = make("drag_linear", "b", {"x": 1.0, "y": 2.0, "z": 4.0})
+    v = run(FLYER % 0, effect, theta, 500, qvel=[1, 1, 1, 0, 0, 0]).qvel[0, 0]
+    time = np.arange(501) * DT
+    # the centre of mass lies off the frame's origin but on the x axis of the pull: y and z also turn the body, x not
+    alone = run(FLYER % 0, effect, theta, 500, qvel=[1, 0, 0, 0, 0, 0]).qvel[0, 0]
+    np.testing.assert_allclose(alone[:, 0], np.exp(-1.0 / MASS * time), atol=1e-3)
+    for axis, k in enumerate((1.0, 2.0, 4.0)):
+        np.testing.assert_allclose(v[:, axis], np.exp(-k / MASS * time), atol=2e-3)
+    # force at the centre of mass: no torque
+    np.testing.assert_allclose(v[:, 3:], 0, atol=1e-9)
+
+
+def test_quadratic_drag_decays_as_one_over_time() -> None:
+    effect, theta = make("drag_quadratic", "b", {"x": 3.0, "y": 3.0, "z": 3.0})
+    start = np.array([3.0, 4.0, 0.0])
+    v = run(FLYER % 0, effect, theta, 500, qvel=[*start, 0, 0, 0]).qvel[0, 0, :, :3]
+    time = np.arange(501) * DT
+    np.testing.assert_allclose(v, start / (1 + 3.0 / MASS * 5.0 * time)[:, None], rtol=5e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize(("family", "power"), [("drag_linear", 1), ("drag_quadratic", 2)])
+def test_fall_ends_at_terminal_velocity(family: str, power: int) -> None:
+    effect, theta = make(family, "b", {"x": 0.0, "y": 0.0, "z": 4.0})
+    v = run(FLYER % -10, effect, theta, 5000).qvel[0, 0, -1, 2]
+    assert v == pytest.approx(-((10 * MASS / 4.0) ** (1 / power)), rel=1e-3)
+
+
+def test_drag_turns_with_the_body() -> None:
+    """Drag along the body's x only; turned by 90 degrees about z it brakes motion along the world's y."""
+    effect, theta = make("drag_linear", "b", {"x": 2.0, "y": 0.0, "z": 0.0})
+    turned = np.array([0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    v = run(FLYER % 0, effect, theta, 400, qpos=turned, qvel=[1, 1, 0, 0, 0, 0]).qvel[0, 0, -1]
+    assert v[0] == pytest.approx(1.0, abs=1e-9)
+    assert v[1] == pytest.approx(np.exp(-2.0 / MASS * 0.4), rel=1e-3)
+
+
+def test_planar_base_feels_drag_at_its_centre_of_mass() -> None:
+    """The slides' body carries a turning one; drag of a body that turns on the spot about its centre is no force."""
+    assert "b" in base_bodies(mujoco.MjModel.from_xml_string(SLED)) or "cart" in base_bodies(
+        mujoco.MjModel.from_xml_string(SLED)
+    )
+    effect, theta = make("drag_linear", "b", {"x": 2.0, "y": 2.0, "z": 0.0})
+    spin = 1.5
+    v = run(SLED, effect, theta, 300, qvel=[-0.1 * spin, 0.0, spin]).qvel[0, 0]
+    assert v[-1, 2] == pytest.approx(spin, rel=1e-4)
+    straight = run(SLED, effect, theta, 300, qvel=[0.0, 1.0, 0.0]).qvel[0, 0]
+    assert straight[-1, 1] == pytest.approx(np.exp(-2.0 / MASS * 0.3), rel=2e-3)
+
+
+def test_a_body_that_moves_with_the_wind_feels_nothing() -> None:
+    parameters = {"push_x": 3.0, "push_y": -1.5, "push_z": 0.0, "drag": 1.5}
+    effect, theta = make("wind", "b", parameters)
+    wind = np.array([2.0, -1.0, 0.0])
+    still = run(FLYER % 0, effect, theta, 400, qvel=[*wind, 0, 0, 0]).qvel[0, 0, -1]
+    np.testing.assert_allclose(still, [*wind, 0, 0, 0], atol=1e-12)
+    # from rest it is carried along
+    v = run(FLYER % 0, effect, theta, 400).qvel[0, 0, -1, :3]
+    np.testing.assert_allclose(v, wind * (1 - np.exp(-1.5 / MASS * 0.4)), rtol=2e-3, atol=1e-9)
+
+
+def test_wind_is_told_in_metres_per_second() -> None:
+    assert "2.24 m/s" in Wind(("b",)).say(np.array([3.0, -1.5, 0.0, 1.5]))
+
+
+def test_external_force_on_a_body_and_along_a_joint() -> None:
+    effect, theta = make("external_force", "b", {"x": 1.0, "y": 2.0, "z": -3.0})
+    v = run(FLYER % 0, effect, theta, 100).qvel[0, 0, -1]
+    np.testing.assert_allclose(v, [*np.array([1.0, 2.0, -3.0]) / MASS * 0.1, 0, 0, 0], atol=1e-12)
+    hinge = """<mujoco><worldbody><body><joint name="j" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/>
+    </body></worldbody></mujoco>"""
+    effect, theta = make("external_force", "j", {"force": 0.5})
+    assert run(hinge, effect, theta, 100).qvel[0, 0, -1, 0] == pytest.approx(0.5 / 0.1 * 100 * 0.002)
+
+
+def test_slope_lets_a_frictionless_body_slide_down() -> None:
+    effect, theta = make("slope", "world", {"roll": 0.0, "pitch": 0.1})
+    v = run(FLYER % -10, effect, theta, 100).qvel[0, 0, -1, :3]
+    np.testing.assert_allclose(v, 10 * 0.1 * np.array([-np.sin(0.1), 0, -np.cos(0.1)]), rtol=1e-9)
+    effect, theta = make("slope", "world", {"roll": 0.1, "pitch": 0.0})
+    v = run(FLYER % -10, effect, theta, 100).qvel[0, 0, -1, :3]
+    np.testing.assert_allclose(v, 10 * 0.1 * np.array([0, np.sin(0.1), -np.cos(0.1)]), rtol=1e-9)
+
+
+def test_rotor_drag_grows_with_thrust_and_speed() -> None:
+    """Without thrust nothing; with thrust T the plane velocity decays at k T / m, and a climb loses inflow * T * v."""
+    effect, theta = make("rotor_drag", "b", {"drag": 0.05, "inflow": 0.02})
+    free = run(FLYER % 0, effect, theta, 50, qvel=[1, 0, 0, 0, 0, 0]).qvel[0, 0, -1]
+    np.testing.assert_allclose(free, [1, 0, 0, 0, 0, 0], atol=1e-12)
+    lifted = FLYER.replace('pos=".05 0 0"', 'pos="0 0 0"') % 0
+    v = run(lifted, effect, theta, 50, qvel=[1, 0, 2, 0, 0, 0], ctrl=[20.0]).qvel[0, 0]
+    assert v[-1, 0] == pytest.approx(np.exp(-0.05 * 20 / MASS * 0.05), rel=1e-4)
+    rate = 0.02 * 20 / MASS
+    assert v[-1, 2] == pytest.approx(2 * np.exp(-rate * 0.05) + 20 / MASS / rate * (1 - np.exp(-rate * 0.05)), rel=1e-4)
+
+
+def test_ground_effect_carries_more_near_the_ground() -> None:
+    effect, theta = make("ground_effect", "b", {"strength": 0.04})
+    lifted = FLYER.replace('pos=".05 0 0"', 'pos="0 0 0"') % -10
+    for height in (0.1, 0.5, 3.0):
+        start = np.array([0, 0, height, 1, 0, 0, 0.0])
+        v = run(lifted, effect, theta, 1, qpos=start, ctrl=[10 * MASS]).qvel[0, 0, -1, 2]
+        assert v == pytest.approx(10 * min(0.04 / (16 * height**2), 0.5) * DT, rel=1e-6)
+
+
+def test_rotor_effects_want_rotors() -> None:
+    model = mujoco.MjModel.from_xml_string(SLED)
+    assert RotorDrag.propose(model, Scales(np.ones(3), np.ones(3), np.ones(0), np.ones(0), 0.01)) == []
+    with pytest.raises(InputError, match="site"):
+        make("rotor_drag", "b", {"drag": 0.1, "inflow": 0.1})[0].bind(model)
+
+
+def test_rotors_lift_more_in_forward_flight() -> None:
+    effect, theta = make("rotor_drag", "b", {"lift": 0.01})
+    lifted = FLYER.replace('pos=".05 0 0"', 'pos="0 0 0"') % 0
+    v = run(lifted, effect, theta, 50, qvel=[3, 0, 0, 0, 0, 0], ctrl=[20.0]).qvel[0, 0, -1]
+    assert v[2] == pytest.approx(20 * (1 + 0.01 * 9) / MASS * 0.05, rel=1e-6)

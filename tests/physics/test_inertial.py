@@ -1,0 +1,123 @@
+"""Mass and its place, against models compiled with the mass welded on and against mechanics."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from machines import make, run
+
+from nfc_gym.physics.effects.inertial import principal
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.state import rotate
+
+BODY = """
+<mujoco><option timestep=".001" gravity="0 0 0"/><worldbody><body name="b" simple="false"><freejoint align="false"/>
+<inertial pos=".02 -.01 .03" quat=".8 .2 -.4 .1" mass="2" diaginertia=".03 .02 .04"/>%s</body></worldbody></mujoco>"""
+BARE = BODY % ""
+
+
+def _tensor(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """Inertia of a body about its own centre of mass in the body's frame, (3, 3)."""
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, model.body_iquat[body])
+    frame = frame.reshape(3, 3)
+    return frame @ np.diag(model.body_inertia[body]) @ frame.T
+
+
+def _edited(family: str, parameters: dict[str, float], text: str = BARE) -> mujoco.MjModel:
+    model = mujoco.MjModel.from_xml_string(text)
+    effect, theta = make(family, "b", parameters)
+    effect.bind(model)
+    fields = ModelFields(model)
+    effect.model(fields, theta)
+    fields.commit()
+    return model
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0, 5), st.tuples(*[st.floats(-0.4, 0.4)] * 3))
+def test_payload_is_a_welded_point_mass(mass: float, place: tuple[float, float, float]) -> None:
+    """Mass matrix, centre and inertia equal those of MuJoCo's own compilation of a point mass in a child body."""
+    model = _edited("payload", {"mass": mass, **dict(zip("xyz", place, strict=True))})
+    child = f'<body pos="{place[0]} {place[1]} {place[2]}"><inertial pos="0 0 0" mass="{max(mass, 1e-12)}" diaginertia="1e-14 1e-14 1e-14"/></body>'
+    welded = mujoco.MjModel.from_xml_string(BODY % child)
+    matrices = []
+    for m in (model, welded):
+        data = mujoco.MjData(m)
+        data.qpos[3:7] = np.array([0.9, 0.1, -0.3, 0.2]) / np.linalg.norm([0.9, 0.1, -0.3, 0.2])
+        mujoco.mj_forward(m, data)
+        full = np.zeros((6, 6))
+        mujoco.mj_fullM(m, data, full)
+        matrices.append(full)
+    np.testing.assert_allclose(matrices[0], matrices[1], atol=1e-10)
+    assert model.body_subtreemass[1] == pytest.approx(2 + mass)
+
+
+def test_payload_moves_as_the_welded_body_does() -> None:
+    place = (0.2, -0.1, 0.15)
+    effect, theta = make("payload", "b", {"mass": 0.7, **dict(zip("xyz", place, strict=True))})
+    start = [0.3, 0.1, -0.2, 2.0, -3.0, 1.0]
+    mine = run(BARE, effect, theta, 300, qvel=start)
+    child = '<body pos="0.2 -0.1 0.15"><inertial pos="0 0 0" mass=".7" diaginertia="1e-12 1e-12 1e-12"/></body>'
+    theirs = run(BODY % child, None, [], 300, qvel=start)
+    np.testing.assert_allclose(mine.qpos, theirs.qpos, atol=1e-7)
+
+
+def test_two_payloads_compose() -> None:
+    """Half the mass twice at one place is the whole mass once."""
+    model = mujoco.MjModel.from_xml_string(BARE)
+    effect, theta = make("payload", "b", {"mass": 0.4, "x": 0.1, "y": 0.2, "z": -0.1})
+    effect.bind(model)
+    fields = ModelFields(model)
+    effect.model(fields, theta)
+    effect.model(fields, theta)
+    once = _edited("payload", {"mass": 0.8, "x": 0.1, "y": 0.2, "z": -0.1})
+    np.testing.assert_allclose(_tensor(model, 1), _tensor(once, 1), atol=1e-12)
+    np.testing.assert_allclose(model.body_ipos[1], once.body_ipos[1], atol=1e-14)
+
+
+def test_com_shift_keeps_mass_and_inertia_and_moves_the_centre() -> None:
+    model, bare = _edited("com_shift", {"x": 0.01, "y": -0.02, "z": 0.03}), mujoco.MjModel.from_xml_string(BARE)
+    np.testing.assert_allclose(model.body_ipos[1] - bare.body_ipos[1], [0.01, -0.02, 0.03])
+    np.testing.assert_array_equal(_tensor(model, 1), _tensor(bare, 1))
+    assert model.body_mass[1] == bare.body_mass[1]
+
+
+def test_com_shift_tips_a_hanging_body() -> None:
+    """A pendulum's centre moved sideways by s at depth d balances turned by atan(s / d)."""
+    text = """<mujoco><option timestep=".005"/><worldbody><body name="b" simple="false"><joint axis="0 1 0" damping=".5"/>
+    <inertial pos="0 0 -.4" mass="1" diaginertia=".01 .01 .01"/></body></worldbody></mujoco>"""
+    effect, theta = make("com_shift", "b", {"x": 0.05, "y": 0.0, "z": 0.0})
+    q = run(text, effect, theta, 2000).qpos[0, 0, -1, 0]
+    assert abs(q) == pytest.approx(np.arctan2(0.05, 0.4), rel=1e-4)
+
+
+def test_inertia_scales_each_principal_moment() -> None:
+    model, bare = _edited("inertia", {"x": 1.2, "y": 0.9, "z": 1.1}), mujoco.MjModel.from_xml_string(BARE)
+    np.testing.assert_allclose(model.body_inertia[1] / bare.body_inertia[1], [1.2, 0.9, 1.1])
+    assert model.body_mass[1] == bare.body_mass[1]
+
+
+def test_principal_of_a_diagonal_matrix_is_itself_bit_for_bit() -> None:
+    for diagonal in ([1.0, 2.0, 3.0], [3.0, 1.0, 2.0], [1.0, 1.0, 1.0], [2.0, 2.0, 1.0]):
+        moments, quat = principal(np.diag(diagonal))
+        np.testing.assert_array_equal(moments, diagonal)
+        np.testing.assert_array_equal(quat, [1, 0, 0, 0])
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-1, 1), min_size=9, max_size=9))
+def test_principal_rebuilds_the_matrix(values: list[float]) -> None:
+    root = np.array(values).reshape(3, 3)
+    matrix = root @ root.T
+    moments, quat = principal(matrix)
+    axes = np.stack([rotate(quat, e) for e in np.eye(3)], -1)
+    np.testing.assert_allclose(axes @ np.diag(moments) @ axes.T, matrix, atol=1e-12)
+
+
+def test_principal_is_continuous() -> None:
+    """Nearly equal moments: a small change of the matrix turns the axes by a small angle, without swapping them."""
+    quats = [principal(np.diag([1.0, 1.2, 2.0]) + e * np.ones((3, 3)))[1] for e in (0.0, 1e-6, 1e-3)]
+    assert 1 - quats[1][0] < 1e-9
+    assert 1 - quats[2][0] < 1e-3

@@ -1,0 +1,153 @@
+"""psi: writing it into one model and a batch, always from nominal; reading, normalising, refusing."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mujoco.batch import Batch
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.parameters import Parameter, ParameterSpace
+
+XML = """
+<mujoco><worldbody>
+  <geom name="floor" type="plane" size="5 5 1"/>
+  <body name="base" pos="0 0 1"><freejoint/><geom name="hull" size=".1 .2 .3" type="box" mass="2"/>
+    <body name="leg_l"><joint name="leg_l" axis="0 1 0"/><geom name="foot_l" size=".1" mass=".5"/></body>
+    <body name="leg_r"><joint name="leg_r" axis="0 1 0"/><geom name="foot_r" size=".1" mass=".5"/></body></body>
+</worldbody><actuator><velocity name="spin" joint="leg_l" kv="3"/><position name="hold" joint="leg_r" kp="20" kv="1"/></actuator></mujoco>"""
+MODEL = mujoco.MjModel.from_xml_string(XML)
+SPACE = ParameterSpace(
+    MODEL,
+    [
+        Parameter("mass", "body_mass", ("base",), "kg", 1.0, 4.0),
+        Parameter("grip", "geom_friction[0]", ("foot_l", "foot_r"), "1", 0.1, 2.0),
+        Parameter("damping", "dof_damping", ("leg_l",), "N m s/rad", 0.0, 1.0),
+        Parameter("kv", "servo_kv", ("spin",), "N m s/rad", 0.0, 9.0),
+        Parameter("kp", "servo_kp", ("hold",), "N m/rad", 0.0, 90.0),
+        Parameter("gravity", "opt.gravity[2]", (), "m/s^2", -12.0, -8.0, anchored=True),
+        Parameter("bounce", "geom_restitution", ("hull",), "1", 0.0, 0.9, nominal=0.2),
+    ],
+)
+VALUES = np.array([3.0, 1.5, 0.4, 5.0, 40.0, -9.0, 0.6])
+
+
+def _written(psi: np.ndarray, times: int = 1) -> mujoco.MjModel:
+    model = mujoco.MjModel.from_xml_string(XML)
+    fields = ModelFields(model)
+    for _ in range(times):
+        SPACE.write(fields, psi)
+    fields.commit()
+    return model
+
+
+def test_nominal_is_read_from_the_model() -> None:
+    np.testing.assert_allclose(SPACE.nominal, [2.0, 1.0, 0.0, 3.0, 20.0, -9.81, 0.2])
+
+
+def test_values_arrive_where_they_should() -> None:
+    model = _written(VALUES)
+    assert model.body_mass[1] == 3.0
+    np.testing.assert_array_equal(model.geom_friction[2:, 0], 1.5)
+    np.testing.assert_array_equal(model.geom_friction[:2], MODEL.geom_friction[:2])
+    assert model.dof_damping[6] == 0.4
+    assert (model.actuator_gainprm[0, 0], model.actuator_biasprm[0, 2]) == (5.0, -5.0)
+    assert (model.actuator_gainprm[1, 0], model.actuator_biasprm[1, 1]) == (40.0, -40.0)
+    assert model.actuator_biasprm[1, 2] == MODEL.actuator_biasprm[1, 2]
+    assert model.opt.gravity[2] == -9.0
+
+
+def test_mass_moves_inertia_and_derived_constants() -> None:
+    model = _written(VALUES)
+    np.testing.assert_allclose(model.body_inertia[1], 1.5 * MODEL.body_inertia[1])
+    assert model.body_subtreemass[1] == pytest.approx(4.0)
+    heavy = mujoco.MjModel.from_xml_string(XML.replace('mass="2"', 'mass="3"'))
+    np.testing.assert_allclose(model.body_invweight0, heavy.body_invweight0, rtol=1e-12)
+
+
+def test_writing_starts_from_nominal_and_does_not_compound() -> None:
+    once, thrice = _written(VALUES), _written(VALUES, times=3)
+    np.testing.assert_array_equal(once.body_inertia, thrice.body_inertia)
+    model = mujoco.MjModel.from_xml_string(XML)
+    fields = ModelFields(model)
+    SPACE.write(fields, VALUES)
+    fields.restore()
+    fields.commit()
+    for name in ("body_mass", "body_inertia", "geom_friction", "geom_solref", "actuator_gainprm", "body_invweight0"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(MODEL, name), err_msg=name)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**31))
+def test_single_model_equals_the_batch(seed: int) -> None:
+    psi = SPACE.sample(np.random.default_rng(seed), 3)
+    batch = Batch(MODEL, 3, 1)
+    fields = ModelFields(batch, MODEL)
+    SPACE.write(fields, psi)
+    fields.commit()
+    for i in range(3):
+        mine, theirs = _written(psi[i]), batch.get_model(i)
+        for name in ("body_mass", "body_inertia", "geom_friction", "geom_solref", "dof_damping", "actuator_gainprm",
+                     "actuator_biasprm", "body_invweight0", "dof_M0", "body_subtreemass"):  # fmt: skip
+            np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)
+        np.testing.assert_array_equal(mine.opt.gravity, theirs.opt.gravity)
+
+
+def test_normalise_maps_the_box_and_inverts() -> None:
+    np.testing.assert_allclose(SPACE.normalise(SPACE.low), -1)
+    np.testing.assert_allclose(SPACE.normalise(SPACE.high), 1)
+    np.testing.assert_allclose(SPACE.denormalise(SPACE.normalise(VALUES)), VALUES)
+
+
+def test_sample_stays_in_the_box_and_leaves_anchored_alone() -> None:
+    draws = SPACE.sample(np.random.default_rng(0), 500)
+    assert (draws >= SPACE.low).all()
+    assert (draws <= SPACE.high).all()
+    assert (draws[:, 5] == -9.81).all()
+    np.testing.assert_allclose(draws[:, 0].mean(), 2.5, atol=0.15)
+
+
+def test_vector_takes_names() -> None:
+    np.testing.assert_array_equal(SPACE.vector({"kv": 7.0}), [2.0, 1.0, 0.0, 7.0, 20.0, -9.81, 0.2])
+    with pytest.raises(InputError, match="there are: mass, grip"):
+        SPACE.vector({"kq": 7.0})
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "words"), [(0, 0.0, "mass must be positive"), (0, -1.0, "mass"), (2, np.nan, "not finite")]
+)
+def test_impossible_values_are_refused(index: int, value: float, words: str) -> None:
+    psi = VALUES.copy()
+    psi[index] = value
+    with pytest.raises(InputError, match=words):
+        SPACE.write(ModelFields(mujoco.MjModel.from_xml_string(XML)), psi)
+
+
+def test_values_beyond_the_prior_are_allowed() -> None:
+    assert _written(np.array([9.0, *VALUES[1:]])).body_mass[1] == 9.0
+
+
+@pytest.mark.parametrize(
+    ("field", "of", "words"),
+    [
+        ("body_mass", ("bass",), "leg_l"),
+        ("geom_friction", ("foot_l",), "3 components"),
+        ("geom_friction[7]", ("foot_l",), "component 7"),
+        ("body_weight", ("base",), "not an array field"),
+        ("body_mass", (), "at least one"),
+    ],
+)
+def test_unknown_fields_and_objects_are_refused(field: str, of: tuple[str, ...], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        ParameterSpace(MODEL, [Parameter("p", field, of, "1", -100, 100)])
+
+
+def test_bounds_and_names_are_checked() -> None:
+    with pytest.raises(InputError, match="twice"):
+        ParameterSpace(MODEL, [Parameter("p", "body_mass", ("base",), "kg", 0, 9)] * 2)
+    with pytest.raises(InputError, match="below"):
+        ParameterSpace(MODEL, [Parameter("p", "body_mass", ("base",), "kg", 3, 3)])
+    with pytest.raises(InputError, match="outside"):
+        ParameterSpace(MODEL, [Parameter("p", "body_mass", ("base",), "kg", 3, 4)])

@@ -1,0 +1,114 @@
+"""Faulty sensors: what they report of a known motion, and the start state recovered from it."""
+
+import mujoco
+import numpy as np
+import pytest
+from machines import make
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, vector_to_quat
+
+MODEL = mujoco.MjModel.from_xml_string("""
+<mujoco><worldbody><body name="base"><freejoint/><geom size=".1"/><site name="imu"/></body>
+<body><joint name="arm" axis="0 0 1"/><geom size=".1"/></body></worldbody>
+<sensor><gyro name="gyro" site="imu"/></sensor></mujoco>""")
+DT = 0.01
+RNG = np.random.default_rng(3)
+
+
+def _bound(family: str, channel: str, parameters: dict[str, float]) -> tuple:
+    effect, theta = make(family, channel, parameters)
+    effect.bind(MODEL)
+    return effect, theta
+
+
+def test_bias_and_gain_are_affine() -> None:
+    values = RNG.normal(size=(4, 20, 1))
+    effect, theta = _bound("sensor_bias", "joint:arm:pos", {"bias": 0.3})
+    np.testing.assert_allclose(effect.sense("joint:arm:pos", values, theta, DT), values + 0.3)
+    np.testing.assert_array_equal(effect.sense("joint:arm:vel", values, theta, DT), values)
+    effect, theta = _bound("sensor_gain", "joint:arm:pos", {"gain": 1.2})
+    np.testing.assert_allclose(effect.sense("joint:arm:pos", values, theta, DT), 1.2 * values)
+    effect, theta = _bound("sensor_bias", "sensor:gyro", {"x": 0.1, "y": 0.2, "z": 0.3})
+    three = RNG.normal(size=(4, 20, 3))
+    np.testing.assert_allclose(effect.sense("sensor:gyro", three, theta, DT), three + [0.1, 0.2, 0.3])
+
+
+def test_delay_reports_the_past_exactly_for_straight_lines() -> None:
+    """A line is reported late without error at any delay, the extrapolated beginning included."""
+    time = np.arange(30) * DT
+    line = (0.5 + 2 * time)[None, :, None]
+    for delay in (0.0, 0.004, 0.03):
+        effect, theta = _bound("sensor_delay", "joint:arm:pos", {"delay": delay})
+        np.testing.assert_allclose(
+            effect.sense("joint:arm:pos", line, theta[None], DT)[0, :, 0], 0.5 + 2 * (time - delay), atol=1e-12
+        )
+
+
+def test_delay_of_whole_samples_shifts_bit_for_bit() -> None:
+    values = RNG.normal(size=(2, 30, 3))
+    effect, _ = _bound("sensor_delay", "sensor:gyro", {"delay": 0.0})
+    late = effect.sense("sensor:gyro", values, np.array([[0.0], [4.0]]), 1.0)
+    np.testing.assert_array_equal(late[0], values[0])
+    np.testing.assert_array_equal(late[1, 4:], values[1, :-4])
+
+
+@pytest.mark.parametrize(
+    ("family", "channel", "parameters"),
+    [
+        ("sensor_bias", "joint:arm:pos", {"bias": 0.3}),
+        ("sensor_bias", "joint:arm:vel", {"bias": 0.3}),
+        ("sensor_bias", "body:base:linvel", {"x": 0.1, "y": 0.2, "z": 0.3}),
+        ("sensor_bias", "body:base:angvel@body", {"x": 0.1, "y": 0.2, "z": 0.3}),
+        ("sensor_gain", "joint:arm:pos", {"gain": 1.2}),
+        ("sensor_gain", "joint:arm:vel", {"gain": 1.2}),
+        ("sensor_gain", "body:base:linvel", {"gain": 1.2}),
+        ("misalignment", "body:base:quat", {"x": 0.2, "y": -0.1, "z": 0.3}),
+        ("misalignment", "body:base:linvel", {"x": 0.2, "y": -0.1, "z": 0.3}),
+    ],
+)
+def test_unsense_recovers_the_start_state(family: str, channel: str, parameters: dict[str, float]) -> None:
+    q, v = RNG.normal(size=(5, MODEL.nq)), RNG.normal(size=(5, MODEL.nv))
+    q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+    where = {"joint:arm:pos": (q, 7, 1), "joint:arm:vel": (v, 6, 1), "body:base:linvel": (v, 0, 3)}
+    where |= {"body:base:angvel@body": (v, 3, 3), "body:base:quat": (q, 3, 4)}
+    array, at, dim = where[channel]
+    effect, theta = _bound(family, channel, parameters)
+    wrong_q, wrong_v = q.copy(), v.copy()
+    wrong = wrong_q if array is q else wrong_v
+    wrong[:, at : at + dim] = effect.sense(channel, array[:, None, at : at + dim], theta, DT)[:, 0]
+    if (family, channel) == ("sensor_gain", "joint:arm:pos"):
+        wrong_v[:, 6] *= 1.2  # speed taken from the same channel
+    back_q, back_v = effect.unsense(wrong_q, wrong_v, theta)
+    np.testing.assert_allclose(back_q, q, atol=1e-12)
+    np.testing.assert_allclose(back_v, v, atol=1e-12)
+    assert not np.allclose(wrong, array)
+
+
+def test_delay_moves_the_start_state_on() -> None:
+    effect, theta = _bound("sensor_delay", "joint:arm:pos", {"delay": 0.05})
+    q, v = np.zeros((1, MODEL.nq)), np.full((1, MODEL.nv), 2.0)
+    assert effect.unsense(q, v, theta)[0][0, 7] == pytest.approx(0.1)
+    effect, theta = _bound("sensor_delay", "body:base:quat", {"delay": 0.05})
+    q[:, 3] = 1.0
+    np.testing.assert_allclose(quat_to_vector(effect.unsense(q, v, theta)[0][0, 3:7]), [0.1, 0.1, 0.1], atol=1e-12)
+
+
+def test_misalignment_turns_vectors_and_orientations_alike() -> None:
+    """The world's direction of a measured vector is the same whether sensed or true: R_meas a_meas = R a."""
+    mount = {"x": 0.2, "y": -0.1, "z": 0.3}
+    vector, theta = _bound("misalignment", "sensor:gyro", mount)
+    orientation, _ = _bound("misalignment", "body:base:quat", mount)
+    quat, a = vector_to_quat(RNG.normal(size=(1, 3))), RNG.normal(size=(1, 3))
+    seen_quat = orientation.sense("body:base:quat", quat, theta, DT)
+    seen = vector.sense("sensor:gyro", a, theta, DT)
+    turn = lambda q, x: quat_multiply(quat_multiply(q, np.c_[[0.0], x]), quat_conjugate(q))[:, 1:]  # noqa: E731
+    np.testing.assert_allclose(turn(seen_quat, seen), turn(quat, a), atol=1e-12)
+    assert np.linalg.norm(seen - a) > 0.01
+
+
+def test_unknown_channels_are_refused() -> None:
+    for channel in ("joint:leg:pos", "sensor:nose", "body:tail:pos", "smell:rose"):
+        parameters = {"delay": 0.1}
+        with pytest.raises(InputError):
+            _bound("sensor_delay", channel, parameters)
