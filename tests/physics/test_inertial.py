@@ -40,7 +40,8 @@ def _edited(family: str, parameters: dict[str, float], text: str = BARE) -> mujo
 def test_payload_is_a_welded_point_mass(mass: float, place: tuple[float, float, float]) -> None:
     """Mass matrix, centre and inertia equal those of MuJoCo's own compilation of a point mass in a child body."""
     model = _edited("payload", {"mass": mass, **dict(zip("xyz", place, strict=True))})
-    child = f'<body pos="{place[0]} {place[1]} {place[2]}"><inertial pos="0 0 0" mass="{max(mass, 1e-12)}" diaginertia="1e-14 1e-14 1e-14"/></body>'
+    point = f'<inertial pos="0 0 0" mass="{max(mass, 1e-12)}" diaginertia="1e-14 1e-14 1e-14"/>'
+    child = f'<body pos="{place[0]} {place[1]} {place[2]}">{point}</body>'
     welded = mujoco.MjModel.from_xml_string(BODY % child)
     matrices = []
     for m in (model, welded):
@@ -86,7 +87,8 @@ def test_com_shift_keeps_mass_and_inertia_and_moves_the_centre() -> None:
 
 def test_com_shift_tips_a_hanging_body() -> None:
     """A pendulum's centre moved sideways by s at depth d balances turned by atan(s / d)."""
-    text = """<mujoco><option timestep=".005"/><worldbody><body name="b" simple="false"><joint axis="0 1 0" damping=".5"/>
+    text = """<mujoco><option timestep=".005"/><worldbody><body name="b" simple="false">
+    <joint axis="0 1 0" damping=".5"/>
     <inertial pos="0 0 -.4" mass="1" diaginertia=".01 .01 .01"/></body></worldbody></mujoco>"""
     effect, theta = make("com_shift", "b", {"x": 0.05, "y": 0.0, "z": 0.0})
     q = run(text, effect, theta, 2000).qpos[0, 0, -1, 0]

@@ -8,7 +8,8 @@ from machines import make, run
 DT, MASS = 0.001, 2.0
 RAIL = f"""
 <mujoco><option timestep="{DT}" gravity="0 0 0" integrator="implicitfast"/><worldbody><body>
-<joint name="rail" type="slide" axis="1 0 0"/><geom type="sphere" size=".1" mass="{MASS}"/></body></worldbody></mujoco>"""
+<joint name="rail" type="slide" axis="1 0 0"/><geom type="sphere" size=".1" mass="{MASS}"/></body></worldbody>
+</mujoco>"""
 ROTOR = f"""
 <mujoco><option timestep="{DT}" gravity="0 0 0" integrator="RK4"/><worldbody><body><joint name="turn" axis="0 0 1"/>
 <inertial pos="0 0 0" mass="1" diaginertia=".01 .01 .01"/></body></worldbody></mujoco>"""

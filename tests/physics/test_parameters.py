@@ -17,7 +17,8 @@ XML = """
   <body name="base" pos="0 0 1"><freejoint/><geom name="hull" size=".1 .2 .3" type="box" mass="2"/>
     <body name="leg_l"><joint name="leg_l" axis="0 1 0"/><geom name="foot_l" size=".1" mass=".5"/></body>
     <body name="leg_r"><joint name="leg_r" axis="0 1 0"/><geom name="foot_r" size=".1" mass=".5"/></body></body>
-</worldbody><actuator><velocity name="spin" joint="leg_l" kv="3"/><position name="hold" joint="leg_r" kp="20" kv="1"/></actuator></mujoco>"""
+</worldbody><actuator><velocity name="spin" joint="leg_l" kv="3"/>
+<position name="hold" joint="leg_r" kp="20" kv="1"/></actuator></mujoco>"""
 MODEL = mujoco.MjModel.from_xml_string(XML)
 SPACE = ParameterSpace(
     MODEL,

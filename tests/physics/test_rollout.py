@@ -89,7 +89,7 @@ def test_rows_do_not_depend_on_threads_or_company() -> None:
 
 
 def test_history_settles_a_filter_at_its_first_command_and_advances_it() -> None:
-    """The rotors' filter (50 ms) after a history of two commands, in closed form: seen as the force of the first step."""
+    """The rotors' filter (50 ms) after a history of two commands, in closed form: the force of the first step."""
     segments = zoo_segments(MODEL, 4, size=1, history=20, steps=1)
     segments.ctrl[0, :, 0] = np.r_[np.full(8, 4.0), np.full(13, 9.0)]
     seen: list[np.ndarray] = []

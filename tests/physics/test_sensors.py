@@ -31,7 +31,7 @@ def test_bias_and_gain_are_affine() -> None:
     np.testing.assert_allclose(effect.sense("joint:arm:pos", values, theta, DT), 1.2 * values)
     effect, theta = _bound("sensor_bias", "sensor:gyro", {"x": 0.1, "y": 0.2, "z": 0.3})
     three = RNG.normal(size=(4, 20, 3))
-    np.testing.assert_allclose(effect.sense("sensor:gyro", three, theta, DT), three + [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(effect.sense("sensor:gyro", three, theta, DT), three + np.array([0.1, 0.2, 0.3]))
 
 
 def test_delay_reports_the_past_exactly_for_straight_lines() -> None:

@@ -35,7 +35,8 @@ def _stop(model: mujoco.MjModel, direction: list[float], where: str = "ground", 
 
 def test_wheels_are_found_and_other_hinges_are_not() -> None:
     assert len(wheels(_rover())) == 4
-    arm = "<mujoco><worldbody><body><joint axis='0 1 0'/><geom type='capsule' fromto='0 0 0 0 0 -1' size='.1'/></body></worldbody></mujoco>"
+    arm = """<mujoco><worldbody><body><joint axis='0 1 0'/><geom type='capsule' fromto='0 0 0 0 0 -1' size='.1'/></body>
+    </worldbody></mujoco>"""
     assert wheels(mujoco.MjModel.from_xml_string(arm)) == []
     with pytest.raises(InputError, match="wheels"):
         make("slip", "ground", {"lateral": 0.1, "longitudinal": 0.0})[0].bind(mujoco.MjModel.from_xml_string(arm))
@@ -88,7 +89,7 @@ def test_one_wheel_turns_the_rover() -> None:
 
 
 def test_creep_slides_below_the_cone_in_proportion_to_the_force() -> None:
-    """Pushed sideways with a part of what friction could hold, the rover drifts: steadily, twice as fast for twice the push."""
+    """Pushed with a part of what friction could hold, the rover drifts steadily, twice as fast for twice the push."""
     model = _rover()
     drift = {}
     for creep in (0.0, 100.0):

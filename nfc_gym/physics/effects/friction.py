@@ -111,12 +111,13 @@ class Stribeck(_JointFriction):
 
 
 class LoadFriction(_JointFriction):
-    """Friction of a loaded gear: level + |motor * actuator torque + external * bias torque| + square * actuator torque^2.
+    """Friction of a loaded gear: level + |motor * drive + external * bias| + square * drive^2, all of them torques.
 
     The actuator pushes the gear's one side (`qfrc_actuator`); gravity, Coriolis and centrifugal forces push the other
     (`qfrc_bias`, the torque that must be applied to balance them). A joint held still has both equal, and they add up.
-    With `motor` alone the gear is loaded by its own drive only; `square` is what a gear loses near its limit. Contact forces are not counted: MuJoCo does not tell
-    them apart from the friction itself. Law: load-dependent models of Duclusaud et al., arXiv:2410.08650 (2024).
+    With `motor` alone the gear is loaded by its own drive only; `square` is what a gear loses near its limit. Contact
+    forces are not counted: MuJoCo does not tell them apart from the friction itself. Law: load-dependent models of
+    Duclusaud et al., arXiv:2410.08650 (2024).
     """
 
     family = "load_friction"
@@ -141,7 +142,7 @@ class LoadFriction(_JointFriction):
 
 
 class DirectionalFriction(_JointFriction):
-    """Friction with laws of its own for each direction of motion: level + viscous |v|; they meet within 0.01 rad/s (m/s) of rest.
+    """Friction with a law for each direction of motion, level + viscous |v|; they meet within 0.01 rad/s (m/s) of rest.
 
     Preloaded screws and gears do so in both parts: Janot, Gautier and Brunot (2019) report it of such a drive.
     """

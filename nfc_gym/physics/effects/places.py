@@ -12,6 +12,8 @@ from nfc_gym.physics.effects.base import Array, Param, Scales, groups, joint_dof
 from nfc_gym.physics.fields import ModelFields, names_of
 
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_LIGHT = 1e-3  # share of mass below which a body only carries another
 
 
 def sized(params: Iterable[Param], **changes: dict[str, object]) -> tuple[Param, ...]:
@@ -32,13 +34,39 @@ def joint_kind(model: mujoco.MjModel, name: str) -> int:
 def joint_places(model: mujoco.MjModel) -> list[tuple[str, ...]]:
     """Named hinge joints and named slide joints: each alone, all of a kind together, and sets of like names.
 
-    Hinges and slides never share a place, because their forces have different units.
+    Hinges and slides never share a place, because their forces have different units. The joints that let a planar base
+    float over the world are no bearings and are left out.
     """
+    floating = _floating(model)
     names = names_of(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)
     out: list[tuple[str, ...]] = []
     for kind in (_HINGE, _SLIDE):
-        alike = [n for j, n in enumerate(names) if n and int(model.jnt_type[j]) == kind]
+        alike = [n for j, n in enumerate(names) if n and int(model.jnt_type[j]) == kind and j not in floating]
         out += groups(alike) if alike else []
+    return out
+
+
+def _carriers(model: mujoco.MjModel, body: int) -> tuple[list[int], bool]:
+    """Joints of a body and of the (nearly) massless bodies that carry it, and whether those stand on the world."""
+    joints: list[int] = []
+    b = body
+    while b > 0 and (b == body or model.body_mass[b] < _LIGHT * model.body_mass[body]):
+        first = int(model.body_jntadr[b])
+        joints += range(first, first + int(model.body_jntnum[b]))
+        b = int(model.body_parentid[b])
+    return joints, int(model.body_weldid[b]) == 0
+
+
+def _floating(model: mujoco.MjModel) -> set[int]:
+    """Undriven joints of bases that slide freely over the world along two axes or more, the turning ones included."""
+    joint = int(mujoco.mjtTrn.mjTRN_JOINT)
+    driven = {int(model.actuator_trnid[i, 0]) for i in range(model.nu) if int(model.actuator_trntype[i]) == joint}
+    out: set[int] = set()
+    for body in range(1, model.nbody):
+        joints, grounded = _carriers(model, body)
+        slides = sum(int(model.jnt_type[j]) == _SLIDE for j in joints)
+        if grounded and slides > 1 and not driven & set(joints):
+            out |= set(joints)
     return out
 
 
@@ -74,25 +102,16 @@ def moving_bodies(model: mujoco.MjModel) -> list[str]:
 
 
 def base_bodies(model: mujoco.MjModel) -> list[str]:
-    """Moving bodies that stand on the world itself: free bases, planar bases, the first link of an arm."""
+    """Bodies that move through the world by themselves: free bases, and bases on slides that stand on the world."""
     names = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
-    moving = set(moving_bodies(model))
-    free = [
-        int(model.jnt_bodyid[j]) for j in range(model.njnt) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)
-    ]
-    return [names[b] for b in range(1, model.nbody) if names[b] in moving and (b in free or _is_carrier(model, b))]
-
-
-def _is_carrier(model: mujoco.MjModel, body: int) -> bool:
-    """A body that slides in the world along at least one axis, by joints of its own or of massless carriers above."""
-    while body > 0:
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        if any(int(model.jnt_type[j]) == _SLIDE for j in range(first, first + count)):
-            return int(model.body_weldid[model.body_parentid[body]]) == 0
-        body = int(model.body_parentid[body])
-        if model.body_mass[body] > 0:
-            return False
-    return False
+    moving, out = set(moving_bodies(model)), []
+    for body in range(1, model.nbody):
+        joints, grounded = _carriers(model, body)
+        kinds = {int(model.jnt_type[j]) for j in joints}
+        light = model.body_mass[body] < _LIGHT * model.body_subtreemass[body]
+        if names[body] in moving and not light and (_FREE in kinds or (grounded and _SLIDE in kinds)):
+            out.append(names[body])
+    return out
 
 
 def body_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:

@@ -67,10 +67,11 @@ class _Rotor(Effect):
 
 
 class RotorDrag(_Rotor):
-    """F = -T (drag v_plane + inflow v_axis) + T lift |v_plane|^2, T total thrust, v the velocity across and along the axis.
+    """F = T (lift |v_plane|^2 axis - drag v_plane - inflow v_axis), T total thrust, v across and along its axis.
 
-    Blade flapping and induced drag of a rotor, linear in speed and thrust: Faessler et al., RA-L 3 (2018). `lift` is the
-    thrust that a rotor gains in forward flight (translational lift: Leishman, Principles of Helicopter Aerodynamics, 2.14).
+    Blade flapping and induced drag of a rotor, linear in speed and thrust: Faessler et al., RA-L 3 (2018). `lift` is
+    the thrust that a rotor gains in forward flight (translational lift: Leishman, Principles of Helicopter
+    Aerodynamics, 2.14).
     """
 
     family = "rotor_drag"

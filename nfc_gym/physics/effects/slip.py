@@ -10,8 +10,8 @@ friction that the wheel does not have:
 v the velocity of the patch over the ground, N an even share of the vehicle's weight, mu the contact's friction, eps
 0.02 m/s. A patch that sticks (v = 0) is left to the solver.
 
-Rubber also creeps before it slides: its sliding speed grows with the force. `creep` softens the tangential part of every
-contact, `impratio / (1 + creep)`, so that the friction cone's edge is reached only at a finite sliding speed.
+Rubber also creeps before it slides: its sliding speed grows with the force. `creep` softens the tangential part of
+every contact, `impratio / (1 + creep)`, so that the friction cone's edge is reached only at a finite sliding speed.
 """
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)

@@ -14,7 +14,7 @@ from nfc_gym.physics.effects.places import sized
 
 
 class Thermal(Effect):
-    """Commands times 1 - fade h, heat h following (u / reference)^2 with a time constant: dh/dt = ((u / ref)^2 - h) / tau.
+    """Commands times 1 - fade h; the heat h follows (u / reference)^2: dh/dt = ((u / reference)^2 - h) / time_constant.
 
     One thermal mass heated by the losses of the winding, which go with the square of the current; the resistance that
     rises with it takes from the force. The heat starts settled at the first command.
