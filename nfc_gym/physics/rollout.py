@@ -181,14 +181,12 @@ class _Run:
         """A field of `MjData`.
 
         A batch fills a derived field from the first call after its binding on, and it is zero until then. Whoever reads
-        one first therefore has it computed for the state as it is; the solver's warm start stays what it was.
+        one first therefore has it computed for the state as it is (`forward` leaves the solver's warm start alone).
         """
         array = self.batch.bind(name)
         if name not in self.derived:
             self.derived.add(name)
-            warm = self.batch.qacc_warmstart.copy()
             self.batch.forward()
-            self.batch.qacc_warmstart[...] = warm
         return array
 
     def _tile(self, array: Array) -> Array:

@@ -61,6 +61,17 @@ def test_drag_turns_with_the_body() -> None:
     assert v[1] == pytest.approx(np.exp(-2.0 / MASS * 0.4), rel=1e-3)
 
 
+def test_a_body_that_spins_about_its_centre_of_mass_feels_no_drag() -> None:
+    """The frame's origin circles the centre of mass, which stays where it is."""
+    effect, theta = make("drag_linear", "b", {"x": 5.0, "y": 5.0, "z": 5.0})
+    start = [0, -0.05 * 4.0, 0, 0, 0, 4.0]
+    t = run(FLYER % 0, effect, theta, 300, qvel=start)
+    turn = 4.0 * 0.3
+    np.testing.assert_allclose(
+        t.qpos[0, 0, -1, :2] + 0.05 * np.array([np.cos(turn), np.sin(turn)]), [0.05, 0], atol=5e-4
+    )
+
+
 def test_joints_of_a_floating_base_are_no_bearings() -> None:
     assert joint_places(mujoco.MjModel.from_xml_string(SLED)) == []
 
@@ -72,6 +83,8 @@ def test_planar_base_feels_drag_at_its_centre_of_mass() -> None:
     spin = 1.5
     v = run(SLED, effect, theta, 300, qvel=[-0.1 * spin, 0.0, spin]).qvel[0, 0]
     assert v[-1, 2] == pytest.approx(spin, rel=1e-4)
+    turned = np.array([-np.sin(0.3 * spin), np.cos(0.3 * spin)])
+    np.testing.assert_allclose(v[-1, 1::-1] + 0.1 * spin * turned, 0, atol=2e-3)
     straight = run(SLED, effect, theta, 300, qvel=[0.0, 1.0, 0.0]).qvel[0, 0]
     assert straight[-1, 1] == pytest.approx(np.exp(-2.0 / MASS * 0.3), rel=2e-3)
 
@@ -144,3 +157,13 @@ def test_rotors_lift_more_in_forward_flight() -> None:
     lifted = FLYER.replace('pos=".05 0 0"', 'pos="0 0 0"') % 0
     v = run(lifted, effect, theta, 50, qvel=[3, 0, 0, 0, 0, 0], ctrl=[20.0]).qvel[0, 0, -1]
     assert v[2] == pytest.approx(20 * (1 + 0.01 * 9) / MASS * 0.05, rel=1e-6)
+
+
+def test_a_carried_body_has_the_velocity_of_its_own_centre_of_mass() -> None:
+    """Not of the vehicle's common one: a link whose centre rests for an instant feels no drag then."""
+    text = SLED.replace('mass="1e-6" diaginertia="1e-9 1e-9 1e-9"', 'mass="3" diaginertia=".1 .1 .1"')
+    effect, theta = make("drag_linear", "b", {"x": 9.0, "y": 9.0, "z": 0.0})
+    for speed, same in (([-0.1 * 1.5, 0.0, 1.5], True), ([0.0, 0.0, 1.5], False)):
+        dragged = run(text, effect, theta, 1, qvel=speed).qvel
+        free = run(text, None, [], 1, qvel=speed).qvel
+        assert np.allclose(dragged, free, atol=1e-12) == same
