@@ -1,0 +1,281 @@
+"""A stand-in for a real machine: a plain `mj_step` loop with one hidden effect, whose logs `nfc-gym demo` works on.
+
+It shares nothing with the simulator that the loop fits but the robot's MJCF: another time step, psi drawn anew, noisy
+sensors, and formulas of its own for every effect. Nothing of `nfc_gym.physics` is used here.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym import assets
+
+Array = NDArray[np.float64]
+STEP = 0.002  # s; the assets' own step is 0.005
+SAMPLE = 0.01  # s between samples, and between commands
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+JACKAL_NOISE = {"pos": 0.001, "quat": 0.001, "linvel": 0.01, "angvel": 0.01, "wheel": 0.05}  # m, rad, m/s, rad/s, rad/s
+_RADIUS, _TRACK = 0.098, 0.37559  # m, of the Jackal's data sheet
+
+
+class Hidden:
+    """One hidden effect; the base class hides nothing.
+
+    Attributes:
+      family, where: what a right answer names.
+      parameters: true values, by the names that reports use.
+      text: what is hidden, in words with units.
+    """
+
+    family = "none"
+
+    def __init__(self, where: tuple[str, ...] = (), parameters: Mapping[str, float] | None = None, text: str = "nothing") -> None:
+        self.where, self.parameters, self.text = where, dict(parameters or {}), text
+
+    def shape(self, spec: mujoco.MjSpec) -> None:
+        """Change the machine before it is built."""
+
+    def begin(self, model: mujoco.MjModel) -> None:
+        """Get ready for a run from the start."""
+
+    def command(self, u: Array) -> Array:
+        """What the actuators receive in this step of what was commanded, (nu,)."""
+        return u
+
+    def push(self, data: mujoco.MjData) -> None:
+        """Add forces to `qfrc_applied` and `xfrc_applied`, both zero before."""
+
+
+class Loss(Hidden):
+    """One actuator makes only a share of its force."""
+
+    family = "loss"
+
+    def __init__(self, actuator: str, fraction: float) -> None:
+        super().__init__((actuator,), {"fraction": fraction}, f"{actuator} has lost {fraction:.1%} of its force")
+
+    def shape(self, spec: mujoco.MjSpec) -> None:
+        actuator, left = spec.actuator(self.where[0]), 1 - self.parameters["fraction"]
+        actuator.gainprm = [left * g for g in actuator.gainprm]
+        actuator.biasprm = [left * b for b in actuator.biasprm]
+        actuator.forcerange = [left * f for f in actuator.forcerange]
+
+
+class Payload(Hidden):
+    """A lump bolted onto a body, as a body of its own."""
+
+    family = "payload"
+
+    def __init__(self, body: str, mass: float, at: Array) -> None:
+        values = {"mass": mass, **dict(zip("xyz", map(float, at), strict=True))}
+        place = ", ".join(f"{a:.3f}" for a in at)
+        super().__init__((body,), values, f"{mass:.3g} kg rides on {body} at ({place}) m")
+        self.at = at
+
+    def shape(self, spec: mujoco.MjSpec) -> None:
+        lump = spec.body(self.where[0]).add_body(name="lump", pos=self.at)
+        lump.explicitinertial = True
+        lump.mass, lump.inertia = self.parameters["mass"], np.full(3, 1e-8)
+
+
+class Delay(Hidden):
+    """Commands arrive late by a fixed time; between two steps a mixture of both."""
+
+    family = "delay"
+
+    def __init__(self, actuators: tuple[str, ...], delay: float) -> None:
+        super().__init__(actuators, {"delay": delay}, f"commands arrive {1e3 * delay:.1f} ms late")
+
+    def begin(self, model: mujoco.MjModel) -> None:
+        self.past: list[Array] = []
+
+    def command(self, u: Array) -> Array:
+        self.past.append(u)
+        whole, part = divmod(self.parameters["delay"] / STEP, 1.0)
+        newest = len(self.past) - 1 - int(whole)
+        return (1 - part) * self.past[max(newest, 0)] + part * self.past[max(newest - 1, 0)]
+
+
+class Lag(Hidden):
+    """Commands are followed at a rate that is the gap over a time constant."""
+
+    family = "lag"
+
+    def __init__(self, actuators: tuple[str, ...], tau: float) -> None:
+        super().__init__(actuators, {"time_constant": tau}, f"commands are followed with a lag of {1e3 * tau:.1f} ms")
+
+    def begin(self, model: mujoco.MjModel) -> None:
+        self.reached: Array | None = None
+
+    def command(self, u: Array) -> Array:
+        before = u if self.reached is None else self.reached
+        self.reached = before + (1 - np.exp(-STEP / self.parameters["time_constant"])) * (u - before)
+        return self.reached
+
+
+class Coulomb(Hidden):
+    """A joint drags with a constant torque, passing through zero within about 0.1 rad/s."""
+
+    family = "coulomb"
+
+    def __init__(self, joint: str, level: float) -> None:
+        super().__init__((joint,), {"level": level}, f"{joint} drags with {level:.3g} N m of dry friction")
+
+    def begin(self, model: mujoco.MjModel) -> None:
+        self.dof = int(model.joint(self.where[0]).dofadr[0])
+
+    def push(self, data: mujoco.MjData) -> None:
+        data.qfrc_applied[self.dof] -= self.parameters["level"] * np.tanh(data.qvel[self.dof] / 0.1)
+
+
+class Slope(Hidden):
+    """The floor leans: its normal is the model's z, and gravity is not along it."""
+
+    family = "slope"
+
+    def __init__(self, roll: float, pitch: float) -> None:
+        lean = np.degrees(np.hypot(roll, pitch))
+        super().__init__(("world",), {"roll": roll, "pitch": pitch}, f"the floor leans by {lean:.2f} degrees")
+
+    def shape(self, spec: mujoco.MjSpec) -> None:
+        roll, pitch = self.parameters["roll"], self.parameters["pitch"]
+        lean = np.hypot(roll, pitch)
+        if lean > 0:
+            spec.option.gravity = [-9.81 * np.sin(lean) * pitch / lean, 9.81 * np.sin(lean) * roll / lean, -9.81 * np.cos(lean)]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """An effect that may be drawn: from a generator and a size to a `Hidden`; sizes lie between low and high."""
+
+    make: Callable[[np.random.Generator, float], Hidden]
+    low: float
+    high: float
+    unit: str
+
+
+def _deck(rng: np.random.Generator, mass: float) -> Payload:
+    angle = rng.uniform(0, 2 * np.pi)
+    return Payload("base", mass, np.array([0.17 * np.cos(angle), 0.12 * np.sin(angle), 0.15]))
+
+
+def _lean(rng: np.random.Generator, angle: float) -> Slope:
+    heading = rng.uniform(0, 2 * np.pi)
+    return Slope(angle * np.cos(heading), angle * np.sin(heading))
+
+
+JACKAL_KINDS: dict[str, Kind] = {
+    "loss": Kind(lambda rng, s: Loss(str(rng.choice(WHEELS)), s), 0.2, 0.9, "1"),
+    "payload": Kind(_deck, 1.0, 6.0, "kg"),
+    "delay": Kind(lambda rng, s: Delay(WHEELS, s), 0.015, 0.08, "s"),
+    "lag": Kind(lambda rng, s: Lag(WHEELS, s), 0.015, 0.08, "s"),
+    "coulomb": Kind(lambda rng, s: Coulomb(f"{rng.choice(WHEELS)}_wheel", s), 0.3, 2.0, "N m"),
+    "slope": Kind(_lean, 0.01, 0.08, "rad"),
+}
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine with its own psi and one hidden effect.
+
+    Attributes:
+      psi: true parameters by the names of the mapping.
+      hidden: the effect.
+    """
+
+    psi: Mapping[str, float]
+    hidden: Hidden = field(default_factory=Hidden)
+
+
+def draw_psi(nominal: Mapping[str, float], rng: np.random.Generator, spread: float = 0.15) -> dict[str, float]:
+    """Each value times a factor within 1 +- spread."""
+    return {name: float(value * (1 + rng.uniform(-spread, spread))) for name, value in nominal.items()}
+
+
+JACKAL_PSI = {"base_mass": 15.08, "wheel_servo": 5.0, "wheel_friction": 0.8, "wheel_damping": 0.01}
+
+
+def build_jackal(machine: Machine) -> mujoco.MjModel:
+    """The Jackal's MJCF with the machine's psi and what its effect does to the hardware."""
+    spec = mujoco.MjSpec.from_file(str(assets.path("jackal")))
+    spec.option.timestep = STEP
+    base, grown = spec.body("base"), machine.psi["base_mass"] / JACKAL_PSI["base_mass"]
+    base.mass, base.inertia = base.mass * grown, np.asarray(base.inertia) * grown
+    for wheel in WHEELS:
+        servo = spec.actuator(wheel)
+        servo.gainprm[0], servo.biasprm[2] = machine.psi["wheel_servo"], -machine.psi["wheel_servo"]
+        spec.joint(f"{wheel}_wheel").damping[0] = machine.psi["wheel_damping"]
+        spec.geom(f"{wheel}_wheel").friction[0] = machine.psi["wheel_friction"]
+    machine.hidden.shape(spec)
+    return spec.compile()
+
+
+def excitation(rng: np.random.Generator, time: Array, size: float) -> Array:
+    """A rich signal (T,) within about +- size: three sines between 0.15 and 2 Hz, and steps of 0.5 to 1.5 s."""
+    sines = sum(
+        np.sin(2 * np.pi * f * time + p) for f, p in zip(rng.uniform(0.15, 2.0, 3), rng.uniform(0, 2 * np.pi, 3), strict=True)
+    )
+    edges = np.cumsum(rng.uniform(0.5, 1.5, int(time[-1] / 0.5) + 2))
+    steps = rng.uniform(-1, 1, len(edges) + 1)[np.searchsorted(edges, time)]
+    return size * (0.25 * sines + 0.5 * steps)
+
+
+def drive_jackal(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
+    """One log: columns by name, (T,) each, at 100 Hz; wheel commands as sent, everything else with sensor noise."""
+    rng = np.random.default_rng(seed)
+    model = build_jackal(machine)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    machine.hidden.begin(model)
+    time = np.arange(0, seconds, SAMPLE)
+    speed, turn = excitation(rng, time, 1.2), excitation(rng, time, 3.0)
+    left, right = (speed - turn * _TRACK / 2) / _RADIUS, (speed + turn * _TRACK / 2) / _RADIUS
+    commands = np.stack([left, right, left, right], 1)
+    yaw = rng.uniform(-np.pi, np.pi)
+    data.qpos[3:7] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    qpos, qvel = run(model, data, machine.hidden, lambda k: commands[k], len(time))
+    noisy = body_columns(qpos, qvel, JACKAL_NOISE, rng)
+    for i, wheel in enumerate(WHEELS):
+        noisy[f"{wheel}_speed"] = qvel[:, 6 + i] + JACKAL_NOISE["wheel"] * rng.normal(size=len(time))
+    sent = {f"{wheel}_command": commands[:, i] for i, wheel in enumerate(WHEELS)}
+    return {"time": time, **sent, **noisy}
+
+
+def run(
+    model: mujoco.MjModel, data: mujoco.MjData, hidden: Hidden, command: Callable[[int], Array], samples: int, settle: float = 1.0
+) -> tuple[Array, Array]:
+    """Step on, sampling the true state before each new command; the first second, at the first command's rest, is not logged."""
+    each = round(SAMPLE / STEP)
+    rest = round(settle / SAMPLE)
+    qpos, qvel = np.zeros((samples, model.nq)), np.zeros((samples, model.nv))
+    for k in range(-rest, samples):
+        if k >= 0:
+            qpos[k], qvel[k] = data.qpos, data.qvel
+        u = command(k) if k >= 0 else np.zeros(model.nu)
+        for _ in range(each):
+            data.ctrl[:] = hidden.command(u)
+            data.qfrc_applied[:], data.xfrc_applied[:] = 0, 0
+            hidden.push(data)
+            mujoco.mj_step(model, data)
+    return qpos, qvel
+
+
+def body_columns(qpos: Array, qvel: Array, noise: Mapping[str, float], rng: np.random.Generator) -> dict[str, Array]:
+    """Noisy columns of a free base: x y z, qw qx qy qz, vx vy vz (world), wx wy wz (body)."""
+    quat = np.empty((len(qpos), 4))
+    for row, true, wobble in zip(quat, qpos[:, 3:7], noise["quat"] * rng.normal(size=(len(qpos), 3)), strict=True):
+        row[:] = true
+        mujoco.mju_quatIntegrate(row, wobble, 1.0)
+    parts = {
+        "xyz": (qpos[:, :3], noise["pos"], ("x", "y", "z")),
+        "v": (qvel[:, :3], noise["linvel"], ("vx", "vy", "vz")),
+        "w": (qvel[:, 3:6], noise["angvel"], ("wx", "wy", "wz")),
+    }
+    out = {name: quat[:, i] for i, name in enumerate(("qw", "qx", "qy", "qz"))}
+    for values, sd, names in parts.values():
+        measured = values + sd * rng.normal(size=values.shape)
+        out |= {name: measured[:, i] for i, name in enumerate(names)}
+    return out
