@@ -1,0 +1,223 @@
+"""A report in plain words: the verdict in a sentence, how sure it is, and what to know before relying on it."""
+
+from typing import Any, NamedTuple
+
+from nfc_gym.measured.wording import DASH, counted, finite, listed, number, percent, plain, quantity
+
+_WORSE = 1.02  # error after over error before from which a group is reported as made worse
+
+_SLIGHT = 0.01  # share of the excess below which an effect is said to matter little
+
+
+class Verdict(NamedTuple):
+    """A verdict's word, colour class, sign (so that colour is not alone) and meaning."""
+
+    word: str
+    cls: str
+    sign: str
+    meaning: str
+
+
+VERDICTS = {
+    v.word: v
+    for v in (
+        Verdict(
+            "nothing missing",
+            "good",
+            "=",
+            "The calibrated model predicts logs that nobody fitted to as well as the noise allows. "
+            "No effect need be added.",
+        ),
+        Verdict(
+            "explained",
+            "found",
+            "✓",
+            "Effects that the model lacked are named below; with them "
+            "the error on unseen logs comes down to what noise alone leaves.",
+        ),
+        Verdict(
+            "partly explained",
+            "part",
+            "◐",
+            "The effects named below help on unseen logs, but a misfit beyond the "
+            "noise remains that they do not explain.",
+        ),
+        Verdict(
+            "unexplained",
+            "open",
+            "?",
+            "The misfit on unseen logs is beyond the noise, and no effect of the "
+            "library is shown to be its cause. Nothing is claimed.",
+        ),
+    )
+}
+
+
+class Change(NamedTuple):
+    """Error of one group of quantities at one horizon with each model; None where it is not known."""
+
+    group: str
+    unit: str
+    horizon: float | None
+    nominal: float | None
+    calibrated: float | None
+    extended: float | None
+    floor: float | None
+
+
+def verdict_of(report: dict[str, Any]) -> Verdict:
+    """The verdict; a word that is not known is shown as it is, without a meaning."""
+    word = str(report.get("verdict", DASH))
+    return VERDICTS.get(word, Verdict(word, "open", "?", ""))
+
+
+def changes(report: dict[str, Any]) -> list[Change]:
+    """Errors of every group at the longest horizon at which the calibrated model has one."""
+    error = report.get("error") or {}
+    horizons = error.get("horizons_s") or []
+    out = []
+    for group, row in (error.get("groups") or {}).items():
+        known = [i for i, v in enumerate(row.get("calibrated") or []) if finite(v) is not None]
+        at = known[-1] if known else 0
+        pick = [value_at(row.get(s), at) for s in ("nominal", "calibrated", "extended", "noise_floor")]
+        out.append(Change(str(group), row.get("unit") or "", value_at(horizons, at), *pick))
+    return out
+
+
+def value_at(values: Any, i: int) -> float | None:
+    """The i-th value, or None where there is none or it is not finite."""
+    return finite(values[i]) if values and i < len(values) else None
+
+
+def worst(found: list[Change]) -> Change | None:
+    """The group that the calibrated model misses by the most, measured by its noise floor: not the prettiest one."""
+    usable = [c for c in found if c.calibrated is not None]
+    excess = lambda c: c.calibrated / c.floor if c.floor else c.calibrated  # noqa: E731
+    return max(usable, key=excess, default=None)
+
+
+def what(effect: dict[str, Any]) -> str:
+    """`dry friction at hinge`: an effect's sentence up to its values, many places counted rather than listed."""
+    where = effect.get("where")
+    places = [str(w) for w in where] if isinstance(where, list) else [str(where or DASH)]
+    head, values, _ = str(effect.get("sentence") or "").partition(": ")
+    if not values:
+        return f"{str(effect.get('family', '')).replace('_', ' ')} at {listed(places, 4)}"
+    if len(places) > 3:
+        head = head.replace(" and ".join(places), listed(places, 4))
+    return head[:1].lower() + head[1:] if head[1:2].islower() else head
+
+
+def headline(report: dict[str, Any]) -> str:
+    """What is missing, in one sentence."""
+    effects = report.get("effects") or []
+    word = report.get("verdict")
+    left = (report.get("unexplained") or {}).get("coordinate")
+    at = f", most of it at {left}" if left else ""
+    if word == "nothing missing":
+        return "Nothing is missing: once calibrated, the model predicts unseen motion as well as the sensors can tell."
+    if word == "unexplained":
+        return f"Something is missing, but no known effect is shown to be it: the model misses unseen motion{at}."
+    lacks = f"Missing from the model: {listed([what(e) for e in effects], 4)}"
+    if word == "partly explained":
+        return f"{lacks}; and something more that no known effect is shown to be{at}."
+    return f"{lacks}. With {'it' if len(effects) == 1 else 'them'} added, what remains is no more than noise."
+
+
+def ahead(horizon: float | None) -> str:
+    """`0.4 s ahead`; horizon 0 is no look ahead."""
+    return f" {plain(horizon)}\N{NO-BREAK SPACE}s ahead" if horizon else " at each instant"
+
+
+def unseen(report: dict[str, Any]) -> str:
+    """On what the errors were counted."""
+    names = set((report.get("logs") or {}).get("verify") or [])
+    if not report.get("independent_splits", True):
+        return f"unseen stretches of {counted(len(names), 'log')}"
+    return counted(len(names), "unseen log")
+
+
+def error_sentence(report: dict[str, Any]) -> str:
+    """Error before and after in the group that was missed by the most."""
+    c = worst(changes(report))
+    if c is None:
+        return ""
+    steps = [(c.nominal, "with the model as given"), (c.calibrated, "once calibrated")]
+    if report.get("effects"):
+        steps.append((c.extended, f"with the missing effect{'s' * (len(report['effects']) > 1)} added"))
+    path = ", ".join(f"{quantity(v, c.unit)} {words}" for v, words in steps if v is not None)
+    floor = f" The noise alone accounts for {quantity(c.floor, c.unit)}." if c.floor is not None else ""
+    return f"Typical error of the {c.group}{ahead(c.horizon)}, on {unseen(report)}: {path}.{floor}"
+
+
+def certainty(report: dict[str, Any]) -> str:
+    """How sure: chi-squared against a perfect model's, and the interval of what the effects take away."""
+    chi2 = report.get("chi2") or {}
+    after = finite(chi2.get("extended" if report.get("effects") else "calibrated"))
+    bound, null = finite(chi2.get("null_95")), finite(chi2.get("null"))
+    if after is None or bound is None:
+        return ""
+    if after <= bound:
+        rest = f"is within what a perfect model would show (up to {number(bound)})"
+    elif after <= 1.1 * bound:
+        rest = f"is next to what a perfect model would show (up to {number(bound)})"
+    else:
+        rest = f"is {number(after / null if null else after, 2)} times a perfect model's ({number(null)})"
+    text = f"Chi-squared {number(after)} {rest}"
+    ratio = chi2.get("extended_over_calibrated_95") or (None, None)
+    if report.get("effects") and finite(ratio[0]) is not None and finite(ratio[1]) is not None:
+        text += (
+            f"; it comes down to between {percent(ratio[0])} and {percent(ratio[1])} of what calibration alone leaves"
+            " (95\N{NO-BREAK SPACE}% interval)"
+        )
+    return f"{text}."
+
+
+def notices(report: dict[str, Any]) -> list[str]:
+    """What a reader should know before relying on the verdict."""
+    parameters = report.get("parameters") or []
+    out = []
+    if not report.get("independent_splits", True):
+        out.append(
+            "The logs that test the model are stretches of the logs that it was fitted to: they are not "
+            "independent, and the errors may be too rosy. Record more logs to be sure."
+        )
+    out += _on_effects(report)
+    moved = [p.get("name") for p in parameters if p.get("left_prior")]
+    if moved:
+        out.append(
+            f"{listed(moved)} {'lies' if len(moved) == 1 else 'lie'} at the bound of the allowed range. Either "
+            "the range is too narrow, or the parameter stands in for something else."
+        )
+    blind = [p.get("name") for p in parameters if p.get("identifiable") is False]
+    if blind:
+        out.append(f"These motions do not show {listed(blind)}: the estimate is hardly more than what was declared.")
+    guessed = [n.get("channel") for n in report.get("noise") or [] if n.get("estimated")]
+    if guessed:
+        out.append(
+            f"The noise of {listed(guessed)} was not declared; it was estimated from the logs, "
+            "and the verdict leans on it."
+        )
+    return out
+
+
+def _on_effects(report: dict[str, Any]) -> list[str]:
+    effects = report.get("effects") or []
+    if not effects:
+        return []
+    out = []
+    for e in effects:
+        if e.get("equivalents"):
+            out.append(f"{e.get('id')} cannot be told from {listed(e['equivalents'], 4)} with these logs.")
+        share = finite(e.get("share_of_excess"))
+        if share is not None and share < _SLIGHT:
+            part = f"takes away {percent(share)} of the excess error on the verification logs"
+            out.append(f"{e.get('id')} {part}: it matters little.")
+    high = finite(((report.get("chi2") or {}).get("extended_over_calibrated_95") or [None, None])[1])
+    if high is not None and high >= 1:
+        out.append("On the verification logs the gain is not significant: its 95 % interval includes none at all.")
+    for c in changes(report):
+        if c.calibrated and c.extended and c.extended > _WORSE * c.calibrated:
+            before, after = quantity(c.calibrated, c.unit), quantity(c.extended, c.unit)
+            out.append(f"The {c.group} gets worse on unseen logs: {before} before, {after} after.")
+    return out

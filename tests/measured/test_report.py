@@ -1,0 +1,446 @@
+"""The page: everything is on it, nothing is loaded, nothing is injected, and odd values are shown as a dash."""
+
+import copy
+import math
+import re
+from html.parser import HTMLParser
+from importlib import resources
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nfc_gym.measured import story, wording
+from nfc_gym.measured.charts import Series, error_chart, nice_ticks, trace_chart
+from nfc_gym.measured.report import render, render_summary
+
+EVIL = "<script>alert('x')</script>\"&"
+SECTIONS = ("effects", "errors", "traces", "misfit", "candidates", "parameters", "identifiability", "noise", "glossary")
+LOADING = {"src", "href", "xlink:href", "action", "data", "srcset", "poster"}
+VOID = {"meta", "br"}
+
+
+def effect(name: str = "coulomb:hinge", **more: Any) -> dict[str, Any]:
+    family, where = name.split(":", 1)
+    level = {"value": 0.04213, "low": 0.0402, "high": 0.0441, "unit": "N m"}
+    base = {"id": name, "family": family, "where": where, "sentence": f"Dry friction at {where}: level 0.0421 N m."}
+    return base | {"share_of_excess": 0.93, "equivalents": [], "parameters": {"level": level}} | more
+
+
+def candidate(name: str, fit: float, select: float, low: float, generic: bool = False) -> dict[str, Any]:
+    row = {"id": name, "gain_fit": fit, "gain_select": select, "gain_select_low": low}
+    return row | {"generic": generic, "sentence": f"{name} in words."}
+
+
+def parameter(
+    name: str, unit: str, nominal: float, estimate: float, low: float, high: float, left_prior: bool = False
+) -> dict[str, Any]:
+    row = {"name": name, "unit": unit, "nominal": nominal, "estimate": estimate, "low": low, "high": high}
+    return row | {"identifiable": True, "left_prior": left_prior}
+
+
+def errors(unit: str, *stages: list[float]) -> dict[str, Any]:
+    return {"unit": unit} | dict(zip(("nominal", "calibrated", "extended", "noise_floor"), stages, strict=True))
+
+
+def example(effects: int = 1) -> dict[str, Any]:
+    """A report as `loop` makes it."""
+    names = ["coulomb:hinge", *(f"gain:motor_{i}" for i in range(effects))][:effects]
+    ranking = [
+        candidate("coulomb:hinge", 812.0, 240.0, 201.0),
+        candidate("stribeck:hinge", 815.0, 239.0, 199.0),
+        candidate("generic_velocity:hinge", 700.0, 200.0, 170.0, True),
+        candidate("damping_poly:hinge", 300.0, 20.0, -4.0),
+    ]
+    first = {"accepted": ["coulomb:hinge"], "share": 0.8, "ranking": ranking, "equivalents": ["stribeck:hinge"]}
+    last = {"accepted": [], "share": 0.0, "ranking": ranking[3:], "equivalents": [], "reason": "no more than chance"}
+    angle = ([0.02, 0.05, 0.1, 0.21], [0.01, 0.02, 0.04, 0.081], [0.003, 0.0032, 0.0036, 0.0041])
+    speed = ([0.2, 0.3, 0.4, 0.5], [0.15, 0.2, 0.25, 0.3], [0.1, 0.11, 0.12, 0.13])
+    levels = {"nominal": 91.0, "calibrated": 14.2, "extended": 1.02, "null": 1.0, "null_95": 1.06}
+    mimic = {"id": "payload:bob", "smallest_detectable": 0.0123, "unit": "kg"}
+    return {
+        "schema": 1,
+        "model": "servo.xml",
+        "fold": "",
+        "logs": {"fit": ["run_1", "run_2"], "select": ["run_3"], "verify": ["run_4", "run_5"]},
+        "independent_splits": True,
+        "parameters": [
+            parameter("bob_mass", "kg", 0.1, 0.10417, 0.1031, 0.1052),
+            parameter("kp", "N m/rad", 10.0, 20.0, 19.9, 20.0, left_prior=True),
+        ],
+        "effects": [effect(n) for n in names],
+        "verdict": "explained" if effects else "nothing missing",
+        "unexplained": None,
+        "error": {
+            "horizons_s": [0.05, 0.1, 0.2, 0.4],
+            "groups": {
+                "joint angle": errors("rad", *angle, [0.003, 0.0031, 0.0033, 0.0037]),
+                "joint speed": errors("rad/s", *speed, [0.1, 0.1, 0.1, 0.11]),
+            },
+        },
+        "chi2": levels | {"extended_over_calibrated_95": (0.05, 0.09)},
+        "identifiability": [
+            mimic | {"worst_mimic": "inertia:bob", "distinguishable": False},
+            {"id": "lag:motor", "smallest_detectable": None, "unit": "s", "worst_mimic": None, "distinguishable": True},
+        ],
+        "rounds": [first, last],
+        "noise": [
+            {"channel": "joint:hinge:pos", "noise": 0.002, "unit": "rad", "estimated": False},
+            {"channel": "joint:hinge:vel", "noise": 0.1, "unit": "rad/s", "estimated": True},
+        ],
+        "seed": 7,
+        "versions": {"nfc_gym": "0.1.0", "mujoco": "4.0.0"},
+    }
+
+
+def pictures() -> dict[str, Any]:
+    """Pictures' data as `details` makes it."""
+    t = np.linspace(0, 0.4, 81)
+    wave = np.sin(9 * t)
+    trace = {
+        "title": "joint:hinge:pos, log run_4",
+        "unit": "rad",
+        "time": t.tolist(),
+        "sample_time": t[::4].tolist(),
+        "measured": (wave[::4] + 0.01).tolist(),
+        "calibrated": (1.3 * wave).tolist(),
+        "extended": wave.tolist(),
+    }
+
+    def misfit(scale: float) -> dict[str, Any]:
+        seconds = [0.4 * i for i in range(20)]
+        values = [scale * (1 + (i % 7)) for i in range(40)]
+        return {
+            "place": {"joint:hinge joint angle": 9 * scale, "joint:hinge joint speed": 4 * scale},
+            "log": {"run_4": 8 * scale, "run_5": 5 * scale},
+            "time": {"log": ["run_4"] * 20 + ["run_5"] * 20, "seconds": seconds * 2, "value": values},
+        }
+
+    return {"traces": [trace], "misfit": {"calibrated": misfit(2.0), "extended": misfit(0.2)}}
+
+
+class _Reader(HTMLParser):
+    """Tags that are open, what is loaded, ids, and the visible words; fails on a tag closed out of turn."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loads: list[str] = []
+        self.ids: list[str] = []
+        self.tags: list[str] = []
+        self.words: list[str] = []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        given = dict(attrs)
+        self.ids += [given["id"]] if given.get("id") else []
+        self.loads += [v or "" for k, v in attrs if k in LOADING]
+        assert not any(k.startswith("on") for k in given), (tag, attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not {"style", "script"} & set(self.open):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def read(page: str) -> _Reader:
+    reader = _Reader(page)
+    assert reader.open == []
+    return reader
+
+
+def spoil(value: Any, bad: Any) -> Any:
+    """Every number replaced."""
+    if isinstance(value, dict):
+        return {k: spoil(v, bad) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [spoil(v, bad) for v in value]
+    return bad if isinstance(value, float) else value
+
+
+def poison(value: Any) -> Any:
+    """Every string and every key of names gets a script."""
+    if isinstance(value, dict):
+        return {k: poison(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [poison(v) for v in value]
+    return value + EVIL if isinstance(value, str) else value
+
+
+def test_every_section_is_there_once_and_tags_are_balanced() -> None:
+    page = read(render(example(), pictures()))
+    assert [i for i in page.ids if i in SECTIONS] == list(SECTIONS)
+    assert "reproduction" in page.ids
+    assert len(page.ids) == len(set(page.ids))
+
+
+def test_the_verdict_comes_first_with_errors_units_and_logs() -> None:
+    text = read(render(example(), pictures())).text
+    lead = text[: text.index("Before you rely on it")]
+    assert "Missing from the model: dry friction at hinge." in lead
+    # the group with the largest error over its floor, at the longest horizon
+    assert "joint angle 0.4 s ahead, on 2 unseen logs: 0.210 rad with the model as given, 0.0810 rad once" in lead
+    assert "0.00410 rad with the missing effect added" in lead
+    assert "0.00370 rad" in lead
+    assert "between 5 % and 9 % of what calibration alone leaves" in lead
+
+
+@pytest.mark.parametrize("word", list(story.VERDICTS))
+def test_each_verdict_has_its_own_words_sign_and_colour(word: str) -> None:
+    report = example(0 if word in ("nothing missing", "unexplained") else 1) | {"verdict": word}
+    if "expl" in word and word != "explained":
+        left = {"coordinate": "joint:arm (joint angle)", "where": "joint:arm", "description": "a bump"}
+        report["unexplained"] = left | {"nearest": "gain:motor", "nearest_share": 0.12}
+    page = render(report, pictures())
+    own = story.VERDICTS[word]
+    others = [v for v in story.VERDICTS.values() if v is not own]
+    assert own.meaning in page
+    assert f'<header class="{own.cls}">' in page
+    assert not any(v.meaning in page or v.cls == own.cls or v.sign == own.sign for v in others)
+    assert ("joint:arm (joint angle)" in page) == (report["unexplained"] is not None)
+    assert ("12\N{NO-BREAK SPACE}%" in page) == (report["unexplained"] is not None)
+
+
+def test_nothing_is_loaded_from_anywhere() -> None:
+    for page in (render(example(), pictures()), render_summary(summary())):
+        assert not re.search(r"https?:|//[a-z]|@import|url\(", page)
+        assert all(re.fullmatch(r"\./[^:]+", link) for link in read(page).loads)
+        assert "default-src 'none'" in page
+
+
+def test_names_from_logs_and_models_cannot_become_markup() -> None:
+    report, shown = poison(example(2)), poison(pictures())
+    report["verdict"] = "partly explained"
+    report["error"]["groups"] = {k + EVIL: v for k, v in report["error"]["groups"].items()}
+    report["effects"][0]["parameters"] = {EVIL: report["effects"][0]["parameters"]["level"]}
+    report["versions"] = {EVIL: EVIL}
+    for m in shown["misfit"].values():
+        m["place"] = {EVIL + k: v for k, v in m["place"].items()}
+        m["log"] = {EVIL + k: v for k, v in m["log"].items()}
+    clean = read(render(example(2) | {"verdict": "partly explained"}, pictures()))
+    page = render(report, shown)
+    assert read(page).tags.count("script") == 1 == clean.tags.count("script")
+    assert "<script>alert" not in page
+    assert page.count("&lt;script&gt;alert") > 40
+
+
+@pytest.mark.parametrize("bad", [None, math.nan, math.inf, -math.inf], ids=["none", "nan", "inf", "-inf"])
+def test_numbers_that_are_missing_become_a_dash(bad: float | None) -> None:
+    page = read(render(spoil(example(), bad), spoil(pictures(), bad)))
+    assert wording.DASH in page.text
+    assert not re.search(r"\b(nan|inf|None|undefined)\b", page.text)
+    svg = re.findall(r'(?: d|cx|cy|x|y|width)="([^"]*)"', render(spoil(example(), bad), spoil(pictures(), bad)))
+    assert not any("nan" in v or "inf" in v for v in svg)
+
+
+def test_one_missing_value_spoils_only_its_own_cell() -> None:
+    report = example()
+    report["error"]["groups"]["joint angle"]["extended"][2] = None
+    report["parameters"][0]["low"] = math.nan
+    text = read(render(report, pictures())).text
+    assert "0.00410 rad" in text
+    assert "20.000" in text
+
+
+def test_an_empty_report_still_makes_a_page() -> None:
+    page = read(render({"verdict": "unexplained"}, {}))
+    assert set(SECTIONS) <= set(page.ids)
+    assert "No effect is claimed" in page.text
+
+
+def test_the_same_report_gives_the_same_page() -> None:
+    report, shown = example(3), pictures()
+    before = copy.deepcopy((report, shown))
+    assert render(report, shown) == render(copy.deepcopy(report), copy.deepcopy(shown))
+    assert (report, shown) == before
+    assert render(report | {"seconds": 1.0}, shown) == render(report | {"seconds": 2.0}, shown)
+
+
+def test_without_effects_no_third_model_is_drawn() -> None:
+    page = render(example(0), pictures())
+    body = page[page.index("<body>") :]
+    assert "line extended" not in body
+    assert "line extended" in render(example(1), pictures())
+
+
+def test_a_single_instant_is_drawn_as_bars() -> None:
+    report = example()
+    report["error"] = {"horizons_s": [0.0], "groups": {"force": errors("N", [9.0], [4.5], [1.5], [1.2])}}
+    page = render(report, pictures())
+    figure = page[page.index('aria-label="force: error before and after"') :]
+    widths = re.findall(r'<rect class="(?:nominal|calibrated|extended)"[^>]*width="([\d.]+)"', figure)[:3]
+    np.testing.assert_allclose(np.array(widths, float) / float(widths[0]), [1, 0.5, 1 / 6], atol=1e-3)
+    assert "force at each instant" in read(page).text
+
+
+def test_large_reports_fold_away_and_stay_small() -> None:
+    report, shown = example(15), pictures()
+    row = report["parameters"][0]
+    report["parameters"] = [row | {"name": f"p{i}", "left_prior": i < 3} for i in range(300)]
+    report["error"]["groups"] = {f"group {i}": report["error"]["groups"]["joint angle"] for i in range(40)}
+    report["identifiability"] = [report["identifiability"][0] | {"id": f"gain:m{i}"} for i in range(200)]
+    shown["traces"] *= 6
+    page = render(report, shown)
+    text = read(page).text
+    assert "300 parameters; 3 at a bound, 0 not identifiable" in text
+    assert all(name in text for name in ("p299", "group 39", "gain:m199"))
+    assert text.count("of the excess error") == 15
+    assert len(page) < 1_000_000
+    assert page.count("<details") >= 4
+
+
+def test_candidates_say_why_they_were_left() -> None:
+    text = read(render(example(), pictures())).text
+    rows = text[text.index("Round 1") : text.index("Round 2")]
+    verdicts = ["accepted", "cannot be told", "significantly less", "its lower bound is not above zero"]
+    at = [rows.index(w, rows.index("outcome")) for w in verdicts]
+    assert at == sorted(at)
+    assert "No more than chance." in text
+
+
+def test_two_plainer_laws_may_stand_for_the_best_candidate() -> None:
+    report = example()
+    report["rounds"][0] |= {"accepted": ["coulomb:hinge", "lag:motor"], "equivalents": ["stribeck:hinge"]}
+    text = read(render(report, pictures())).text
+    rows = text[text.index("Round 1") : text.index("Round 2")]
+    assert "accepted coulomb:hinge , lag:motor" in rows
+    assert "plainer than the best-ranked" in rows
+    assert "201 gains, but significantly less" in rows  # coulomb alone was not what was taken
+
+
+def test_warnings_name_what_they_are_about() -> None:
+    report = example() | {"independent_splits": False}
+    report["effects"][0]["equivalents"] = ["stribeck:hinge"]
+    report["effects"].append(effect("lag:motor", share_of_excess=0.0002))
+    report["parameters"][0]["identifiable"] = False
+    report["error"]["groups"]["joint speed"]["extended"][-1] = 0.6
+    said = " ".join(story.notices(report))
+    for words in (
+        "not independent",
+        "stribeck:hinge",
+        "kp lies at the bound",
+        "do not show bob_mass",
+        "matters little",
+    ):
+        assert words in said
+    for words in ("joint:hinge:vel was not declared", "joint speed gets worse"):
+        assert words in said
+    assert story.notices(example(0) | {"parameters": [], "noise": []}) == []
+
+
+def test_misfit_is_in_noise_widths_with_the_worst_first() -> None:
+    text = read(render(example(), pictures())).text
+    part = text[text.index("Where and when") :]
+    # mean squares 18 and 8 before, 1.8 and 0.8 after
+    assert part.index("joint:hinge joint angle 4.24 1.34") < part.index("joint:hinge joint speed 2.83 0.894")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0123456, "0.0123"), (1234.5, "1234"), (0, "0"), (-0.5, "−0.500"), (1.2e-5, "1.20×10⁻⁵"), (-3e7, "−3.00×10⁷"),
+     (0.09996, "0.100"), (99999.9, "1.00×10⁵"), (None, "–"), (math.nan, "–"), ("7", "–"), (np.float64(2), "2.00")],
+)  # fmt: skip
+def test_numbers(value: Any, text: str) -> None:
+    assert wording.number(value) == text
+
+
+@pytest.mark.parametrize("value", 10.0 ** np.linspace(-9, 9, 181))
+def test_a_shown_number_is_within_half_a_unit_of_its_third_digit(value: float) -> None:
+    shown = wording.number(value).replace("×10", "e").translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
+    assert abs(float(shown) - value) <= 0.005001 * value
+
+
+def test_a_value_is_shown_to_the_precision_of_its_interval() -> None:
+    assert wording.interval(0.10417, 0.1031, 0.1052) == ("0.1042", "0.1031 to 0.1052")
+    assert wording.interval(52.1234, 40.0, 64.0) == ("52", "40 to 64")
+    assert wording.interval(52.1234, None, None) == ("52.1", "–")
+    assert wording.interval(1.0, 1.0, 1.0) == ("1.00", "1.00 to 1.00")
+
+
+def test_units_of_one_are_not_written() -> None:
+    assert wording.quantity(0.4, "1") == "0.400"
+    assert wording.quantity(0.4, "m/s") == "0.400\N{NO-BREAK SPACE}m/s"
+    assert wording.quantity(None, "m") == "–"
+
+
+@pytest.mark.parametrize("high", [1e-9, 0.4, 1.0, 7.3, 1234.5])
+def test_ticks_are_round_inside_and_few(high: float) -> None:
+    low = -0.37 * high
+    ticks = nice_ticks(low, high, 5)
+    assert 2 <= len(ticks) <= 6
+    assert all(low * (1 + 1e-9) <= t <= high * (1 + 1e-9) for t in ticks)
+    np.testing.assert_allclose(np.diff(ticks), ticks[1] - ticks[0])
+
+
+def heights(figure: str, cls: str) -> list[float]:
+    path = re.search(rf'<path class="line {cls}" d="([^"]*)"', figure)
+    assert path
+    return [float(p.split()[1]) for p in re.split("[ML]", path[1])[1:]]
+
+
+def test_a_curve_is_drawn_to_scale() -> None:
+    figure = error_chart("g", "m", [Series("a", "nominal", [0, 1, 2], [0.0, 1.0, 2.0])])
+    y = heights(figure, "nominal")
+    assert y[0] - y[1] == pytest.approx(y[1] - y[0 + 2], abs=0.11)
+    assert y[0] > y[2]
+    decades = heights(error_chart("g", "m", [Series("a", "nominal", [0, 1, 2], [0.01, 0.1, 1.0])]), "nominal")
+    assert decades[0] - decades[1] == pytest.approx(decades[1] - decades[2], abs=0.11)
+
+
+def test_a_gap_is_left_where_a_value_is_missing() -> None:
+    figure = trace_chart("t", "m", [Series("a", "nominal", range(5), [0.0, 1.0, None, 1.0, 0.0])])
+    path = re.search(r'<path class="line nominal" d="([^"]*)"', figure)
+    assert path
+    assert path[1].count("M") == 2
+
+
+def test_a_prediction_that_runs_away_does_not_flatten_the_measurement() -> None:
+    t = np.linspace(0, 1, 50)
+    calm = Series("m", "measured", t.tolist(), np.sin(6 * t).tolist(), dots=True)
+    wild = Series("c", "calibrated", t.tolist(), (1e6 * t).tolist())
+    figure = trace_chart("t", "m", [wild, calm])
+    path = re.search(r'<path class="dots measured" d="([^"]*)"', figure)
+    assert path
+    y = [float(p.split()[1].removesuffix("h0")) for p in path[1].split("M")[1:]]
+    assert max(y) - min(y) > 50
+
+
+def summary() -> dict[str, Any]:
+    folds = {
+        name: {k: r[k] for k in ("verdict", "chi2", "error")} | {"effects": [e["id"] for e in r["effects"]]}
+        for name, r in (("a b/c", example()), ("javascript:alert(1)", example(0)), (EVIL, example()))
+    }
+    head = {k: example()[k] for k in ("schema", "model", "seed", "versions")}
+    return head | {"folds": folds, "effects_found_in": {"coulomb:hinge": "2 of 3 folds"}, "seconds": 3.0}
+
+
+def test_summary_lists_folds_with_links_that_stay_beneath_it() -> None:
+    page = render_summary(summary())
+    reader = read(page)
+    assert reader.loads[:2] == ["./a%20b/c/report.html", "./javascript%3Aalert%281%29/report.html"]
+    assert "Explained in 2 of 3 folds; nothing missing in 1 of 3 folds." in reader.text
+    assert "joint angle 0.0810 → 0.00410 rad (0.00370)" in reader.text
+    assert reader.tags.count("script") == 1
+    assert read(render_summary({"folds": {}})).tags
+
+
+def test_the_templates_are_part_of_the_package() -> None:
+    folder = resources.files("nfc_gym.measured").joinpath("templates")
+    names = {f.name for f in folder.iterdir()}
+    assert {"base.html.j2", "report.html.j2", "summary.html.j2", "page.css", "page.js"} <= names
