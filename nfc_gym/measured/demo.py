@@ -18,7 +18,7 @@ from nfc_gym.measured import standin
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.stages import digest, write_whole
 
-_LOGS, _SECONDS = 10, 8.0
+_LOGS, _SECONDS = 8, 5.0
 _OURS = {"logs", "mapping.yaml", "envelope.json", "report"}
 
 

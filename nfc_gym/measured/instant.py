@@ -26,6 +26,7 @@ from nfc_gym.physics.parameters import resolve, write_field
 from nfc_gym.physics.rollout import Plant, advance_activations
 
 Array = NDArray[np.float64]
+_LOAD_PASSES = 3  # friction that depends on the actuator's load, and a load that includes the friction: iterations
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class InstantProblem(Problem):
     """Blocks of consecutive samples; a subclass says what is predicted along a whole track."""
 
     def __init__(
-        self, model: mujoco.MjModel, logs: Sequence[Log], states: Sequence[States], length: float, most: int = 12_000
+        self, model: mujoco.MjModel, logs: Sequence[Log], states: Sequence[States], length: float, most: int = 6_000
     ) -> None:
         self.channels = self.compared(model, logs[0])
         total = sum(len(log) for log in logs)
@@ -202,16 +203,19 @@ def actuator_forces(plant: Plant, x: Array, t: Track) -> Array:
     thetas = plant.split(x)[1]
     base = model.dof_frictionloss.copy()
     motion = _Motion(model, data, t)
-    force = motion.inverse(None)
     rubbing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "friction")]
     ctx = Context(plant.model, t.dt, t.qpos, t.qvel, t.ctrl, t.exogenous, motion.data, lambda name: _tile(base if name == "dof_frictionloss" else getattr(model, name), len(t.time)))
-    for _ in range(3 if rubbing else 0):
+    force = None if rubbing else motion.inverse(None)
+    for _ in range(_LOAD_PASSES if rubbing else 0):
         level = np.tile(base, (len(t.time), 1))
-        motion.fields["qfrc_actuator"] = force
         for effect, theta in rubbing:
             dofs, more = effect.friction(ctx, np.broadcast_to(theta, (len(t.time), len(theta))))
             level[:, dofs] += more
         force = motion.inverse(level)
+        if not motion.load_read:
+            break
+        motion.fields["qfrc_actuator"] = force
+    assert force is not None
     pushing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "force")]
     if pushing:
         motion.fields["qfrc_actuator"] = force
@@ -237,6 +241,7 @@ class _Motion:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, t: Track) -> None:
         self.model, self._data, self._track = model, data, t
         self.fields: dict[str, Array] = {}
+        self.load_read = False  # whether a law asked for the actuators' own load, which then must be made consistent
 
     def inverse(self, friction: Array | None) -> Array:
         """(T, nv) generalised forces; `friction` (T, nv) overrides the dry friction sample by sample."""
@@ -254,6 +259,10 @@ class _Motion:
 
     def data(self, name: str) -> Array:
         """A derived field (T, ...) of positions and velocities, computed along the track when first asked for."""
+        if name == "qfrc_actuator":
+            self.load_read = True
+            if name not in self.fields:
+                self.fields[name] = self.inverse(None)
         if name not in self.fields:
             batch = self._placed()
             values = batch.bind(name)

@@ -26,6 +26,7 @@ class Screened:
       effect: the candidate.
       gain: drop of the (weighted, squared) loss that its best linear combination reaches, psi and accepted effects refitted.
       theta: (k,) parameters to start a fit from.
+      shift: (j,) change of the fitted model's scaled free parameters that goes with it.
       columns: (n, k') projected whitened change at the probe that did best, for the identifiability table.
       probe: (k',) size of the probed parameters.
     """
@@ -33,6 +34,7 @@ class Screened:
     effect: Effect
     gain: float
     theta: Array
+    shift: Array
     columns: Array
     probe: Array
 
@@ -61,9 +63,9 @@ class Screen:
         self.problem, self.metric, self.current = problem, metric, current
         self.weight = loss_weight(current.white)
         self.target = (self.weight * current.white).ravel()
-        tangent = (self.weight[..., None] * current.jacobian).reshape(len(self.target), -1)
-        norms = np.linalg.norm(tangent, axis=0)
-        tangent = tangent[:, norms > 1e-9] / norms[norms > 1e-9]
+        self.full_tangent = (self.weight[..., None] * current.jacobian).reshape(len(self.target), -1)
+        norms = np.linalg.norm(self.full_tangent, axis=0)
+        tangent = self.full_tangent[:, norms > 1e-9] / norms[norms > 1e-9]
         self.basis = np.linalg.svd(tangent, full_matrices=False)[0] if tangent.size else np.zeros((len(self.target), 0))
         self.projected = self.project(self.target)
 
@@ -79,22 +81,29 @@ class Screen:
         x = np.concatenate([np.repeat(self.current.x[None], len(rows), 0), rows], 1)
         white = self.metric.whiten(self.problem.residual(plant, x))
         change = (self.weight * (white - self.current.white)).reshape(len(rows), -1).T
-        best = Screened(effect, 0.0, sets[0][0], np.zeros((len(self.target), 0)), np.zeros(0))
+        best = Screened(effect, 0.0, sets[0][0], np.zeros(self.full_tangent.shape[1]), np.zeros((len(self.target), 0)), np.zeros(0))
         at = 0
         for probe in sets:
-            columns = self.project(change[:, at : at + len(probe)])
+            raw = change[:, at : at + len(probe)]
+            columns = self.project(raw)
             at += len(probe)
-            gain, theta = self._combine(effect, probe, columns)
+            gain, theta, multiple = self._combine(effect, probe, columns)
             if gain > best.gain or best.columns.shape[1] == 0:
                 sizes = (probe - effect.null)[np.arange(len(probe)), [i for i, p in enumerate(effect.params) if not p.shape]]
-                best = Screened(effect, gain, theta, columns, sizes)
+                best = Screened(effect, gain, theta, self._shift(raw @ multiple), columns, sizes)
         return best
 
-    def _combine(self, effect: Effect, probe: Array, columns: Array) -> tuple[float, Array]:
+    def _shift(self, change: Array) -> Array:
+        """Step of the fitted parameters that answers a change of the residual; directions that hardly show stay put."""
+        if not self.full_tangent.shape[1]:
+            return np.zeros(0)
+        return np.linalg.lstsq(self.full_tangent, -(self.target + change), rcond=1e-3)[0]
+
+    def _combine(self, effect: Effect, probe: Array, columns: Array) -> tuple[float, Array, Array]:
         """Best multiples of the probes within the parameters' bounds, and what they gain."""
         norms = np.linalg.norm(columns, axis=0)
         if not (norms > 1e-9).any():
-            return 0.0, probe[0]
+            return 0.0, probe[0], np.zeros(len(probe))
         solution = np.linalg.lstsq(columns / np.maximum(norms, 1e-12), -self.projected, rcond=1e-6)[0] / np.maximum(norms, 1e-12)
         sizing = [i for i, p in enumerate(effect.params) if not p.shape]
         size = (probe - effect.null)[np.arange(len(probe)), sizing]
@@ -105,22 +114,26 @@ class Screen:
         gain = float(self.projected @ self.projected - after @ after)
         theta = probe[0].copy()
         theta[sizing] = effect.null[sizing] + multiple * size
-        return gain, np.clip(theta, effect.low, effect.high)
+        return gain, np.clip(theta, effect.low, effect.high), multiple
 
-    def chance(self, found: Sequence[Screened], blocks: NDArray[np.intp], rng: np.random.Generator, draws: int = 99) -> Array:
-        """(draws,) best gain over all candidates on residuals that hold no effect.
+    def chance(self, found: Sequence[Screened], blocks: NDArray[np.intp], rng: np.random.Generator, draws: int = 199) -> dict[str, float]:
+        """Gain of each candidate that only 1 % of residuals without any effect would bring the luckiest candidate to.
 
         What the best candidate leaves over takes a random sign in every block: such a residual is as large and as correlated
-        as the real one and holds nothing, yet the best of many candidates gains from it. That is the gain to be beaten.
+        as the real one and holds nothing, yet the best of many candidates gains from it. Gains are compared in units of
+        each candidate's own average by chance, since laws with more parameters gain more.
         """
         kept = [s for s in found if s.columns.shape[1]]
         if not kept:
-            return np.zeros(draws)
+            return {}
         spans = [_span(s.columns) for s in kept]
         rest = self.projected - spans[0] @ (spans[0].T @ self.projected)
         signs = rng.choice([-1.0, 1.0], (draws, int(blocks.max()) + 1))[:, blocks]
         targets = (signs[:, :, None] * rest.reshape(-1, self.current.white.shape[1])).reshape(draws, -1)
-        return np.max([((targets @ q) ** 2).sum(1) for q in spans], axis=0)
+        gains = np.array([((targets @ q) ** 2).sum(1) for q in spans])
+        mean = np.maximum(gains.mean(1), 1e-12)
+        luckiest = float(np.quantile((gains / mean[:, None]).max(0), 0.99))
+        return {s.effect.id: luckiest * float(m) for s, m in zip(kept, mean, strict=True)}
 
 
 def _span(columns: Array) -> Array:

@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.contest import Judged, clusters, judge, losses, not_worse, shortlist
-from nfc_gym.measured.fit import Fit, fit
-from nfc_gym.measured.metric import Metric, metric, unexplained_variance
+from nfc_gym.measured.fit import Fit, box, fit
+from nfc_gym.measured.metric import Metric, loss, metric, unexplained_variance
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screen, Screened, screen_all
 from nfc_gym.physics.effects.base import Effect
-from nfc_gym.physics.effects.each import split
+from nfc_gym.physics.effects.each import Each, split
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 Say = Callable[[str], None]
+_KEEP = 60  # candidates that are screened again in every round, whatever they gained
+_CHORD = 10  # free parameters beyond which a candidate's refit reuses psi's Jacobian
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Options:
 class Round:
     """What one round of the search saw, for the report."""
 
-    accepted: str | None
+    accepted: list[str]
     share: float
     ranking: list[dict] = field(default_factory=list)
     equivalents: list[str] = field(default_factory=list)
@@ -88,6 +90,7 @@ class Search:
         self.fit_data, self.select, self.plant = fit_data, select, plant
         self.named = [e for e in candidates if not e.generic]
         self.generics = [e for e in candidates if e.generic]
+        self.hopeless: set[str] = set()
         self.options, self.say = options, say
         self.rng = np.random.default_rng(options.seed)
         self.fit_blocks, self.select_blocks = clusters(fit_data.problem), clusters(select.problem)
@@ -124,9 +127,13 @@ class Search:
 
     def _screen(self, screen: Screen, pool: Sequence[Effect], current: Fit) -> list[Screened]:
         taken = {e.id.removesuffix(":each") for e in current.plant.effects}
-        left = [e for e in pool if e.id not in taken]
+        left = [e for e in pool if e.id not in taken and (e.id not in self.hopeless or len(e.where) > 1)]
         self.say(f"screening {len(left)} candidates")
-        return screen_all(screen, left)
+        found = screen_all(screen, left)
+        # Places that show nothing at all are not looked at again; sets of places stay, since they stand for many.
+        floor = 1e-3 * float(screen.projected @ screen.projected)
+        self.hopeless |= {f.effect.id for f in found[_KEEP:] if f.gain < floor}
+        return found
 
     def _generic(self, screen: Screen, current: Fit, fit_metric: Metric, select_metric: Metric, outcome: Round) -> Judged | None:
         """The smooth law of position, speed or time that still adds most to the accepted effects, if it is believed."""
@@ -135,20 +142,20 @@ class Search:
             return None
         base_losses = losses(self.select.problem, select_metric, current)
         judged = [
-            self._try(current, [*current.plant.effects, s.effect], s.theta, screen, fit_metric, select_metric, base_losses)
+            self._try(current, [s], fit_metric, select_metric, base_losses)
             for s in screened[:3]
             if s.gain > 0
         ]
         judged.sort(key=lambda j: -j.total)
         outcome.ranking += [self._row(j, current) for j in judged]
-        chance = float(np.quantile(screen.chance(screened, self.fit_blocks, self.rng), 0.99))
+        chance = screen.chance(screened, self.fit_blocks, self.rng)
         return judged[0] if judged and self._believed(judged[0], chance, current, base_losses) else None
 
     def _outdone(self, generic: Judged, calibrated: Fit, current: Fit, fit_metric: Metric, select_metric: Metric) -> bool:
         """Whether that generic law alone explains clearly more than all accepted effects together."""
         base = self.refit(calibrated, fit_metric, rounds=6)
         base_losses = losses(self.select.problem, select_metric, base)
-        effect = self._newest(generic, current)
+        effect = self._new(generic, current)[0]
         plant = base.plant.with_effects([effect])
         alone = fit(self.fit_data.problem, fit_metric, plant, np.concatenate([base.x, effect.null]), 10)
         rival = judge(alone, base, self.select.problem, select_metric, base_losses, self.rng)
@@ -159,39 +166,67 @@ class Search:
         self, screen: Screen, screened: list[Screened], current: Fit, fit_metric: Metric, select_metric: Metric
     ) -> tuple[Round, Judged | None]:
         """Refit the shortlist, judge it on the selection logs, and decide."""
-        chance = float(np.quantile(screen.chance(screened, self.fit_blocks, self.rng), 0.99))
+        chance = screen.chance(screened, self.fit_blocks, self.rng)
         base_losses = losses(self.select.problem, select_metric, current)
         judged: list[Judged] = []
         for s in shortlist(screened, self.options.short):
             self.say(f"refitting {s.effect.id}")
-            judged.append(self._try(current, [*current.plant.effects, s.effect], s.theta, screen, fit_metric, select_metric, base_losses))
+            judged.append(self._try(current, [s], fit_metric, select_metric, base_losses))
         for effect in current.plant.effects:
             parts = split(effect, current.plant)
             if parts is not None:
                 judged.append(self._try_split(current, effect, parts, fit_metric, select_metric, base_losses))
         judged.sort(key=lambda j: -j.total)
-        ranking = [self._row(j, current) for j in judged]
-        outcome = Round(None, 0.0, ranking)
-        if not judged:
-            outcome.reason = "no candidate reduces the misfit"
+        outcome = Round([], 0.0, [self._row(j, current) for j in judged])
+        believed = [j for j in judged if self._believed(j, chance, current, base_losses)]
+        if not believed:
+            name = self._label(judged[0], current) if judged else ""
+            outcome.reason = f"the best candidate, {name}, gains no more on unseen logs than chance" if judged else "no candidate reduces the misfit"
             return outcome, None
-        best = judged[0]
-        if not self._believed(best, chance, current, base_losses):
-            outcome.reason = f"the best candidate, {self._newest(best, current).id}, gains no more on unseen logs than chance"
-            return outcome, None
-        outcome.accepted = self._newest(best, current).id
+        best = self._simplest(believed, screened, current, fit_metric, select_metric, base_losses)
+        outcome.accepted = [e.id for e in self._new(best, current)]
         outcome.share = best.gain / max(float(base_losses.sum()), 1e-9)
         outcome.equivalents = [
-            self._newest(j, current).id for j in judged[1:] if j.gain > 0 and not_worse(best, j, self.fit_blocks, self.select_blocks, self.rng)
+            self._label(j, current) for j in judged if self._label(j, current) not in outcome.accepted and j.gain > 0 and self._ties(believed[0], j)
         ]
-        self.say(f"accepted {outcome.accepted}")
+        self.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best
 
-    def _try(
-        self, current: Fit, effects: Sequence[Effect], theta: Array, screen: Screen, fit_metric: Metric, select_metric: Metric, base_losses: Array
+    def _ties(self, best: Judged, other: Judged) -> bool:
+        return not_worse(best, other, self.fit_blocks, self.select_blocks, self.rng)
+
+    def _simplest(
+        self, believed: list[Judged], screened: list[Screened], current: Fit, fit_metric: Metric, select_metric: Metric, base_losses: Array
     ) -> Judged:
-        plant = current.plant.with_effects(effects)
-        fitted = fit(self.fit_data.problem, fit_metric, plant, np.concatenate([current.x, theta]), 10, known=current.jacobian)
+        """Of the candidates that explain the data as well as the best one, that with the fewest parameters.
+
+        A law whose own feature does not show gives way to the plainer laws that it contains.
+        """
+        best = believed[0]
+        rivals = [j for j in believed if self._ties(best, j)]
+        by_id = {s.effect.id: s for s in screened}
+        effect = self._new(best, current)[0]
+        for families in effect.simpler if not isinstance(effect, Each) else ():
+            parts = [by_id.get(f"{f}:{effect.place}") for f in families]
+            if all(p is not None for p in parts):
+                self.say(f"refitting {' and '.join(families)} instead")
+                plain = self._try(current, [p for p in parts if p is not None], fit_metric, select_metric, base_losses)
+                if plain.lower > 0 and self._ties(best, plain):
+                    rivals.append(plain)
+        return min(rivals, key=lambda j: (len(j.fitted.x), -j.total))
+
+    def _try(self, current: Fit, picks: Sequence[Screened], fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
+        """Refit screened candidates with everything fitted so far, from where the screening points or from where we are."""
+        plant = current.plant.with_effects([*current.plant.effects, *(s.effect for s in picks)])
+        limits, thetas = box(current.plant), [s.theta for s in picks]
+        moved = current.x.copy()
+        moved[limits.free] += picks[0].shift * limits.scale[limits.free]
+        starts = np.stack([np.concatenate([x, *thetas]) for x in (np.clip(moved, limits.low, limits.high), current.x)])
+        white = fit_metric.whiten(self.fit_data.problem.residual(plant, starts))
+        start = starts[int(loss(white).sum(-1).argmin())]
+        # With few parameters a full Jacobian costs little; with many, psi keeps the one that it has (the chord method).
+        known = current.jacobian if int(limits.free.sum()) > _CHORD else None
+        fitted = fit(self.fit_data.problem, fit_metric, plant, start, 10, known=known)
         return judge(fitted, current, self.select.problem, select_metric, base_losses, self.rng)
 
     def _try_split(self, current: Fit, effect: Effect, parts: tuple[Effect, Array], fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
@@ -207,25 +242,31 @@ class Search:
         fitted = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(effects), np.concatenate(pieces), 8)
         return judge(fitted, current, self.select.problem, select_metric, base_losses, self.rng)
 
-    def _believed(self, j: Judged, chance: float, current: Fit, base_losses: Array) -> bool:
+    def _believed(self, j: Judged, chance: dict[str, float], current: Fit, base_losses: Array) -> bool:
+        """Whether the gain holds on unseen logs, is worth naming, and is more than the luckiest candidate gains by chance."""
         worth = self.options.worth * float(base_losses.sum())
-        return j.lower > 0 and j.gain > worth and float(j.fit_gains.sum()) > chance
+        lucky = max((chance.get(e.id, 0.0) for e in self._new(j, current)), default=0.0)
+        return j.lower > 0 and j.gain > worth and float(j.fit_gains.sum()) > lucky
 
     @staticmethod
-    def _newest(j: Judged, current: Fit) -> Effect:
+    def _new(j: Judged, current: Fit) -> list[Effect]:
+        """What a candidate adds to (or splits in) the current model."""
         before = set(map(id, current.plant.effects))
-        return next(e for e in j.fitted.plant.effects if id(e) not in before)
+        return [e for e in j.fitted.plant.effects if id(e) not in before]
+
+    def _label(self, j: Judged, current: Fit) -> str:
+        return " + ".join(e.id for e in self._new(j, current))
 
     def _row(self, j: Judged, current: Fit) -> dict:
-        effect = self._newest(j, current)
-        theta = j.fitted.plant.split(j.fitted.x)[1][j.fitted.plant.effects.index(effect)]
+        thetas = dict(zip(map(id, j.fitted.plant.effects), j.fitted.plant.split(j.fitted.x)[1], strict=True))
+        new = self._new(j, current)
         return {
-            "id": effect.id,
+            "id": self._label(j, current),
             "gain_fit": float(j.fit_gains.sum()),
             "gain_select": j.gain,
             "gain_select_low": j.lower,
-            "generic": effect.generic,
-            "sentence": effect.say(theta),
+            "generic": new[0].generic,
+            "sentence": " ".join(e.say(thetas[id(e)]) for e in new),
         }
 
     def _prune(self, current: Fit, fit_metric: Metric, select_metric: Metric) -> Fit:

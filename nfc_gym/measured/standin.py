@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 STEP = 0.002  # s; the assets' own step is 0.005
 SAMPLE = 0.01  # s between samples, and between commands
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-JACKAL_NOISE = {"pos": 0.001, "quat": 0.001, "linvel": 0.01, "angvel": 0.01, "wheel": 0.05}  # m, rad, m/s, rad/s, rad/s
+JACKAL_NOISE = {"pos": 0.0005, "quat": 0.0005, "linvel": 0.01, "angvel": 0.01, "wheel": 0.05}  # m, rad, m/s, rad/s, rad/s
 _RADIUS, _TRACK = 0.098, 0.37559  # m, of the Jackal's data sheet
 
 

@@ -164,7 +164,7 @@ def effect_rows(fitted: Fit, rounds: Sequence[Round], problem: Problem, shares: 
     """Accepted effects with sentences, intervals and equivalents."""
     sd = uncertainty(fitted, clusters(problem))
     at = len(fitted.plant.space)
-    equivalents = {r.accepted: r.equivalents for r in rounds if r.accepted}
+    equivalents = {i: r.equivalents for r in rounds for i in r.accepted}
     rows = []
     for effect, theta in zip(fitted.plant.effects, fitted.plant.split(fitted.x)[1], strict=True):
         spread = sd[at : at + len(theta)]

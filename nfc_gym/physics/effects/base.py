@@ -113,6 +113,8 @@ class Effect(ABC):
     summary: ClassVar[str]
     # A member of the generic alternatives takes part in every contest but is never claimed by name.
     generic: ClassVar[bool] = False
+    # Families that together do the same at the same place unless this law's own feature shows: claimed instead where it does not.
+    simpler: ClassVar[tuple[tuple[str, ...], ...]] = ()
     # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
     PARAMS: ClassVar[tuple[Param, ...]] = ()
 

@@ -93,6 +93,7 @@ class Stribeck(_JointFriction):
 
     family = "stribeck"
     summary = "Dry friction with a Stribeck rise at low speed"
+    simpler = (("coulomb",), ("coulomb", "damping_poly"))
     LEVELS = ("level", "rise")
     PARAMS = (
         Param("level", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
@@ -122,6 +123,7 @@ class LoadFriction(_JointFriction):
 
     family = "load_friction"
     summary = "Gear friction that grows with the load"
+    simpler = (("coulomb",), ("coulomb", "damping_poly"))
     PARAMS = (
         Param("level", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
         Param("motor", "1", 0.0, 0.8, probes=(0.05, 0.2), resolution=2e-3),
@@ -149,6 +151,7 @@ class DirectionalFriction(_JointFriction):
 
     family = "directional_friction"
     summary = "Dry friction that differs by direction of motion"
+    simpler = (("coulomb",), ("damping_poly",), ("coulomb", "damping_poly"))
     LEVELS = ("forward", "backward")
     PARAMS = (
         Param("forward", "N m", 0.0, 1e3, probes=(0.01, 0.1)),
