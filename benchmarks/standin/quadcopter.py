@@ -19,7 +19,7 @@ from nfc_gym.measured.standin import (
 )
 
 ROTORS = ("front_left", "front_right", "rear_left", "rear_right")
-NOISE = {"pos": 0.0005, "quat": 0.0005, "linvel": 0.01, "angvel": 0.01}  # m, rad, m/s, rad/s
+NOISE = {"pos": 0.0005, "quat": 0.0005, "linvel": 0.01, "angvel": 0.01, "mount": 0.001}  # m, rad, m/s, rad/s, rad
 PSI = {"base_mass": 0.6, "arm_mass": 0.1, "mount_stiffness": 4.0}
 VOLTS = 11.9  # of the battery at which the rotors make the thrust that the model says
 _AT = 0.12  # m, a rotor's x and y
@@ -162,5 +162,10 @@ def fly(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
             data.xfrc_applied[:] = 0
             hidden.push(data)
             mujoco.mj_step(model, data)
+    angles = {
+        f"{r}_{axis}": qpos[:, model.joint(f"{r}_mount_{axis}").qposadr[0]] + NOISE["mount"] * rng.normal(size=len(time))
+        for r in ROTORS
+        for axis in "xy"
+    }
     thrusts = {f"{r}_thrust": sent[:, i] for i, r in enumerate(ROTORS)}
-    return {"time": time, **thrusts, "volts": volts, **body_columns(qpos, qvel, NOISE, rng)}
+    return {"time": time, **thrusts, "volts": volts, **body_columns(qpos, qvel, NOISE, rng), **angles}

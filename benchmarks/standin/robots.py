@@ -30,7 +30,10 @@ class Robot:
 
 
 def quadcopter_mapping(weighed: float) -> str:
-    """Mapping file of the stand-in's logs: the chassis was weighed; four arms and four mounts of one make."""
+    """Mapping file of the stand-in's logs: the chassis was weighed; four arms and four mounts of one make.
+
+    The mounts' angle sensors are logged too: arms that start a prediction unbent, or bent by an unknown angle, kick the chassis.
+    """
     rotors = list(quadcopter.ROTORS)
     mounts = [f"{r}_mount_{axis}" for r in rotors for axis in "xy"]
     mapping = {
@@ -47,7 +50,12 @@ def quadcopter_mapping(weighed: float) -> str:
         "logs": [{"path": "logs/*.csv"}],
         "time": {"column": "time", "unit": "s"},
         "controls": {f"ctrl:{r}": {"column": f"{r}_thrust", "unit": "N"} for r in rotors},
-        "channels": body_channels(quadcopter.NOISE),
+        "channels": body_channels(quadcopter.NOISE)
+        | {
+            f"joint:{r}_mount_{axis}:pos": {"column": f"{r}_{axis}", "unit": "rad", "noise": quadcopter.NOISE["mount"]}
+            for r in rotors
+            for axis in "xy"
+        },
         "exogenous": {"exo:supply": {"column": "volts", "unit": "V"}},
         "segments": {"length": 0.4, "history": 0.5, "horizons": [0.05, 0.1, 0.2, 0.4]},
     }

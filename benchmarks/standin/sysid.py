@@ -1,5 +1,7 @@
 """The baseline `mujoco.sysid`: the same psi fitted to the same logs by MuJoCo's own toolbox, with its default residual."""
 
+import contextlib
+import io
 import logging
 from collections.abc import Callable, Sequence
 
@@ -76,20 +78,21 @@ def identify(bench: Bench, logs: Sequence[Log], iterations: int = 20) -> Array:
         {p.name: _parameter(p, float(n)) for p, n in zip(space.parameters, space.nominal, strict=True) if not p.anchored}
     )
     residual = sysid.build_residual_fn(models_sequences=[sequences])
-    found, _ = sysid.optimize(wanted, residual, optimizer="mujoco", verbose=False, max_iters=iterations)
+    with contextlib.redirect_stdout(io.StringIO()):  # the optimizer prints each iteration, whatever `verbose` says
+        found, _ = sysid.optimize(wanted, residual, optimizer="mujoco", verbose=False, max_iters=iterations)
     values = {p.name: float(found[p.name].value[0]) for p in space.parameters if not p.anchored}
     return space.vector(values)
 
 
 def _pieces(bench: Bench, logs: Sequence[Log]) -> tuple[list[Array], list[sysid.TimeSeries], list[sysid.TimeSeries]]:
     model = bench.plant.model
-    wheels = [c.split(":")[1] for c in logs[0].channels if c.startswith("joint:")]
-    names = ["base_qpos", "base_qvel", *(f"{w}_qvel" for w in wheels)]
+    joints = [c.split(":")[1:] for c in logs[0].channels if c.startswith("joint:")]
+    names = ["base_qpos", "base_qvel", *(f"{name}_q{what}" for name, what in joints)]
     starts, controls, measured = [], [], []
     for log in logs:
         states = bench.states[log.name]
         sent = np.stack([log.controls[f"ctrl:{model.actuator(a).name}"] for a in range(model.nu)], 1)
-        channels = [f"body:base:{c}" for c in ("pos", "quat", "linvel", "angvel@body")] + [f"joint:{w}:vel" for w in wheels]
+        channels = [f"body:base:{c}" for c in ("pos", "quat", "linvel", "angvel@body")] + [f"joint:{name}:{what}" for name, what in joints]
         seen = np.concatenate([log.channels[c].values.reshape(len(log), -1) for c in channels], 1)
         act = _filtered(model, sent, log.interval)
         length = round(bench.dataset.mapping.segments.length / log.interval)

@@ -78,6 +78,7 @@ class Payload(Hidden):
     def shape(self, spec: mujoco.MjSpec) -> None:
         lump = spec.body(self.where[0]).add_body(name="lump", pos=self.at)
         lump.explicitinertial = True
+        lump.ipos = [0.0, 0.0, 0.0]  # unset, MuJoCo takes the body's own place for it once more
         lump.mass, lump.inertia = self.parameters["mass"], np.full(3, 1e-8)
 
 
