@@ -10,12 +10,13 @@ from typing import Any
 
 from markupsafe import Markup
 
-from nfc_gym.measured.wording import finite, number, plain, quantity
+from nfc_gym.measured.wording import finite, fixed, number, plain, quantity
 
 _WIDTH, _HEIGHT = 440, 230
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 10, 12, 40
-_RANGE_OF_LOG = 15.0  # largest over smallest value from which a logarithmic axis shows more than a linear one
+_LEFT, _RIGHT, _TOP, _BOTTOM = 72, 10, 12, 40
+_RANGE_OF_LOG = 15.0  # worst over best model from which a logarithmic axis shows more than a linear one
 _FAR = 1.5  # how many measured ranges beyond the measurement a prediction is still drawn
+_FEW = 30  # samples up to which they are drawn large, and say little of the range
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,11 @@ def _text(x: float, y: float, words: str, anchor: str = "middle", more: str = ""
 def _frame(x: _Axis, y: _Axis, x_label: str, y_label: str) -> Markup:
     """Grid lines, tick labels and axis titles."""
     parts = []
-    for v in y.ticks(5):
+    ticks = y.ticks(5)
+    for v, label in zip(ticks, _labels(y, ticks), strict=True):
         at = y(v)
         parts.append(Markup('<path class="grid" d="M{} {}H{}"/>').format(_LEFT, f"{at:.1f}", _WIDTH - _RIGHT))
-        parts.append(_text(_LEFT - 6, at + 4, number(v, 1) if y.log else number(v, _digits(y)), "end"))
+        parts.append(_text(_LEFT - 6, at + 4, label, "end"))
     for v in x.ticks(6):
         parts.append(Markup('<path class="grid" d="M{} {}v4"/>').format(f"{x(v):.1f}", _HEIGHT - _BOTTOM))
         parts.append(_text(x(v), _HEIGHT - _BOTTOM + 17, plain(v)))
@@ -97,14 +99,13 @@ def _frame(x: _Axis, y: _Axis, x_label: str, y_label: str) -> Markup:
     return Markup("").join(parts)
 
 
-def _digits(axis: _Axis) -> int:
-    """Significant digits that tell neighbouring ticks apart."""
-    ticks = axis.ticks(5)
+def _labels(axis: _Axis, ticks: Sequence[float]) -> list[str]:
+    """Ticks as text, all with the same number of places."""
     step = ticks[1] - ticks[0] if len(ticks) > 1 else 0.0
     largest = max((abs(t) for t in ticks), default=0.0)
-    if step <= 0 or largest <= 0:
-        return 2
-    return max(1, math.floor(math.log10(largest)) - math.floor(math.log10(step)) + 1)
+    if axis.log or not 1e-4 <= step <= largest < 1e5:
+        return [number(t, 1 if axis.log else 3) for t in ticks]
+    return ["0" if abs(t) < 1e-9 * step else fixed(t, max(0, -math.floor(math.log10(step) + 1e-9))) for t in ticks]
 
 
 def _path(series: Series, x: _Axis, y: _Axis) -> Markup:
@@ -119,7 +120,7 @@ def _path(series: Series, x: _Axis, y: _Axis) -> Markup:
         alone = pen_up and (i + 1 == len(points) or points[i + 1][1] is None)
         steps.append(f"M{at}h0" if series.dots or alone else f"{'M' if pen_up else 'L'}{at}")
         pen_up = series.dots
-    kind = "dots" if series.dots else "line"
+    kind = "line" if not series.dots else "dots" if len(points) > _FEW else "dots few"
     return Markup('<path class="{} {}" d="{}"><title>{}</title></path>').format(
         kind, series.cls, "".join(steps), series.name
     )
@@ -153,6 +154,15 @@ def _inner(curves: Iterable[Markup]) -> Markup:
     )
 
 
+def _apart(series: Sequence[Series]) -> float:
+    """Largest ratio of two curves at one place."""
+    columns: dict[float, list[float]] = {}
+    for a, b in (point for s in series for point in s.points()):
+        if a is not None and b is not None and b > 0:
+            columns.setdefault(a, []).append(b)
+    return max((max(c) / min(c) for c in columns.values()), default=1.0)
+
+
 def error_chart(label: str, unit: str, series: Sequence[Series]) -> Markup:
     """Error against horizon, from zero; logarithmic where the curves lie far apart."""
     xs = [a for s in series for a, _ in s.points() if a is not None]
@@ -160,7 +170,7 @@ def error_chart(label: str, unit: str, series: Sequence[Series]) -> Markup:
     positive = [b for b in ys if b > 0]
     if not xs or not positive:
         return Markup('<p class="none">No value to draw.</p>')
-    log = max(positive) > _RANGE_OF_LOG * min(positive)
+    log = _apart(series) > _RANGE_OF_LOG
     x = _Axis(0.0, max(xs) * 1.02 or 1.0, _LEFT, _WIDTH - _RIGHT)
     low = min(positive) / 1.3 if log else 0.0
     y = _Axis(low, max(positive) * (1.3 if log else 1.08), _HEIGHT - _BOTTOM, _TOP, log)
@@ -178,7 +188,7 @@ def trace_chart(label: str, unit: str, series: Sequence[Series]) -> Markup:
     if not xs or not rest:
         return Markup('<p class="none">No value to draw.</p>')
     lead = lead or rest
-    reach = _FAR * ((max(lead) - min(lead)) or max(abs(max(lead)), 1e-9))
+    reach = (_FAR if len(lead) > _FEW else 4 * _FAR) * ((max(lead) - min(lead)) or max(abs(max(lead)), 1e-9))
     low, high = max(min(rest), min(lead) - reach), min(max(rest), max(lead) + reach)
     margin = 0.06 * (high - low) or max(abs(high), 1.0) * 0.1
     x = _Axis(min(xs), max(xs) if max(xs) > min(xs) else min(xs) + 1.0, _LEFT, _WIDTH - _RIGHT)

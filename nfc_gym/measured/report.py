@@ -43,8 +43,9 @@ def render(report: Row, shown: Row) -> str:
         error_rows=_error_rows(report.get("error") or {}),
         chi2=_chi2(report.get("chi2") or {}, stages),
         chi2_bound=finite((report.get("chi2") or {}).get("null_95")),
+        instant=(report.get("error") or {}).get("horizons_s") == [0.0],
         traces=[_trace(t, stages) for t in shown.get("traces") or []],
-        effects=[_effect(e) for e in report.get("effects") or []],
+        effects=[_effect(e, report["effects"]) for e in report.get("effects") or []],
         parameters=[_parameter(p) for p in report.get("parameters") or []],
         rounds=[_round(r) for r in report.get("rounds") or []],
         places=_misfit_rows(misfit, "place", stages),
@@ -148,7 +149,7 @@ def _trace(trace: Row, stages: Sequence[str]) -> Row:
     return {"title": title, "figure": charts.trace_chart(f"{title}: measured and predicted", unit, curves)}
 
 
-def _effect(effect: Row) -> Row:
+def _effect(effect: Row, effects: Sequence[Row]) -> Row:
     rows = []
     for name, p in (effect.get("parameters") or {}).items():
         value, span = wording.interval(p.get("value"), p.get("low"), p.get("high"))
@@ -159,7 +160,7 @@ def _effect(effect: Row) -> Row:
         "sentence": effect.get("sentence") or story.what(effect),
         "share": share,
         "meter": charts.meter(share, 1.0, "extended"),
-        "equivalents": effect.get("equivalents") or [],
+        "equivalents": story.rivals_of(effect, effects),
         "parameters": rows,
     }
 
@@ -186,13 +187,15 @@ def _round(r: Row) -> Row:
 
 def _outcome(candidate: Row, label: str, equivalents: Sequence[Any]) -> str:
     """Why a candidate was taken or left, from what the round decided; `label` is what it accepted, or empty."""
-    low = finite(candidate.get("gain_select_low"))
+    gain, low = finite(candidate.get("gain_select")), finite(candidate.get("gain_select_low"))
     if label and candidate.get("id") == label:
         return "accepted"
     if candidate.get("id") in equivalents:
         return "cannot be told from the accepted one, which is as plain or plainer"
+    if gain is not None and gain <= 0:
+        return "no gain on unseen logs"
     if low is not None and low <= 0:
-        return "gain on unseen logs not sure: its lower bound is not above zero"
+        return "gain on unseen logs not sure: lower bound not above zero"
     if label:
         return "gains, but significantly less than the best"
     return "a gain too small to name, or no larger than chance gives"

@@ -1,5 +1,6 @@
 """A report in plain words: the verdict in a sentence, how sure it is, and what to know before relying on it."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from nfc_gym.measured.wording import DASH, counted, finite, listed, number, percent, plain, quantity
@@ -113,7 +114,7 @@ def headline(report: dict[str, Any]) -> str:
     effects = report.get("effects") or []
     word = report.get("verdict")
     left = (report.get("unexplained") or {}).get("coordinate")
-    at = f", most of it at {left}" if left else ""
+    at = f", the largest share at {left}" if left else ""
     if word == "nothing missing":
         return "Nothing is missing: once calibrated, the model predicts unseen motion as well as the sensors can tell."
     if word == "unexplained":
@@ -164,12 +165,10 @@ def certainty(report: dict[str, Any]) -> str:
     else:
         rest = f"is {number(after / null if null else after, 2)} times a perfect model's ({number(null)})"
     text = f"Chi-squared {number(after)} {rest}"
-    ratio = chi2.get("extended_over_calibrated_95") or (None, None)
-    if report.get("effects") and finite(ratio[0]) is not None and finite(ratio[1]) is not None:
-        text += (
-            f"; it comes down to between {percent(ratio[0])} and {percent(ratio[1])} of what calibration alone leaves"
-            " (95\N{NO-BREAK SPACE}% interval)"
-        )
+    low, high = (finite(r) for r in chi2.get("extended_over_calibrated_95") or (None, None))
+    if report.get("effects") and low is not None and high is not None:
+        part = f"{number(100 * low, 2)} to {number(100 * high, 2)} %"
+        text += f"; that is {part} of what calibration alone leaves (95 % interval)"
     return f"{text}."
 
 
@@ -201,14 +200,20 @@ def notices(report: dict[str, Any]) -> list[str]:
     return out
 
 
+def rivals_of(effect: dict[str, Any], effects: Sequence[dict[str, Any]]) -> list[str]:
+    """Ids of what fits as well as an effect, less those that are claimed beside it."""
+    claimed = {e.get("id") for e in effects}
+    return [i for i in effect.get("equivalents") or [] if i not in claimed]
+
+
 def _on_effects(report: dict[str, Any]) -> list[str]:
     effects = report.get("effects") or []
     if not effects:
         return []
     out = []
     for e in effects:
-        if e.get("equivalents"):
-            out.append(f"{e.get('id')} cannot be told from {listed(e['equivalents'], 4)} with these logs.")
+        if rivals := rivals_of(e, effects):
+            out.append(f"{e.get('id')} cannot be told from {listed(rivals, 4)} with these logs.")
         share = finite(e.get("share_of_excess"))
         if share is not None and share < _SLIGHT:
             part = f"takes away {percent(share)} of the excess error on the verification logs"
