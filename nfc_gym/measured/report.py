@@ -153,7 +153,9 @@ def _effect(effect: Row, effects: Sequence[Row]) -> Row:
     rows = []
     for name, p in (effect.get("parameters") or {}).items():
         value, span = wording.interval(p.get("value"), p.get("low"), p.get("high"))
-        rows.append({"name": str(name).replace("_", " "), "value": value, "interval": span, "unit": p.get("unit")})
+        what, at, place = str(name).partition("@")
+        label = what.replace("_", " ") + (f" at {place}" if at else "")
+        rows.append({"name": label, "value": value, "interval": span, "unit": p.get("unit")})
     share = effect.get("share_of_excess")
     return {
         "id": effect.get("id"),

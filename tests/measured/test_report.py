@@ -314,6 +314,13 @@ def test_candidates_say_why_they_were_left() -> None:
     assert "No more than chance." in text
 
 
+def test_values_of_each_place_keep_the_place_as_the_model_names_it() -> None:
+    report = example()
+    level = report["effects"][0]["parameters"]["level"]
+    report["effects"][0]["parameters"] = {"forward_viscous@rear_left": level}
+    assert "forward viscous at rear_left 0.0421 N m 0.0402 to 0.0441" in read(render(report, pictures())).text
+
+
 def test_two_plainer_laws_may_stand_for_the_best_candidate() -> None:
     report = example()
     report["rounds"][0] |= {"accepted": ["coulomb:hinge", "lag:motor"], "equivalents": ["stribeck:hinge"]}
