@@ -21,6 +21,9 @@ from nfc_gym.physics.parameters import ParameterSpace, parameters_from_toml
 from nfc_gym.physics.rollout import Plant
 
 
+_SAMPLES = 12_000  # of all logs together that an instant problem looks at; longer logs are thinned
+
+
 @dataclass
 class Bench:
     """A mapping made ready.
@@ -47,7 +50,7 @@ class Bench:
         states = [self.states[log.name] for log in logs]
         if self.mode != "rollout":
             kind = InverseProblem if self.mode == "inverse" else ForwardProblem
-            return kind(model, logs, states, segments.length)
+            return kind(model, logs, states, segments.length, max(1, -(-sum(map(len, self.dataset.logs)) // _SAMPLES)))
         controls = self.dataset.mapping.controls
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")

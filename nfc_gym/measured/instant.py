@@ -75,12 +75,10 @@ class InstantProblem(Problem):
     """Blocks of consecutive samples; a subclass says what is predicted along a whole track."""
 
     def __init__(
-        self, model: mujoco.MjModel, logs: Sequence[Log], states: Sequence[States], length: float, most: int = 6_000
+        self, model: mujoco.MjModel, logs: Sequence[Log], states: Sequence[States], length: float, stride: int = 1
     ) -> None:
         self.channels = self.compared(model, logs[0])
-        total = sum(len(log) for log in logs)
         self.smooth = max(logs[0].channels[c].smooth for c in self.channels)
-        stride = max(1, int(np.ceil(total / most)))
         self.stride = stride if self.smooth == 1 else min(stride, max(1, self.smooth // 5))
         self.tracks = [track(model, log, s, self.channels, self.stride) for log, s in zip(logs, states, strict=True)]
         self.names = tuple(log.name for log in logs)
@@ -341,12 +339,11 @@ class ForwardProblem(InstantProblem):
         for part in np.split(sensed, np.cumsum(lengths)[:-1], axis=1):
             columns = []
             for o in self.observers:
-                block = part[..., o._address : o._address + o._address2]
-                values = block if o._axes is None else block[..., list(o._axes)]
+                values = o.read(part)
                 for effect, theta in zip(plant.effects, thetas, strict=True):
                     if overrides(effect, "sense"):
                         values = effect.sense(o.name, values, theta, dt)
-                columns.append(values)
+                columns.append(o.pick(values))
             out.append(np.concatenate(columns, -1))
         return out
 

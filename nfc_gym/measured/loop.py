@@ -32,7 +32,7 @@ from nfc_gym.measured.stages import Stages, digest, write_whole
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-_WORK = 24_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
+_WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
 _REPLICAS = 4
 
 
@@ -92,6 +92,8 @@ def close_loop(
             reports[f.name] = json.loads(finished.read_text())
             continue
         reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, digest(extra=key + f.name), overwrite, resume, console)
+    if fold is not None:  # other folds may be running beside this one; the summary is the whole run's
+        return reports[fold]
     summary = _summary(dataset, reports)
     write_whole(out / "report.json", json.dumps(summary, indent=1))
     return summary

@@ -36,18 +36,25 @@ class Metric:
 
 
 def unexplained_variance(problem: Problem, residual: Array, sigma: Array) -> Array:
-    """(m,) variance of each column beyond what the noise explains, from the middle of the residuals' spread.
+    """(m,) variance of each kind of column (quantity, place, horizon) beyond what the noise explains, from the middle of the residuals' spread.
 
     residual (S, m) and sigma (S, m, m) are those of the best model so far. Candidates of one round are compared under one
     such variance, so that no model is flattered by a metric of its own.
     """
     values = np.where(problem.mask & np.isfinite(residual), residual, np.nan)
     expected = np.where(problem.mask, np.einsum("sii->si", sigma), np.nan)
-    with np.errstate(invalid="ignore"):
-        spread = (1.4826 * np.nanmedian(np.abs(values), axis=0)) ** 2
-        heavy = np.nanmean(np.minimum(values**2, 9 * np.where(spread > 0, spread, np.inf)), axis=0)
-    found = np.fmax(np.fmax(spread, heavy) - np.nanmedian(expected, axis=0), 0.0)
-    return np.where(np.isfinite(found), found, 0.0)
+    c = problem.columns
+    kinds = list(zip(c.group, c.place, c.horizon.tolist(), strict=True))
+    out = np.zeros(len(c))
+    for kind in dict.fromkeys(kinds):
+        of = np.array([k == kind for k in kinds])
+        errors, known = values[:, of], expected[:, of]
+        if not np.isfinite(errors).any():
+            continue
+        spread = (1.4826 * np.nanmedian(np.abs(errors))) ** 2
+        heavy = np.nanmean(np.minimum(errors**2, 9 * spread if spread > 0 else np.inf))
+        out[of] = max(max(spread, heavy) - np.nanmedian(known), 0.0)
+    return out
 
 
 def metric(problem: Problem, sigma: Array, extra: Array | None = None) -> Metric:

@@ -56,7 +56,7 @@ class Observer:
         return self._kind == "sensor"
 
     def predict(self, traj: Trajectory) -> Array:
-        """Values (P, S, K + 1, dim) along a trajectory."""
+        """Values (P, S, K + 1, dim) along a trajectory; of a vector sensor all components (see `pick`)."""
         a = self._address
         if self._kind == "qpos":
             return traj.qpos[..., a : a + 1]
@@ -64,8 +64,7 @@ class Observer:
             return traj.qvel[..., a : a + 1]
         if self._kind == "sensor":
             assert traj.sensordata is not None
-            block = traj.sensordata[..., a : a + self._address2]
-            return block if self._axes is None else block[..., list(self._axes)]
+            return self.read(traj.sensordata)
         if self._kind == "pos":
             return traj.qpos[..., a : a + 3]
         quat = traj.qpos[..., self._address2 : self._address2 + 4]
@@ -75,6 +74,14 @@ class Observer:
         if self._kind == "linvel":
             return rotate_back(quat, velocity) if self._in_body else velocity
         return velocity if self._in_body else rotate(quat, velocity)
+
+    def read(self, sensordata: Array) -> Array:
+        """A sensor's whole reading (..., dim) out of `sensordata`."""
+        return sensordata[..., self._address : self._address + self._address2]
+
+    def pick(self, values: Array) -> Array:
+        """The components that are measured, after every effect on the whole sensor."""
+        return values if self._axes is None else values[..., list(self._axes)]
 
     def difference(self, predicted: Array, measured: Array) -> Array:
         """measured minus predicted, (..., size); for quaternions the rotation vector between them, in the predicted frame."""

@@ -166,7 +166,7 @@ class RolloutProblem(Problem):
             for effect, theta in zip(plant.effects, thetas, strict=True):
                 if overrides(effect, "sense"):
                     values = effect.sense(o.name, values, theta[:, None, :] if theta.ndim == 2 else theta, segments.dt)
-            out.append(values)
+            out.append(o.pick(values))
         return out, traj
 
     def _compare(self, plant: Plant, x: Array, segments: Segments, measured: Sequence[Array], step: Array, mask: NDArray[np.bool_]) -> Array:

@@ -21,6 +21,7 @@ from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 Say = Callable[[str], None]
+_NEARLY = 0.9  # share of the best candidate's gain that a simpler law must reach to be preferred
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
 _CHORD = 10  # free parameters beyond which a candidate's refit reuses psi's Jacobian
 
@@ -203,7 +204,7 @@ class Search:
         A law whose own feature does not show gives way to the plainer laws that it contains.
         """
         best = believed[0]
-        rivals = [j for j in believed if self._ties(best, j)]
+        rivals = [j for j in believed if j.total > _NEARLY * best.total and self._ties(best, j)]
         by_id = {s.effect.id: s for s in screened}
         effect = self._new(best, current)[0]
         for families in effect.simpler if not isinstance(effect, Each) else ():
@@ -211,7 +212,7 @@ class Search:
             if all(p is not None for p in parts):
                 self.say(f"refitting {' and '.join(families)} instead")
                 plain = self._try(current, [p for p in parts if p is not None], fit_metric, select_metric, base_losses)
-                if plain.lower > 0 and self._ties(best, plain):
+                if plain.lower > 0 and plain.total > _NEARLY * best.total and self._ties(best, plain):
                     rivals.append(plain)
         return min(rivals, key=lambda j: (len(j.fitted.x), -j.total))
 
