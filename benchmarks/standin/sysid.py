@@ -48,6 +48,11 @@ def _damping(spec: mujoco.MjSpec, name: str, value: float) -> None:
     spec.joint(name).damping[0] = value
 
 
+@_writes("dof_armature")
+def _armature(spec: mujoco.MjSpec, name: str, value: float) -> None:
+    spec.joint(name).armature = value
+
+
 @_writes("jnt_stiffness")
 def _stiffness(spec: mujoco.MjSpec, name: str, value: float) -> None:
     spec.joint(name).stiffness[0] = value

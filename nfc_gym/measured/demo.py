@@ -133,8 +133,8 @@ def body_channels(noise: Mapping[str, float], body: str = "base") -> dict[str, A
 def jackal_mapping(weighed: float) -> str:
     """Mapping file of the stand-in's logs.
 
-    It declares fewer parameters than the Jackal's psi.toml. Four wheels of one make share a friction, a servo gain and a
-    bearing drag: with a gain for each wheel a lost axle would be a parameter like any other, and no finding. The chassis was
+    It declares other and fewer parameters than the Jackal's psi.toml. Four wheels of one make share a friction, a servo gain, a
+    bearing drag and a rotor inertia: with a gain for each wheel a lost axle would be a parameter like any other, and no finding. The chassis was
     weighed, which fixes the scale of all forces; restitution shows only in jumps, of which there are none.
     """
     noise, wheels = standin.JACKAL_NOISE, list(standin.WHEELS)
@@ -147,6 +147,7 @@ def jackal_mapping(weighed: float) -> str:
             {"name": "wheel_servo", "field": "servo_kv", "of": wheels, "tied": True, "unit": "N m s/rad", "low": 0.5, "high": 10.0},
             {"name": "wheel_friction", "field": "geom_friction[0]", "of": joints, "tied": True, "unit": "1", "low": 0.1, "high": 1.5},
             {"name": "wheel_damping", "field": "dof_damping", "of": joints, "tied": True, "unit": "N m s/rad", "low": 0.0, "high": 0.1},
+            {"name": "wheel_armature", "field": "dof_armature", "of": joints, "tied": True, "unit": "kg m^2", "nominal": 0.05, "low": 0.02, "high": 0.1, "reason": "rotor inertia times the gear ratio squared, data sheet"},
         ],
         "logs": [{"path": "logs/*.csv"}],
         "time": {"column": "time", "unit": "s"},
