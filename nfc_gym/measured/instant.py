@@ -319,18 +319,27 @@ class ForwardProblem(InstantProblem):
         batch.qpos[...], batch.qvel[...] = join("qpos"), join("qvel")
         batch.ctrl[...] = np.concatenate([u for u, _ in commands], 1).reshape(count * samples, -1)
         batch.act[...] = np.concatenate([a for _, a in commands], 1).reshape(count * samples, -1)
+        sensordata = batch.bind("sensordata")  # bound before the call that fills it
         batch.forward()
         exogenous = {k: np.tile(np.concatenate([t.exogenous[k] for t in tracks]), count) for k in tracks[0].exogenous}
         thetas = plant.split(rows)[1]
         pushing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "force")]
         if pushing:
-            ctx = Context(plant.model, tracks[0].dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, batch.bind, fields.__getitem__)
-            out = Forces(batch.qfrc_applied, batch.xfrc_applied)
-            batch.bind("xquat"), batch.bind("actuator_force")
+
+            def derived(name: str) -> Array:
+                fresh = name not in batch._bound
+                values = batch.bind(name)
+                if fresh:
+                    batch.forward()
+                return values
+
+            ctx = Context(plant.model, tracks[0].dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, derived, fields.__getitem__)
+            out = Forces(np.zeros_like(batch.qfrc_applied), np.zeros_like(batch.xfrc_applied))
             for effect, theta in pushing:
                 effect.force(ctx, theta, out)
+            batch.qfrc_applied[...], batch.xfrc_applied[...] = out.qfrc, out.xfrc
             batch.forward()
-        sensed = batch.sensordata.reshape(count, samples, -1)
+        sensed = sensordata.reshape(count, samples, -1)
         return self._read(plant, x, sensed, lengths, tracks[0].dt)
 
     def _read(self, plant: Plant, x: Array, sensed: Array, lengths: Sequence[int], dt: float) -> list[Array]:

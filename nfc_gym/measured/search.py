@@ -37,7 +37,7 @@ class Options:
       seed: of bootstrap and chance draws.
     """
 
-    most: int = 6
+    most: int = 8
     worth: float = 0.02
     short: int = 8
     seed: int = 0
@@ -199,9 +199,10 @@ class Search:
     def _simplest(
         self, believed: list[Judged], screened: list[Screened], current: Fit, fit_metric: Metric, select_metric: Metric, base_losses: Array
     ) -> Judged:
-        """Of the candidates that explain the data as well as the best one, that with the fewest parameters.
+        """Of the candidates that explain the data as well as the best one, that with the fewest parameters and the widest place.
 
-        A law whose own feature does not show gives way to the plainer laws that it contains.
+        A law whose own feature does not show gives way to the plainer laws that it contains; and a cause that like parts share
+        is likelier than the same cause in just one of them, unless the data tell them apart.
         """
         best = believed[0]
         rivals = [j for j in believed if j.total > _NEARLY * best.total and self._ties(best, j)]
@@ -214,7 +215,7 @@ class Search:
                 plain = self._try(current, [p for p in parts if p is not None], fit_metric, select_metric, base_losses)
                 if plain.lower > 0 and plain.total > _NEARLY * best.total and self._ties(best, plain):
                     rivals.append(plain)
-        return min(rivals, key=lambda j: (len(j.fitted.x), -j.total))
+        return min(rivals, key=lambda j: (len(j.fitted.x), -len(self._new(j, current)[0].where), -j.total))
 
     def _try(self, current: Fit, picks: Sequence[Screened], fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
         """Refit screened candidates with everything fitted so far, from where the screening points or from where we are."""

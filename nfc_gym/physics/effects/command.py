@@ -244,7 +244,8 @@ class SupplySag(_OnCommand):
         # The reference only names the voltage at which nothing changes: free, it would be a gain under another name.
         change = {"probes": (volts,), "low": volts * (1 - 1e-3), "high": volts * (1 + 1e-3)}
         out: list[Effect] = []
-        for where in actuator_places(model, names):
+        # One battery feeds all the drives; a drive with a battery of its own would have a signal of its own.
+        for where in [tuple(names)] if names else []:
             effect = cls(where, sized(cls.PARAMS, reference=change))
             effect.signal = signal
             out.append(effect)

@@ -105,8 +105,9 @@ class SensorBias(_OnChannel):
             params = cls.PARAMS if at.dim == 1 else cls.ON_VECTOR
             size = {
                 "probes": (0.1 * spread + noise,),
-                "low": -5 * spread,
-                "high": 5 * spread,
+                # a bias larger than all that was ever measured would have been seen on the bench
+                "low": -spread,
+                "high": spread,
                 "resolution": 2e-3 * spread,
             }
             size["unit"] = _UNITS.get(at.quantity.split("@")[0], "1")
@@ -198,7 +199,7 @@ class Misalignment(_OnChannel):
 
     family = "misalignment"
     summary = "Sensor mounted at an angle"
-    PARAMS = tuple(Param(axis, "rad", -1.6, 1.6, probes=(0.03,), resolution=5e-4) for axis in "xyz")
+    PARAMS = tuple(Param(axis, "rad", -0.3, 0.3, probes=(0.03,), resolution=5e-4) for axis in "xyz")
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
         if channel != self.where[0]:
