@@ -134,7 +134,9 @@ class Pilot:
         turn = (self.heading[i] - yaw + np.pi) % (2 * np.pi) - np.pi
         torque = np.array([0.8, 0.8, 0.08]) * [tilt[0], tilt[1], turn] - np.array([0.12, 0.12, 0.06]) * qvel[3:6]
         lift = max(force @ frame[:, 2], 2.0)
-        mix = lift / 4 + torque[0] * _Y / (4 * _AT**2) - torque[1] * _X / (4 * _AT**2) + torque[2] * _SPIN / (4 * _YAW**2)
+        mix = (
+            lift / 4 + torque[0] * _Y / (4 * _AT**2) - torque[1] * _X / (4 * _AT**2) + torque[2] * _SPIN / (4 * _YAW**2)
+        )
         return np.clip(mix + self.dither[i], 0.1, _MAX)
 
 
@@ -163,7 +165,8 @@ def fly(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
             hidden.push(data)
             mujoco.mj_step(model, data)
     angles = {
-        f"{r}_{axis}": qpos[:, model.joint(f"{r}_mount_{axis}").qposadr[0]] + NOISE["mount"] * rng.normal(size=len(time))
+        f"{r}_{axis}": qpos[:, model.joint(f"{r}_mount_{axis}").qposadr[0]]
+        + NOISE["mount"] * rng.normal(size=len(time))
         for r in ROTORS
         for axis in "xy"
     }

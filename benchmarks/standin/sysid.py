@@ -17,7 +17,9 @@ from nfc_gym.physics.parameters import Parameter
 _WRITE: dict[str, Callable[[mujoco.MjSpec, str, float], None]] = {}
 
 
-def _writes(name: str) -> Callable[[Callable[[mujoco.MjSpec, str, float], None]], Callable[[mujoco.MjSpec, str, float], None]]:
+def _writes(
+    name: str,
+) -> Callable[[Callable[[mujoco.MjSpec, str, float], None]], Callable[[mujoco.MjSpec, str, float], None]]:
     def register(function: Callable[[mujoco.MjSpec, str, float], None]) -> Callable[[mujoco.MjSpec, str, float], None]:
         _WRITE[name] = function
         return function
@@ -77,10 +79,20 @@ def identify(bench: Bench, logs: Sequence[Log], iterations: int = 20) -> Array:
                 _WRITE[p.field](spec, name, float(value))
     starts, controls, measured = _pieces(bench, logs)
     sequences = sysid.ModelSequences(
-        "machine", spec, [f"piece {i}" for i in range(len(starts))], starts, controls, measured, allow_missing_sensors=True
+        "machine",
+        spec,
+        [f"piece {i}" for i in range(len(starts))],
+        starts,
+        controls,
+        measured,
+        allow_missing_sensors=True,
     )
     wanted = sysid.ParameterDict(
-        {p.name: _parameter(p, float(n)) for p, n in zip(space.parameters, space.nominal, strict=True) if not p.anchored}
+        {
+            p.name: _parameter(p, float(n))
+            for p, n in zip(space.parameters, space.nominal, strict=True)
+            if not p.anchored
+        }
     )
     residual = sysid.build_residual_fn(models_sequences=[sequences])
     with contextlib.redirect_stdout(io.StringIO()):  # the optimizer prints each iteration, whatever `verbose` says
@@ -97,13 +109,17 @@ def _pieces(bench: Bench, logs: Sequence[Log]) -> tuple[list[Array], list[sysid.
     for log in logs:
         states = bench.states[log.name]
         sent = np.stack([log.controls[f"ctrl:{model.actuator(a).name}"] for a in range(model.nu)], 1)
-        channels = [f"body:base:{c}" for c in ("pos", "quat", "linvel", "angvel@body")] + [f"joint:{name}:{what}" for name, what in joints]
+        channels = [f"body:base:{c}" for c in ("pos", "quat", "linvel", "angvel@body")] + [
+            f"joint:{name}:{what}" for name, what in joints
+        ]
         seen = np.concatenate([log.channels[c].values.reshape(len(log), -1) for c in channels], 1)
         act = _filtered(model, sent, log.interval)
         length = round(bench.dataset.mapping.segments.length / log.interval)
         for s in range(0, len(log) - length, length):
             part, clock = slice(s, s + length + 1), np.arange(length + 1) * log.interval
-            starts.append(sysid.create_initial_state(model, states.qpos[s], states.qvel[s], act[s] if model.na else None))
+            starts.append(
+                sysid.create_initial_state(model, states.qpos[s], states.qvel[s], act[s] if model.na else None)
+            )
             controls.append(sysid.TimeSeries.from_control_names(clock, sent[part], model))
             measured.append(sysid.TimeSeries.from_names(clock, seen[part], model, names))
     return starts, controls, measured

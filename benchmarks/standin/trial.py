@@ -93,7 +93,9 @@ def _write_mapping(folder: Path, kit: Robot, psi: dict[str, float], only: Sequen
     (folder / "mapping.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False))
 
 
-def sized(kit: Robot, psi: dict[str, float], family: str, place: int, wanted: float, folder: Path) -> tuple[Hidden, float]:
+def sized(
+    kit: Robot, psi: dict[str, float], family: str, place: int, wanted: float, folder: Path
+) -> tuple[Hidden, float]:
     """The effect at a size that makes X / X_null about `wanted`, and the ratio reached (the range of sizes is limited)."""
     kind = kit.kinds[family]
     floor = _chi2(kit, psi, Hidden(), folder)

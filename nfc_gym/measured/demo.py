@@ -43,12 +43,18 @@ def demo(out: Path, *, seed: int = 0, console: Console | None = None, draw: int 
     console.print(
         "[bold]This machine is simulated.[/bold] It stands in for a real Jackal: separate code, another time step, parameters off by up to 15 %, noisy sensors."
     )
-    console.print(f"One hidden effect was drawn just now and written to {out / 'envelope.json'} before the loop starts.")
-    console.print("The loop reads mapping.yaml and logs/ only. So that you can check that the envelope stays as it is, its SHA-256 now:")
+    console.print(
+        f"One hidden effect was drawn just now and written to {out / 'envelope.json'} before the loop starts."
+    )
+    console.print(
+        "The loop reads mapping.yaml and logs/ only. So that you can check that the envelope stays as it is, its SHA-256 now:"
+    )
     console.print(f"  {envelope}", highlight=False)
     report = close_loop(out / "mapping.yaml", out / "report", seed=seed, console=console)
     if digest(out / "envelope.json") != envelope:
-        raise InputError(f"{out / 'envelope.json'} was changed while the loop ran: this demo proves nothing, start over")
+        raise InputError(
+            f"{out / 'envelope.json'} was changed while the loop ran: this demo proves nothing, start over"
+        )
     content = json.loads((out / "envelope.json").read_text())
     outcome = judge(report, content["family"], content["where"])
     _show(console, content, report, outcome, out)
@@ -143,11 +149,55 @@ def jackal_mapping(weighed: float) -> str:
         "version": 1,
         "model": "jackal",
         "parameters": [
-            {"name": "base_mass", "field": "body_mass", "of": ["base"], "unit": "kg", "nominal": round(weighed, 3), "low": 12.0, "high": 35.0, "anchored": True, "reason": "weighed"},
-            {"name": "wheel_servo", "field": "servo_kv", "of": wheels, "tied": True, "unit": "N m s/rad", "low": 0.5, "high": 10.0},
-            {"name": "wheel_friction", "field": "geom_friction[0]", "of": joints, "tied": True, "unit": "1", "low": 0.1, "high": 1.5},
-            {"name": "wheel_damping", "field": "dof_damping", "of": joints, "tied": True, "unit": "N m s/rad", "low": 0.0, "high": 0.1},
-            {"name": "wheel_armature", "field": "dof_armature", "of": joints, "tied": True, "unit": "kg m^2", "nominal": 0.05, "low": 0.02, "high": 0.1, "reason": "rotor inertia times the gear ratio squared, data sheet"},
+            {
+                "name": "base_mass",
+                "field": "body_mass",
+                "of": ["base"],
+                "unit": "kg",
+                "nominal": round(weighed, 3),
+                "low": 12.0,
+                "high": 35.0,
+                "anchored": True,
+                "reason": "weighed",
+            },
+            {
+                "name": "wheel_servo",
+                "field": "servo_kv",
+                "of": wheels,
+                "tied": True,
+                "unit": "N m s/rad",
+                "low": 0.5,
+                "high": 10.0,
+            },
+            {
+                "name": "wheel_friction",
+                "field": "geom_friction[0]",
+                "of": joints,
+                "tied": True,
+                "unit": "1",
+                "low": 0.1,
+                "high": 1.5,
+            },
+            {
+                "name": "wheel_damping",
+                "field": "dof_damping",
+                "of": joints,
+                "tied": True,
+                "unit": "N m s/rad",
+                "low": 0.0,
+                "high": 0.1,
+            },
+            {
+                "name": "wheel_armature",
+                "field": "dof_armature",
+                "of": joints,
+                "tied": True,
+                "unit": "kg m^2",
+                "nominal": 0.05,
+                "low": 0.02,
+                "high": 0.1,
+                "reason": "rotor inertia times the gear ratio squared, data sheet",
+            },
         ],
         "logs": [{"path": "logs/*.csv"}],
         "time": {"column": "time", "unit": "s"},
@@ -163,14 +213,26 @@ def _show(console: Console, content: Mapping[str, Any], report: Mapping[str, Any
     claims = report["effects"]
     table = Table("", "sealed in the envelope", "what the loop says", title="The envelope is opened", show_lines=True)
     table.add_row("effect", content["hidden"], "; ".join(e["sentence"] for e in claims) or "no effect claimed")
-    table.add_row("family: place", f"{content['family']}: {'+'.join(content['where'])}", "\n".join([e["id"], *(f"or {q}" for q in e["equivalents"])]) if (e := claims[0] if claims else None) else "-")
+    table.add_row(
+        "family: place",
+        f"{content['family']}: {'+'.join(content['where'])}",
+        "\n".join([e["id"], *(f"or {q}" for q in e["equivalents"])]) if (e := claims[0] if claims else None) else "-",
+    )
     for name, true in content["parameters"].items():
         found = claims[0]["parameters"].get(name) if claims else None
-        table.add_row(name, f"{true:.4g}", f"{found['value']:.4g} ({found['low']:.4g} to {found['high']:.4g}) {found['unit']}" if found else "-")
+        table.add_row(
+            name,
+            f"{true:.4g}",
+            f"{found['value']:.4g} ({found['low']:.4g} to {found['high']:.4g}) {found['unit']}" if found else "-",
+        )
     for group, row in report["error"]["groups"].items():
         before, after, floor = (row[s][-1] for s in ("calibrated", "extended", "noise_floor"))
         horizon = report["error"]["horizons_s"][-1]
-        table.add_row(f"{group} error", f"after {horizon:g} s, on logs nobody fitted to", f"{before:.3g} -> {after:.3g} {row['unit']} (noise floor {floor:.3g})")
+        table.add_row(
+            f"{group} error",
+            f"after {horizon:g} s, on logs nobody fitted to",
+            f"{before:.3g} -> {after:.3g} {row['unit']} (noise floor {floor:.3g})",
+        )
     table.add_row("verdict", "", report["verdict"])
     console.print(table)
     words = {
@@ -179,4 +241,6 @@ def _show(console: Console, content: Mapping[str, Any], report: Mapping[str, Any
         "missed": "[bold yellow]Missed:[/bold yellow] the loop claims nothing, though something was hidden.",
     }
     console.print(words[outcome])
-    console.print(f"The report: {out / 'report' / 'report.html'}. The machine was simulated; on yours: nfc-gym close-loop MAPPING.yaml --out DIR")
+    console.print(
+        f"The report: {out / 'report' / 'report.html'}. The machine was simulated; on yours: nfc-gym close-loop MAPPING.yaml --out DIR"
+    )

@@ -17,7 +17,13 @@ Array = NDArray[np.float64]
 STEP = 0.002  # s; the assets' own step is 0.005
 SAMPLE = 0.01  # s between samples, and between commands
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-JACKAL_NOISE = {"pos": 0.0005, "quat": 0.0005, "linvel": 0.01, "angvel": 0.01, "wheel": 0.05}  # m, rad, m/s, rad/s, rad/s
+JACKAL_NOISE = {
+    "pos": 0.0005,
+    "quat": 0.0005,
+    "linvel": 0.01,
+    "angvel": 0.01,
+    "wheel": 0.05,
+}  # m, rad, m/s, rad/s, rad/s
 _RADIUS, _TRACK = 0.098, 0.37559  # m, of the Jackal's data sheet
 
 
@@ -32,7 +38,9 @@ class Hidden:
 
     family = "none"
 
-    def __init__(self, where: tuple[str, ...] = (), parameters: Mapping[str, float] | None = None, text: str = "nothing") -> None:
+    def __init__(
+        self, where: tuple[str, ...] = (), parameters: Mapping[str, float] | None = None, text: str = "nothing"
+    ) -> None:
         self.where, self.parameters, self.text = where, dict(parameters or {}), text
 
     def shape(self, spec: mujoco.MjSpec) -> None:
@@ -145,7 +153,11 @@ class Slope(Hidden):
         roll, pitch = self.parameters["roll"], self.parameters["pitch"]
         lean = np.hypot(roll, pitch)
         if lean > 0:
-            spec.option.gravity = [-9.81 * np.sin(lean) * pitch / lean, 9.81 * np.sin(lean) * roll / lean, -9.81 * np.cos(lean)]
+            spec.option.gravity = [
+                -9.81 * np.sin(lean) * pitch / lean,
+                9.81 * np.sin(lean) * roll / lean,
+                -9.81 * np.cos(lean),
+            ]
 
 
 @dataclass(frozen=True)
@@ -226,7 +238,8 @@ def build_jackal(machine: Machine) -> mujoco.MjModel:
 def excitation(rng: np.random.Generator, time: Array, size: float) -> Array:
     """A rich signal (T,) within about +- size: three sines between 0.15 and 2 Hz, and steps of 0.5 to 1.5 s."""
     sines = sum(
-        np.sin(2 * np.pi * f * time + p) for f, p in zip(rng.uniform(0.15, 2.0, 3), rng.uniform(0, 2 * np.pi, 3), strict=True)
+        np.sin(2 * np.pi * f * time + p)
+        for f, p in zip(rng.uniform(0.15, 2.0, 3), rng.uniform(0, 2 * np.pi, 3), strict=True)
     )
     edges = np.cumsum(rng.uniform(0.5, 1.5, int(time[-1] / 0.5) + 2))
     steps = rng.uniform(-1, 1, len(edges) + 1)[np.searchsorted(edges, time)]
@@ -266,7 +279,12 @@ def drive_jackal(machine: Machine, seconds: float, seed: int) -> dict[str, Array
 
 
 def run(
-    model: mujoco.MjModel, data: mujoco.MjData, hidden: Hidden, command: Callable[[int], Array], samples: int, settle: float = 1.0
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    hidden: Hidden,
+    command: Callable[[int], Array],
+    samples: int,
+    settle: float = 1.0,
 ) -> tuple[Array, Array]:
     """Step on, sampling the true state before each new command; the first second, at the first command's rest, is not logged."""
     each = round(SAMPLE / STEP)
