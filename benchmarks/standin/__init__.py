@@ -1,1 +1,1 @@
-"""Stand-in machines: plain `mj_step` loops that share only the MJCF with the package (the Jackal's ships in the package)."""
+"""Stand-in machines: plain `mj_step` loops that share only the MJCF with the package; the Jackal's ships in it."""

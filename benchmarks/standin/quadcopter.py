@@ -4,19 +4,8 @@ import mujoco
 import numpy as np
 
 from nfc_gym import assets
-from nfc_gym.measured.standin import (
-    SAMPLE,
-    STEP,
-    Array,
-    Delay,
-    Hidden,
-    Kind,
-    Loss,
-    Machine,
-    Payload,
-    body_columns,
-    excitation,
-)
+from nfc_gym.measured.hidden import STEP, Array, Delay, Hidden, Kind, Loss, Payload
+from nfc_gym.measured.standin import SAMPLE, Machine, body_columns, excitation
 
 ROTORS = ("front_left", "front_right", "rear_left", "rear_right")
 NOISE = {"pos": 0.0005, "quat": 0.0005, "linvel": 0.01, "angvel": 0.01, "mount": 0.001}  # m, rad, m/s, rad/s, rad
@@ -117,14 +106,14 @@ class Pilot:
     """Position loop over an attitude loop over a mixer, with gains for a 1 kg machine; it knows nothing of psi."""
 
     def __init__(self, rng: np.random.Generator, time: Array) -> None:
-        self.wish = np.stack([excitation(rng, time, s) for s in (1.2, 1.2, 0.6)], 1) + [0.0, 0.0, 3.0]
+        self.wish = np.stack([excitation(rng, time, s) for s in (1.2, 1.2, 0.6)], 1) + np.array([0.0, 0.0, 3.0])
         self.heading = excitation(rng, time, 0.8)
         self.dither = np.stack([0.08 * excitation(rng, 4 * time, 1.0) for _ in ROTORS], 1)
 
     def fly(self, k: int, qpos: Array, qvel: Array) -> Array:
         """Thrust of each rotor (4,), N, at sample k; before the first the machine is brought to its start."""
         i = max(k, 0)
-        force = np.clip(4.0 * (self.wish[i] - qpos[:3]) - 3.0 * qvel[:3], -5, 5) + [0.0, 0.0, 9.81]
+        force = np.clip(4.0 * (self.wish[i] - qpos[:3]) - 3.0 * qvel[:3], -5, 5) + np.array([0.0, 0.0, 9.81])
         frame = np.zeros(9)
         mujoco.mju_quat2Mat(frame, qpos[3:7])
         frame = frame.reshape(3, 3)

@@ -7,7 +7,8 @@ import yaml
 
 from nfc_gym.measured import standin
 from nfc_gym.measured.demo import body_channels, jackal_mapping
-from nfc_gym.measured.standin import Array, Kind, Machine
+from nfc_gym.measured.hidden import Array, Kind
+from nfc_gym.measured.standin import Machine
 
 from . import quadcopter
 
@@ -32,7 +33,7 @@ class Robot:
 def quadcopter_mapping(weighed: float) -> str:
     """Mapping file of the stand-in's logs: the chassis was weighed; four arms and four mounts of one make.
 
-    The mounts' angle sensors are logged too: arms that start a prediction unbent, or bent by an unknown angle, kick the chassis.
+    The mounts' angle sensors are logged too: arms that start a prediction bent by an unknown angle kick the chassis.
     """
     rotors = list(quadcopter.ROTORS)
     mounts = [f"{r}_mount_{axis}" for r in rotors for axis in "xy"]

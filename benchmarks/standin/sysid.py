@@ -1,4 +1,4 @@
-"""The baseline `mujoco.sysid`: the same psi fitted to the same logs by MuJoCo's own toolbox, with its default residual."""
+"""The baseline `mujoco.sysid`: the same psi fitted to the same logs by MuJoCo's own toolbox, default residual."""
 
 import contextlib
 import io
@@ -11,7 +11,7 @@ from mujoco import sysid
 
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
-from nfc_gym.measured.standin import Array
+from nfc_gym.measured.hidden import Array
 from nfc_gym.physics.parameters import Parameter
 
 _WRITE: dict[str, Callable[[mujoco.MjSpec, str, float], None]] = {}
@@ -69,7 +69,7 @@ def _parameter(p: Parameter, nominal: float) -> sysid.Parameter:
 
 
 def identify(bench: Bench, logs: Sequence[Log], iterations: int = 20) -> Array:
-    """Psi (d,) fitted by `mujoco.sysid` to pieces as long as the loop's segments, each from its measured start state."""
+    """Psi (d,) fitted by `mujoco.sysid` to pieces as long as the loop's segments, each from its measured start."""
     logging.getLogger().setLevel(logging.ERROR)
     space = bench.plant.space
     spec = bench.spec.copy()

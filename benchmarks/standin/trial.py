@@ -1,7 +1,6 @@
-"""One trial: draw a machine, size its effect, write logs, run the loop blind, and compare with the oracle and two baselines."""
+"""One trial: draw a machine, size its effect, write logs, run the loop blind, compare with oracle and baselines."""
 
 import json
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,10 +13,11 @@ from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.demo import judge, write_log
 from nfc_gym.measured.export import unpack
+from nfc_gym.measured.hidden import Array, Hidden
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.standin import Array, Hidden, Machine, draw_psi
+from nfc_gym.measured.standin import Machine, draw_psi
 from nfc_gym.measured.verdict import mean_square
 from nfc_gym.physics.rollout import Plant
 
@@ -44,7 +44,7 @@ class Row:
       false_claims: effects claimed that are not there (an equivalent of a right claim is none).
       errors: error over the oracle's by stage (nominal, psi only, sysid, after), at the longest horizon, geometric mean
         over the groups of quantities.
-      oracle_x: X of the oracle over X_null on the verification logs, about 1 if stand-in and package mean the same effect.
+      oracle_x: X of the oracle over X_null on the verification logs, about 1 if both codes mean the same effect.
     """
 
     robot: str
@@ -96,7 +96,7 @@ def _write_mapping(folder: Path, kit: Robot, psi: dict[str, float], only: Sequen
 def sized(
     kit: Robot, psi: dict[str, float], family: str, place: int, wanted: float, folder: Path
 ) -> tuple[Hidden, float]:
-    """The effect at a size that makes X / X_null about `wanted`, and the ratio reached (the range of sizes is limited)."""
+    """The effect at a size that makes X / X_null about `wanted`, and the ratio reached (sizes have a range)."""
     kind = kit.kinds[family]
     floor = _chi2(kit, psi, Hidden(), folder)
     size = float(np.sqrt(kind.low * kind.high))
@@ -109,7 +109,7 @@ def sized(
             best = (miss, hidden, ratio)
         if miss < 0.1:
             break
-        # The excess grows about as the square of the size; where it does not, a step goes at most to a tenth or tenfold.
+        # The excess grows about as the square of the size; where not, a step goes at most to a tenth or tenfold.
         step = np.sqrt((wanted - 1) / max(ratio - 1, 1e-2))
         size = float(np.clip(size * np.clip(step, 0.1, 10.0), kind.low, kind.high))
     assert best is not None
@@ -133,7 +133,7 @@ def _white(problem: Problem, plant: Plant, x: Array, sigma: Array) -> Array:
 
 
 def _compare(row: Row, folder: Path, report: dict, machine: Machine) -> None:
-    """Errors on the verification logs of all models over the oracle's: true effect and true psi in the package's model."""
+    """Errors on the verification logs of all models over the oracle's: true effect, true psi, the package's model."""
     bench = make_bench(load(folder / "mapping.yaml"), 1)
     logs = {log.name: log for log in bench.dataset.logs}
     fitting = [logs[n] for n in report["logs"]["fit"]]

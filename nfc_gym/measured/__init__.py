@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 from nfc_gym.core import MissingExtra
 
-_NEEDED = ("pandas", "pyarrow", "pydantic", "yaml", "plotly", "jinja2", "cma")
+_NEEDED = ("pandas", "pyarrow", "pydantic", "yaml", "jinja2", "markupsafe")
 _missing = [name for name in _NEEDED if find_spec(name) is None]
 if _missing:
     raise MissingExtra(f"nfc_gym.measured needs {', '.join(_missing)}: pip install 'nfc_gym[measured]'")

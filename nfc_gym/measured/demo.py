@@ -15,6 +15,7 @@ from rich.table import Table
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured import standin
+from nfc_gym.measured.hidden import Array
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.stages import digest, write_whole
 
@@ -26,7 +27,7 @@ def demo(out: Path, *, seed: int = 0, console: Console | None = None, draw: int 
     """Draw a hidden effect, seal it, run the loop on the logs alone, open the envelope and compare.
 
     Args:
-      out: folder for `logs/`, `mapping.yaml`, `envelope.json` and `report/`; new, empty, or left by a demo that did not finish.
+      out: folder for `logs/`, `mapping.yaml`, `envelope.json` and `report/`; new, empty, or left by an unfinished demo.
       seed: of the loop; it does not choose the effect.
       console: where progress and the outcome go; None is silent.
       draw: fixes the drawing of machine, effect and noise, to repeat a demo (`draw` in its envelope); None draws anew.
@@ -41,13 +42,15 @@ def demo(out: Path, *, seed: int = 0, console: Console | None = None, draw: int 
     _clear(out)
     envelope = _seal(out, secrets.randbits(32) if draw is None else draw)
     console.print(
-        "[bold]This machine is simulated.[/bold] It stands in for a real Jackal: separate code, another time step, parameters off by up to 15 %, noisy sensors."
+        "[bold]This machine is simulated.[/bold] It stands in for a real Jackal: separate code, another time step, "
+        "parameters off by up to 15 %, noisy sensors."
     )
     console.print(
         f"One hidden effect was drawn just now and written to {out / 'envelope.json'} before the loop starts."
     )
     console.print(
-        "The loop reads mapping.yaml and logs/ only. So that you can check that the envelope stays as it is, its SHA-256 now:"
+        "The loop reads mapping.yaml and logs/ only. So that you can check that the envelope stays as it is, "
+        "its SHA-256 now:"
     )
     console.print(f"  {envelope}", highlight=False)
     report = close_loop(out / "mapping.yaml", out / "report", seed=seed, console=console)
@@ -64,8 +67,8 @@ def demo(out: Path, *, seed: int = 0, console: Console | None = None, draw: int 
 def judge(report: Mapping[str, Any], family: str, where: list[str] | tuple[str, ...]) -> str:
     """What a report is worth, given what was hidden (family `none` for nothing).
 
-    Returns `right`: the one claim, or the one equivalent reported beside it, has the family and the place; `missed`: no claim,
-    though something was hidden; `wrong`: anything else, a right claim with a second, false one included.
+    Returns `right`: the one claim, or the one equivalent reported beside it, has the family and the place; `missed`: no
+    claim, though something was hidden; `wrong`: anything else, a right claim with a second, false one included.
     """
     claims = report["effects"]
     if not claims:
@@ -121,7 +124,7 @@ def _seal(out: Path, draw: int) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def write_log(path: Path, columns: Mapping[str, standin.Array]) -> None:
+def write_log(path: Path, columns: Mapping[str, Array]) -> None:
     """Columns (T,) each as a CSV file."""
     np.savetxt(path, np.stack(list(columns.values()), 1), "%.9g", ",", header=",".join(columns), comments="")
 
@@ -139,9 +142,10 @@ def body_channels(noise: Mapping[str, float], body: str = "base") -> dict[str, A
 def jackal_mapping(weighed: float) -> str:
     """Mapping file of the stand-in's logs.
 
-    It declares other and fewer parameters than the Jackal's psi.toml. Four wheels of one make share a friction, a servo gain, a
-    bearing drag and a rotor inertia: with a gain for each wheel a lost axle would be a parameter like any other, and no finding. The chassis was
-    weighed, which fixes the scale of all forces; restitution shows only in jumps, of which there are none.
+    It declares other and fewer parameters than the Jackal's psi.toml. Four wheels of one make share a friction, a servo
+    gain, a bearing drag and a rotor inertia: with a gain for each wheel a lost axle would be a parameter like any other,
+    and no finding. The chassis was weighed, which fixes the scale of all forces; restitution shows only in jumps, of
+    which there are none.
     """
     noise, wheels = standin.JACKAL_NOISE, list(standin.WHEELS)
     joints = [f"{w}_wheel" for w in wheels]
@@ -242,5 +246,6 @@ def _show(console: Console, content: Mapping[str, Any], report: Mapping[str, Any
     }
     console.print(words[outcome])
     console.print(
-        f"The report: {out / 'report' / 'report.html'}. The machine was simulated; on yours: nfc-gym close-loop MAPPING.yaml --out DIR"
+        f"The report: {out / 'report' / 'report.html'}. The machine was simulated; on yours: "
+        "nfc-gym close-loop MAPPING.yaml --out DIR"
     )

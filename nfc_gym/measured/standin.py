@@ -9,12 +9,10 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from nfc_gym import assets
+from nfc_gym.measured.hidden import STEP, Array, Coulomb, Delay, Hidden, Kind, Lag, Loss, Payload, Slope
 
-Array = NDArray[np.float64]
-STEP = 0.002  # s; the assets' own step is 0.005
 SAMPLE = 0.01  # s between samples, and between commands
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 JACKAL_NOISE = {
@@ -25,149 +23,6 @@ JACKAL_NOISE = {
     "wheel": 0.05,
 }  # m, rad, m/s, rad/s, rad/s
 _RADIUS, _TRACK = 0.098, 0.37559  # m, of the Jackal's data sheet
-
-
-class Hidden:
-    """One hidden effect; the base class hides nothing.
-
-    Attributes:
-      family, where: what a right answer names.
-      parameters: true values, by the names that reports use.
-      text: what is hidden, in words with units.
-    """
-
-    family = "none"
-
-    def __init__(
-        self, where: tuple[str, ...] = (), parameters: Mapping[str, float] | None = None, text: str = "nothing"
-    ) -> None:
-        self.where, self.parameters, self.text = where, dict(parameters or {}), text
-
-    def shape(self, spec: mujoco.MjSpec) -> None:
-        """Change the machine before it is built."""
-
-    def begin(self, model: mujoco.MjModel) -> None:
-        """Get ready for a run from the start."""
-
-    def command(self, u: Array) -> Array:
-        """What the actuators receive in this step of what was commanded, (nu,)."""
-        return u
-
-    def push(self, data: mujoco.MjData) -> None:
-        """Add forces to `qfrc_applied` and `xfrc_applied`, both zero before."""
-
-
-class Loss(Hidden):
-    """One actuator makes only a share of its force."""
-
-    family = "loss"
-
-    def __init__(self, actuator: str, fraction: float) -> None:
-        super().__init__((actuator,), {"fraction": fraction}, f"{actuator} has lost {fraction:.1%} of its force")
-
-    def shape(self, spec: mujoco.MjSpec) -> None:
-        actuator, left = spec.actuator(self.where[0]), 1 - self.parameters["fraction"]
-        actuator.gainprm = [left * g for g in actuator.gainprm]
-        actuator.biasprm = [left * b for b in actuator.biasprm]
-        actuator.forcerange = [left * f for f in actuator.forcerange]
-
-
-class Payload(Hidden):
-    """A lump bolted onto a body, as a body of its own."""
-
-    family = "payload"
-
-    def __init__(self, body: str, mass: float, at: Array) -> None:
-        values = {"mass": mass, **dict(zip("xyz", map(float, at), strict=True))}
-        place = ", ".join(f"{a:.3f}" for a in at)
-        super().__init__((body,), values, f"{mass:.3g} kg rides on {body} at ({place}) m")
-        self.at = at
-
-    def shape(self, spec: mujoco.MjSpec) -> None:
-        lump = spec.body(self.where[0]).add_body(name="lump", pos=self.at)
-        lump.explicitinertial = True
-        lump.ipos = [0.0, 0.0, 0.0]  # unset, MuJoCo takes the body's own place for it once more
-        lump.mass, lump.inertia = self.parameters["mass"], np.full(3, 1e-8)
-
-
-class Delay(Hidden):
-    """Commands arrive late by a fixed time; between two steps a mixture of both."""
-
-    family = "delay"
-
-    def __init__(self, actuators: tuple[str, ...], delay: float) -> None:
-        super().__init__(actuators, {"delay": delay}, f"commands arrive {1e3 * delay:.1f} ms late")
-
-    def begin(self, model: mujoco.MjModel) -> None:
-        self.past: list[Array] = []
-
-    def command(self, u: Array) -> Array:
-        self.past.append(u)
-        whole, part = divmod(self.parameters["delay"] / STEP, 1.0)
-        newest = len(self.past) - 1 - int(whole)
-        return (1 - part) * self.past[max(newest, 0)] + part * self.past[max(newest - 1, 0)]
-
-
-class Lag(Hidden):
-    """Commands are followed at a rate that is the gap over a time constant."""
-
-    family = "lag"
-
-    def __init__(self, actuators: tuple[str, ...], tau: float) -> None:
-        super().__init__(actuators, {"time_constant": tau}, f"commands are followed with a lag of {1e3 * tau:.1f} ms")
-
-    def begin(self, model: mujoco.MjModel) -> None:
-        self.reached: Array | None = None
-
-    def command(self, u: Array) -> Array:
-        before = u if self.reached is None else self.reached
-        self.reached = before + (1 - np.exp(-STEP / self.parameters["time_constant"])) * (u - before)
-        return self.reached
-
-
-class Coulomb(Hidden):
-    """A joint drags with a constant torque, passing through zero within about 0.1 rad/s."""
-
-    family = "coulomb"
-
-    def __init__(self, joint: str, level: float) -> None:
-        super().__init__((joint,), {"level": level}, f"{joint} drags with {level:.3g} N m of dry friction")
-
-    def begin(self, model: mujoco.MjModel) -> None:
-        self.dof = int(model.joint(self.where[0]).dofadr[0])
-
-    def push(self, data: mujoco.MjData) -> None:
-        data.qfrc_applied[self.dof] -= self.parameters["level"] * np.tanh(data.qvel[self.dof] / 0.1)
-
-
-class Slope(Hidden):
-    """The floor leans: its normal is the model's z, and gravity is not along it."""
-
-    family = "slope"
-
-    def __init__(self, roll: float, pitch: float) -> None:
-        lean = np.degrees(np.hypot(roll, pitch))
-        super().__init__(("world",), {"roll": roll, "pitch": pitch}, f"the floor leans by {lean:.2f} degrees")
-
-    def shape(self, spec: mujoco.MjSpec) -> None:
-        roll, pitch = self.parameters["roll"], self.parameters["pitch"]
-        lean = np.hypot(roll, pitch)
-        if lean > 0:
-            spec.option.gravity = [
-                -9.81 * np.sin(lean) * pitch / lean,
-                9.81 * np.sin(lean) * roll / lean,
-                -9.81 * np.cos(lean),
-            ]
-
-
-@dataclass(frozen=True)
-class Kind:
-    """An effect that may be drawn: from a generator and a size to a `Hidden`; sizes lie between low and high."""
-
-    make: Callable[[np.random.Generator, float], Hidden]
-    low: float
-    high: float
-    unit: str
 
 
 def _deck(rng: np.random.Generator, mass: float) -> Payload:
@@ -208,8 +63,8 @@ def draw_psi(nominal: Mapping[str, float], rng: np.random.Generator, spread: flo
     return {name: float(value * (1 + rng.uniform(-spread, spread))) for name, value in nominal.items()}
 
 
-# Nominal values. wheel_armature is not the MJCF's 0.005: with so light a drive behind so stiff a servo the motion depends on
-# the time step (0.1 m/s between 5 ms and 2 ms). A 20 g cm^2 rotor times the square of a gear of 158 is 0.05 kg m^2.
+# Nominal values. wheel_armature is not the MJCF's 0.005: with so light a drive behind so stiff a servo the motion depends
+# on the time step (0.1 m/s between 5 ms and 2 ms). A 20 g cm^2 rotor times the square of a gear of 158 is 0.05 kg m^2.
 JACKAL_PSI = {
     "base_mass": 15.08,
     "wheel_servo": 5.0,
@@ -247,7 +102,7 @@ def excitation(rng: np.random.Generator, time: Array, size: float) -> Array:
 
 
 def ramped(wish: Array) -> Array:
-    """A wheel command (T,) that follows `wish` at no more than 60 rad/s^2 (6 m/s^2), as a rover's own controller sends it."""
+    """A wheel command (T,) that follows `wish` at no more than 60 rad/s^2 (6 m/s^2), as a rover's own limiter does."""
     out, most = np.empty_like(wish), 60.0 * SAMPLE
     last = 0.0
     for k, w in enumerate(wish):
@@ -286,7 +141,7 @@ def run(
     samples: int,
     settle: float = 1.0,
 ) -> tuple[Array, Array]:
-    """Step on, sampling the true state before each new command; the first second, at the first command's rest, is not logged."""
+    """Step on, sampling the true state (T, nq), (T, nv) before each new command; a second at rest before is not logged."""
     each = round(SAMPLE / STEP)
     rest = round(settle / SAMPLE)
     qpos, qvel = np.zeros((samples, model.nq)), np.zeros((samples, model.nv))
