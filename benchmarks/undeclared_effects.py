@@ -1,8 +1,9 @@
 """Does the loop name what a model lacks? Stand-in machines, each with one undeclared effect or none, drawn at run time.
 
-Truth is simulated by separate code at another time step, with psi off by up to 15 % and noisy sensors (`standin/`). Sizes
-are drawn so that X / X_null of the true effect spreads over 1.3 to 30. Every error is over the oracle's: the package's model
-with the true effect and the true psi, at its own time step. Baselines in the same run: psi alone, and `mujoco.sysid`.
+Truth is simulated by separate code at another time step, with psi off by up to 15 % and noisy sensors (`standin/`).
+Sizes are drawn so that X / X_null of the true effect spreads over 1.3 to 30. Every error is over the oracle's: the
+package's model with the true effect and the true psi, at its own time step. Baselines in the same run: psi alone, and
+`mujoco.sysid`.
 
     python benchmarks/undeclared_effects.py --trials 12 --nulls 12 --jobs 2 --json out.json
 """

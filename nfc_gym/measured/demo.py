@@ -19,7 +19,7 @@ from nfc_gym.measured.hidden import Array
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.stages import digest, write_whole
 
-_LOGS, _SECONDS = 8, 5.0
+_LOGS, _SECONDS = 7, 4.0  # 16 s to fit: the whole loop then takes a minute or two on two cores
 _OURS = {"logs", "mapping.yaml", "envelope.json", "report"}
 
 
@@ -38,21 +38,19 @@ def demo(out: Path, *, seed: int = 0, console: Console | None = None, draw: int 
     Raises:
       InputError: the folder holds something else, or a finished demo.
     """
-    console = console or Console(quiet=True)
+    screen = console or Console(quiet=True)
     _clear(out)
     envelope = _seal(out, secrets.randbits(32) if draw is None else draw)
-    console.print(
+    screen.print(
         "[bold]This machine is simulated.[/bold] It stands in for a real Jackal: separate code, another time step, "
         "parameters off by up to 15 %, noisy sensors."
     )
-    console.print(
-        f"One hidden effect was drawn just now and written to {out / 'envelope.json'} before the loop starts."
-    )
-    console.print(
+    screen.print(f"One hidden effect was drawn just now and written to {out / 'envelope.json'} before the loop starts.")
+    screen.print(
         "The loop reads mapping.yaml and logs/ only. So that you can check that the envelope stays as it is, "
         "its SHA-256 now:"
     )
-    console.print(f"  {envelope}", highlight=False)
+    screen.print(f"  {envelope}", highlight=False)
     report = close_loop(out / "mapping.yaml", out / "report", seed=seed, console=console)
     if digest(out / "envelope.json") != envelope:
         raise InputError(
@@ -60,7 +58,7 @@ def demo(out: Path, *, seed: int = 0, console: Console | None = None, draw: int 
         )
     content = json.loads((out / "envelope.json").read_text())
     outcome = judge(report, content["family"], content["where"])
-    _show(console, content, report, outcome, out)
+    _show(screen, content, report, outcome, out)
     return {**content, "outcome": outcome, "report": report}
 
 
@@ -143,9 +141,9 @@ def jackal_mapping(weighed: float) -> str:
     """Mapping file of the stand-in's logs.
 
     It declares other and fewer parameters than the Jackal's psi.toml. Four wheels of one make share a friction, a servo
-    gain, a bearing drag and a rotor inertia: with a gain for each wheel a lost axle would be a parameter like any other,
-    and no finding. The chassis was weighed, which fixes the scale of all forces; restitution shows only in jumps, of
-    which there are none.
+    gain, a bearing drag and a rotor inertia: with a gain for each wheel a lost axle would be a parameter like any
+    other, and no finding. The chassis was weighed, which fixes the scale of all forces; restitution shows only in
+    jumps, of which there are none.
     """
     noise, wheels = standin.JACKAL_NOISE, list(standin.WHEELS)
     joints = [f"{w}_wheel" for w in wheels]

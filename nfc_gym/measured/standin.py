@@ -36,12 +36,12 @@ def _lean(rng: np.random.Generator, angle: float) -> Slope:
 
 
 JACKAL_KINDS: dict[str, Kind] = {
-    "loss": Kind(lambda rng, s: Loss(str(rng.choice(WHEELS)), s), 0.2, 0.9, "1"),
-    "payload": Kind(_deck, 1.0, 6.0, "kg"),
-    "delay": Kind(lambda rng, s: Delay(WHEELS, s), 0.015, 0.08, "s"),
-    "lag": Kind(lambda rng, s: Lag(WHEELS, s), 0.015, 0.08, "s"),
-    "coulomb": Kind(lambda rng, s: Coulomb(f"{rng.choice(WHEELS)}_wheel", s), 0.3, 2.0, "N m"),
-    "slope": Kind(_lean, 0.01, 0.08, "rad"),
+    "loss": Kind(lambda rng, s: Loss(str(rng.choice(WHEELS)), s), 0.3, 0.9, "1"),
+    "payload": Kind(_deck, 1.5, 6.0, "kg"),
+    "delay": Kind(lambda rng, s: Delay(WHEELS, s), 0.02, 0.08, "s"),
+    "lag": Kind(lambda rng, s: Lag(WHEELS, s), 0.02, 0.08, "s"),
+    "coulomb": Kind(lambda rng, s: Coulomb(f"{rng.choice(WHEELS)}_wheel", s), 0.8, 3.0, "N m"),
+    "slope": Kind(_lean, 0.02, 0.08, "rad"),
 }
 
 
@@ -63,8 +63,8 @@ def draw_psi(nominal: Mapping[str, float], rng: np.random.Generator, spread: flo
     return {name: float(value * (1 + rng.uniform(-spread, spread))) for name, value in nominal.items()}
 
 
-# Nominal values. wheel_armature is not the MJCF's 0.005: with so light a drive behind so stiff a servo the motion depends
-# on the time step (0.1 m/s between 5 ms and 2 ms). A 20 g cm^2 rotor times the square of a gear of 158 is 0.05 kg m^2.
+# Nominal values. wheel_armature is not the MJCF's 0.005: with so light a drive behind so stiff a servo the motion
+# depends on the step (0.1 m/s between 5 ms and 0.5 ms). 20 g cm^2 times the square of a gear of 158 is 0.05 kg m^2.
 JACKAL_PSI = {
     "base_mass": 15.08,
     "wheel_servo": 5.0,
@@ -141,7 +141,7 @@ def run(
     samples: int,
     settle: float = 1.0,
 ) -> tuple[Array, Array]:
-    """Step on, sampling the true state (T, nq), (T, nv) before each new command; a second at rest before is not logged."""
+    """True states (T, nq), (T, nv) before each new command; a second at rest comes first and is not logged."""
     each = round(SAMPLE / STEP)
     rest = round(settle / SAMPLE)
     qpos, qvel = np.zeros((samples, model.nq)), np.zeros((samples, model.nv))
