@@ -168,15 +168,9 @@ def summary(rows: Sequence[Row], seed: int) -> list[dict]:
     nulls = [r for r in rows if r.family == "none"]
     if nulls:
         false = sum(r.false_claims > 0 for r in nulls)
-        add(
-            f"false claims in {len(nulls)} nulls",
-            false,
-            "trials",
-            None,
-            f"<= {len(nulls) / 24:.1f}",
-            false <= len(nulls) / 24,
-            nulls,
-        )
+        allowed = math.ceil(len(nulls) / 24)  # one in 24; with fewer nulls one cannot be told from chance
+        name = f"false claims in {len(nulls)} nulls"
+        add(name, false, "trials", None, f"<= {allowed}", false <= allowed, nulls)
     return out
 
 

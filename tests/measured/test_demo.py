@@ -158,3 +158,10 @@ def test_loss_takes_its_share_of_the_torque() -> None:
         return float(data.actuator_force[0])
 
     assert torque(hidden.Loss("front_left", 0.3)) == pytest.approx(0.7 * torque(hidden.Hidden()))
+
+
+@pytest.mark.parametrize("module_file", [standin.__file__, hidden.__file__])
+def test_the_stand_in_shares_no_physics_with_the_package(module_file: str) -> None:
+    assert "nfc_gym.physics" not in "".join(
+        line for line in Path(module_file).read_text().splitlines(True) if "import" in line
+    )
