@@ -75,7 +75,12 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array) -> tuple[str, list[Ef
     fields.commit()
     spec.copy_back(model)
     outside = [e for e, theta in pairs if not _carried(e, theta, spec)]
-    spec.compile()
+    try:
+        spec.compile()
+    except ValueError:
+        # Motion about one axis does not show the other two: let MuJoCo make such an inertia physical.
+        spec.compiler.balanceinertia = 1
+        spec.compile()
     return spec.to_xml(), outside
 
 

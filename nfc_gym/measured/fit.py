@@ -45,7 +45,7 @@ def box(plant: Plant) -> Box:
 
 def jacobian(problem: Problem, metric: Metric, plant: Plant, x: Array, base: Array, which: NDArray[np.intp], limits: Box) -> Array:
     """(S, m, len(which)) derivative of the whitened residual by scaled parameters, forward differences, one batch."""
-    step = 2e-3 * limits.scale[which]
+    step = 2e-4 * limits.scale[which]
     step = np.where(x[which] + step > limits.high[which], -step, step)
     rows = np.repeat(x[None], len(which), 0)
     rows[np.arange(len(which)), which] += step

@@ -25,7 +25,7 @@ from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import metric, unexplained_variance
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.report import render
+from nfc_gym.measured.report import render, render_summary
 from nfc_gym.measured.search import Data, Found, Options, Search
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole
@@ -76,13 +76,16 @@ def close_loop(
     Raises:
       InputError: the mapping, the model or the logs cannot be used; nothing is written then.
     """
+    # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
+    mujoco.set_mju_user_warning(lambda message: None)
     dataset = require(mapping)[0]
     bench = make_bench(dataset, jobs)
     key = digest(mapping, model_path(dataset.mapping.model_file, dataset.folder), *dataset.files, extra=f"{seed} {version('nfc_gym')}")
     folds = [dataset.fold(fold)] if fold is not None else list(dataset.folds)
     if len(dataset.folds) == 1:
         return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)
-    Stages(out, key, overwrite, resume)
+    if fold is None:  # single folds may be running side by side
+        Stages(out, key, overwrite, resume)
     reports = {}
     for f in folds:
         if console:
@@ -95,6 +98,7 @@ def close_loop(
     if fold is not None:  # other folds may be running beside this one; the summary is the whole run's
         return reports[fold]
     summary = _summary(dataset, reports)
+    write_whole(out / "report.html", render_summary(summary))
     write_whole(out / "report.json", json.dumps(summary, indent=1))
     return summary
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.contest import Judged, clusters, judge, losses, not_worse, shortlist
+from nfc_gym.measured.contest import Judged, clusters, fold_of, judge, losses, not_worse, shortlist
 from nfc_gym.measured.fit import Fit, box, fit
 from nfc_gym.measured.metric import Metric, loss, metric, unexplained_variance
 from nfc_gym.measured.problem import Problem
@@ -21,7 +21,8 @@ from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 Say = Callable[[str], None]
-_NEARLY = 0.9  # share of the best candidate's gain that a simpler law must reach to be preferred
+_NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
+_SHARED = 0.8  # the same for the same law at a wider place
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
 _CHORD = 10  # free parameters beyond which a candidate's refit reuses psi's Jacobian
 
@@ -95,6 +96,7 @@ class Search:
         self.options, self.say = options, say
         self.rng = np.random.default_rng(options.seed)
         self.fit_blocks, self.select_blocks = clusters(fit_data.problem), clusters(select.problem)
+        self.folds = fold_of(fit_data.problem)
 
     def metrics(self, current: Fit) -> tuple[Metric, Metric]:
         """Common metrics of a round, with what the current model leaves unexplained as extra variance."""
@@ -159,8 +161,8 @@ class Search:
         effect = self._new(generic, current)[0]
         plant = base.plant.with_effects([effect])
         alone = fit(self.fit_data.problem, fit_metric, plant, np.concatenate([base.x, effect.null]), 10)
-        rival = judge(alone, base, self.select.problem, select_metric, base_losses, self.rng)
-        named = judge(current, base, self.select.problem, select_metric, base_losses, self.rng)
+        rival = self._judge(alone, base, select_metric, base_losses)
+        named = self._judge(current, base, select_metric, base_losses)
         return rival.total > 1.25 * named.total and not not_worse(rival, named, self.fit_blocks, self.select_blocks, self.rng)
 
     def _round(
@@ -188,10 +190,16 @@ class Search:
         outcome.accepted = [e.id for e in self._new(best, current)]
         outcome.share = best.gain / max(float(base_losses.sum()), 1e-9)
         outcome.equivalents = [
-            self._label(j, current) for j in judged if self._label(j, current) not in outcome.accepted and j.gain > 0 and self._ties(believed[0], j)
+            self._label(j, current) for j in judged if self._label(j, current) not in outcome.accepted and j.total > _NEARLY * best.total and self._ties(believed[0], j)
         ]
         self.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best
+
+    def _enough(self, j: Judged, best: Judged, current: Fit) -> float:
+        """Share of the best gain that a rival must reach: less for the best one's own law at a place that includes its place."""
+        rival, winner = self._new(j, current)[0], self._new(best, current)[0]
+        wider = rival.family == winner.family and set(winner.where) < set(rival.where)
+        return _SHARED if wider else _NEARLY
 
     def _ties(self, best: Judged, other: Judged) -> bool:
         return not_worse(best, other, self.fit_blocks, self.select_blocks, self.rng)
@@ -205,7 +213,7 @@ class Search:
         is likelier than the same cause in just one of them, unless the data tell them apart.
         """
         best = believed[0]
-        rivals = [j for j in believed if j.total > _NEARLY * best.total and self._ties(best, j)]
+        rivals = [j for j in believed if j.total > self._enough(j, best, current) * best.total and self._ties(best, j)]
         by_id = {s.effect.id: s for s in screened}
         effect = self._new(best, current)[0]
         for families in effect.simpler if not isinstance(effect, Each) else ():
@@ -229,7 +237,7 @@ class Search:
         # With few parameters a full Jacobian costs little; with many, psi keeps the one that it has (the chord method).
         known = current.jacobian if int(limits.free.sum()) > _CHORD else None
         fitted = fit(self.fit_data.problem, fit_metric, plant, start, 10, known=known)
-        return judge(fitted, current, self.select.problem, select_metric, base_losses, self.rng)
+        return self._judge(fitted, current, select_metric, base_losses)
 
     def _try_split(self, current: Fit, effect: Effect, parts: tuple[Effect, Array], fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
         """The same effect with a value of its own at each place."""
@@ -242,13 +250,16 @@ class Search:
             pieces.append(theta[copies] if e is effect else theta)
         self.say(f"refitting {each.id} with values of its own at each place")
         fitted = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(effects), np.concatenate(pieces), 8)
-        return judge(fitted, current, self.select.problem, select_metric, base_losses, self.rng)
+        return self._judge(fitted, current, select_metric, base_losses)
+
+    def _judge(self, fitted: Fit, base: Fit, under: Metric, base_losses: Array) -> Judged:
+        return judge(fitted, base, self.folds, self.fit_blocks, self.select.problem, under, base_losses, self.rng)
 
     def _believed(self, j: Judged, chance: dict[str, float], current: Fit, base_losses: Array) -> bool:
         """Whether the gain holds on unseen logs, is worth naming, and is more than the luckiest candidate gains by chance."""
-        worth = self.options.worth * float(base_losses.sum())
+        worth = self.options.worth * (float(base_losses.sum()) + float(current.losses.sum()))
         lucky = max((chance.get(e.id, 0.0) for e in self._new(j, current)), default=0.0)
-        return j.lower > 0 and j.gain > worth and float(j.fit_gains.sum()) > lucky
+        return j.lower > 0 and j.gain > 0 and j.total > worth and float(j.fit_gains.sum()) > lucky
 
     @staticmethod
     def _new(j: Judged, current: Fit) -> list[Effect]:
@@ -279,8 +290,8 @@ class Search:
             start = np.concatenate([psi, *(t for e, t in zip(current.plant.effects, thetas, strict=True) if e is not effect)])
             without = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(rest), start, 8)
             base = losses(self.select.problem, select_metric, without)
-            kept = judge(current, without, self.select.problem, select_metric, base, self.rng)
-            if kept.lower <= 0 or kept.gain < self.options.worth * float(base.sum()):
+            kept = self._judge(current, without, select_metric, base)
+            if kept.lower <= 0 or kept.total < self.options.worth * (float(base.sum()) + float(without.losses.sum())):
                 self.say(f"dropped {effect.id}: the others explain what it did")
                 current = without
         return current

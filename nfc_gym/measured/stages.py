@@ -17,7 +17,7 @@ def write_whole(path: Path, text: str) -> None:
     """Write a file so that it is either the old one or the whole new one, never half of it."""
     part = path.with_name(f".{path.name}.part")
     try:
-        with open(part, "w") as handle:
+        with open(part, "w", encoding="utf-8") as handle:
             handle.write(text)
             handle.flush()
             os.fsync(handle.fileno())
