@@ -1,0 +1,112 @@
+"""The six recorded machines: prepare the logs, close the loop on each, predict, score, and print the table with its goals.
+
+    python benchmarks/measured_sets.py --data ../shared [--sets emps ...] [--work DIR] [--jobs N] [--json FILE] [--quick]
+
+The recordings, their splits and their scores are those of `score/recordings.py` in the data folder; everything that is
+particular to a machine is in its folder under `benchmarks/measured/`: the model to start from, and a mapping file. Without
+the data the benchmark says so and ends. `--quick` runs one set (one fold of it) to show that the way through works.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+# set -> (what `nfc-gym predict --mode` is asked for, figure of the start, figure of the reference, goal), by the scorer's figures
+SETS = {
+    "skidsteer_husky": ("rollout", (0.448, 1.383), (0.244, 0.128), (0.235, 0.115)),
+    "bam_xl330": ("rollout", (0.088,), (0.076,), (0.072,)),
+    "emps": ("inverse", (0.704,), (0.0269,), (0.026,)),
+    "dfki_double_pendulum": ("inverse", (0.281,), (0.217,), (0.205,)),
+    "nanobench_crazyflie": ("forward", (0.254,), (0.217,), (0.205,)),
+    "quadruped_go2": ("rollout", (0.0373,), (0.0098,), (0.0085,)),
+}
+# The scorer prints the figures of single groups first; the goals are about the last ones.
+STAGES = ("nominal", "calibrated", "extended")
+
+
+def command(*words: object) -> list[str]:
+    """`nfc-gym ...` with this interpreter."""
+    return [sys.executable, "-c", "from nfc_gym.cli import main; main()", *map(str, words)]
+
+
+def prepare(data: Path, work: Path) -> None:
+    """Write the prepared logs of all sets, and each set's mapping and model beside them."""
+    subprocess.run([sys.executable, data / "score" / "recordings.py", "prepare", work / "prepared"], check=True, stdout=subprocess.DEVNULL)
+    for name in SETS:
+        folder = work / name
+        if folder.exists():
+            shutil.rmtree(folder)
+        shutil.copytree(HERE / "measured" / name, folder)
+        shutil.move(work / "prepared" / name, folder / "logs")
+
+
+def run_set(name: str, data: Path, work: Path, jobs: int, seed: int) -> dict[str, list[float]]:
+    """Close the loop on a set and score each stage's predictions: stage -> the figures that the goals are about."""
+    mapping, out = work / name / "mapping.yaml", work / name / "loop"
+    subprocess.run(command("close-loop", mapping, "--out", out, "--jobs", jobs, "--seed", seed), check=True)
+    figures = {}
+    for stage in STAGES:
+        file = work / name / f"{stage}.npz"
+        subprocess.run(command("predict", mapping, "--fit", out, "--mode", SETS[name][0], "--stage", stage, "--out", file), check=True)
+        text = subprocess.run([sys.executable, data / "score" / "recordings.py", "score", name, file], check=True, capture_output=True, text=True).stdout
+        values = [float(line.rpartition(":")[2]) for line in text.strip().splitlines()]
+        figures[stage] = values[-len(SETS[name][3]) :]
+    return figures
+
+
+def claims(out: Path) -> str:
+    """What the loop claimed."""
+    report = json.loads((out / "report.json").read_text())
+    if "folds" in report:
+        return "; ".join(f"{k} ({v})" for k, v in report["effects_found_in"].items()) or "nothing"
+    return "; ".join(e["id"] for e in report["effects"]) or "nothing"
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=HERE.parents[1] / "shared", help="folder with data/ and score/")
+    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
+    parser.add_argument("--work", type=Path, default=Path("results/measured_sets"))
+    parser.add_argument("--jobs", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--quick", action="store_true", help="one set, as an end-to-end check within minutes")
+    args = parser.parse_args()
+    if not (args.data / "score" / "recordings.py").exists():
+        print(f"measured_sets: skipped, the recordings are not at {args.data} (say --data FOLDER)")
+        return
+    args.work.mkdir(parents=True, exist_ok=True)
+    prepare(args.data, args.work)
+    rows = []
+    for name in ["emps"] if args.quick else args.sets:
+        began = time.monotonic()
+        figures = run_set(name, args.data, args.work, args.jobs, args.seed)
+        seconds = time.monotonic() - began
+        _, start, reference, goals = SETS[name]
+        for i, goal in enumerate(goals):
+            rows.append(
+                {
+                    "name": name, "value": figures["extended"][i], "unit": "scorer's", "baseline": figures["calibrated"][i],
+                    "start": start[i], "reference": reference[i], "goal": goal, "holds": figures["extended"][i] <= goal,
+                    "seeds": [args.seed], "seconds": round(seconds, 1), "claims": claims(args.work / name / "loop"),
+                }
+            )  # fmt: skip
+    print(f"{'set':22} {'start':>8} {'reference':>9} {'psi alone':>9} {'extended':>9} {'goal':>8}  holds  minutes")
+    for r in rows:
+        print(
+            f"{r['name']:22} {r['start']:8.4g} {r['reference']:9.4g} {r['baseline']:9.4g} {r['value']:9.4g} {r['goal']:8.4g}  "
+            f"{'yes' if r['holds'] else 'NO':5}  {r['seconds'] / 60:.1f}"
+        )
+        print(f"    {r['claims']}")
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()
