@@ -64,6 +64,9 @@ def fitted_residual(problem: Problem, fitted: Fit) -> Array:
 def judge(
     fitted: Fit,
     base: Fit,
+    problem: Problem,
+    under: Metric,
+    base_left_out: Array,
     folds: NDArray[np.intp],
     fit_blocks: NDArray[np.intp],
     select: Problem,
@@ -73,7 +76,7 @@ def judge(
 ) -> Judged:
     """Compare a fitted candidate with the model without it, on the selection logs and on fit blocks that were left out."""
     gains = base_losses - losses(select, metric, fitted)
-    fit_gains = left_out_losses(base, folds) - left_out_losses(fitted, folds)
+    fit_gains = base_left_out - left_out_losses(problem, under, fitted, folds)
     extra = len(fitted.x) - len(base.x)
     blocks = clusters(select)
     both = np.concatenate([gains, fit_gains])
@@ -82,11 +85,11 @@ def judge(
     return Judged(fitted, gains, fit_gains, total, float(np.quantile(draws, 0.005)))
 
 
-def left_out_losses(fitted: Fit, folds: NDArray[np.intp]) -> Array:
+def left_out_losses(problem: Problem, under: Metric, fitted: Fit, folds: NDArray[np.intp]) -> Array:
     """(S,) loss of each block when the fold it is in takes no part in the fit: one Gauss-Newton step from the whole fit.
 
     At the optimum the blocks' gradients add up to zero; without fold k they add up to minus its own, and the parameters
-    move by H_-k^{-1} g_k. Leave-one-out by linearisation: no roll-out is needed.
+    move by H_-k^{-1} g_k. The residuals there are rolled out, all folds in one batch.
     """
     jac, white = fitted.jacobian, fitted.white
     if jac.shape[-1] == 0:
@@ -100,13 +103,13 @@ def left_out_losses(fitted: Fit, folds: NDArray[np.intp]) -> Array:
     whole = hessians.sum(0) + pull
     # Damped as in a Levenberg-Marquardt step: where the other folds say nothing, the linear model must not run away.
     ridge = _DAMPING * np.diag(np.diag(whole)) + 1e-12 * np.eye(len(free))
-    room = np.stack([limits.low - fitted.x, limits.high - fitted.x])[:, free] / limits.scale[free]
-    out = np.empty(len(white))
-    for k in np.unique(folds):
+    names = np.unique(folds)
+    x = np.repeat(fitted.x[None], len(names), 0)
+    for row, k in zip(x, names, strict=True):
         of = folds == k
-        step = np.linalg.solve(whole - hessians[of].sum(0) + ridge, gradients[of].sum(0))
-        out[of] = loss(white[of] + jac[of] @ np.clip(step, *room))
-    return out
+        row[free] += np.linalg.solve(whole - hessians[of].sum(0) + ridge, gradients[of].sum(0)) * limits.scale[free]
+    losses = loss(under.whiten(problem.residual(fitted.plant, np.clip(x, limits.low, limits.high))))
+    return losses[np.searchsorted(names, folds), np.arange(len(folds))]
 
 
 def fold_of(problem: Problem, most: int = 8) -> NDArray[np.intp]:

@@ -79,7 +79,7 @@ class InstantProblem(Problem):
     ) -> None:
         self.channels = self.compared(model, logs[0])
         self.smooth = max(logs[0].channels[c].smooth for c in self.channels)
-        self.stride = stride if self.smooth == 1 else min(stride, max(1, self.smooth // 5))
+        self.stride = stride if self.smooth == 1 else min(stride, max(1, self.smooth // 3))
         self.tracks = [track(model, log, s, self.channels, self.stride) for log, s in zip(logs, states, strict=True)]
         self.names = tuple(log.name for log in logs)
         self._layout(model, length)

@@ -132,7 +132,8 @@ def _fold(
     fitting, selecting, verifying = (dataset.of(s, fold) for s in ("fit", "select", "verify"))
     if not verifying:
         raise InputError("no log verifies: give one `split: verify`, or let `split` divide them")
-    whole = bench.problem(fitting)
+    # What was selected is refitted on all logs that do not verify.
+    whole = bench.problem([*fitting, *selecting])
     steps = bench.dataset.mapping.segments.length / bench.plant.model.opt.timestep
     work = bench.problem(fitting, most=max(40, int(_WORK / steps)))
     select = bench.problem(selecting, most=max(40, int(_WORK / steps)))

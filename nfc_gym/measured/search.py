@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.contest import Judged, clusters, fold_of, judge, losses, not_worse, shortlist
+from nfc_gym.measured.contest import Judged, clusters, fold_of, judge, left_out_losses, losses, not_worse, shortlist
 from nfc_gym.measured.fit import Fit, box, fit
 from nfc_gym.measured.metric import Metric, loss, metric, unexplained_variance
 from nfc_gym.measured.problem import Problem
@@ -97,6 +97,7 @@ class Search:
         self.rng = np.random.default_rng(options.seed)
         self.fit_blocks, self.select_blocks = clusters(fit_data.problem), clusters(select.problem)
         self.folds = fold_of(fit_data.problem)
+        self.left_out: tuple[Fit | None, Metric | None, Array] = (None, None, np.zeros(0))  # of the model candidates are compared with
 
     def metrics(self, current: Fit) -> tuple[Metric, Metric]:
         """Common metrics of a round, with what the current model leaves unexplained as extra variance."""
@@ -161,8 +162,8 @@ class Search:
         effect = self._new(generic, current)[0]
         plant = base.plant.with_effects([effect])
         alone = fit(self.fit_data.problem, fit_metric, plant, np.concatenate([base.x, effect.null]), 10)
-        rival = self._judge(alone, base, select_metric, base_losses)
-        named = self._judge(current, base, select_metric, base_losses)
+        rival = self._judge(alone, base, fit_metric, select_metric, base_losses)
+        named = self._judge(current, base, fit_metric, select_metric, base_losses)
         return rival.total > 1.25 * named.total and not not_worse(rival, named, self.fit_blocks, self.select_blocks, self.rng)
 
     def _round(
@@ -237,7 +238,7 @@ class Search:
         # With few parameters a full Jacobian costs little; with many, psi keeps the one that it has (the chord method).
         known = current.jacobian if int(limits.free.sum()) > _CHORD else None
         fitted = fit(self.fit_data.problem, fit_metric, plant, start, 10, known=known)
-        return self._judge(fitted, current, select_metric, base_losses)
+        return self._judge(fitted, current, fit_metric, select_metric, base_losses)
 
     def _try_split(self, current: Fit, effect: Effect, parts: tuple[Effect, Array], fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
         """The same effect with a value of its own at each place."""
@@ -250,10 +251,15 @@ class Search:
             pieces.append(theta[copies] if e is effect else theta)
         self.say(f"refitting {each.id} with values of its own at each place")
         fitted = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(effects), np.concatenate(pieces), 8)
-        return self._judge(fitted, current, select_metric, base_losses)
+        return self._judge(fitted, current, fit_metric, select_metric, base_losses)
 
-    def _judge(self, fitted: Fit, base: Fit, under: Metric, base_losses: Array) -> Judged:
-        return judge(fitted, base, self.folds, self.fit_blocks, self.select.problem, under, base_losses, self.rng)
+    def _judge(self, fitted: Fit, base: Fit, fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
+        if self.left_out[0] is not base or self.left_out[1] is not fit_metric:
+            self.left_out = (base, fit_metric, left_out_losses(self.fit_data.problem, fit_metric, base, self.folds))
+        return judge(
+            fitted, base, self.fit_data.problem, fit_metric, self.left_out[2], self.folds, self.fit_blocks,
+            self.select.problem, select_metric, base_losses, self.rng,
+        )  # fmt: skip
 
     def _believed(self, j: Judged, chance: dict[str, float], current: Fit, base_losses: Array) -> bool:
         """Whether the gain holds on unseen logs, is worth naming, and is more than the luckiest candidate gains by chance."""
@@ -290,7 +296,7 @@ class Search:
             start = np.concatenate([psi, *(t for e, t in zip(current.plant.effects, thetas, strict=True) if e is not effect)])
             without = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(rest), start, 8)
             base = losses(self.select.problem, select_metric, without)
-            kept = self._judge(current, without, select_metric, base)
+            kept = self._judge(current, without, fit_metric, select_metric, base)
             if kept.lower <= 0 or kept.total < self.options.worth * (float(base.sum()) + float(without.losses.sum())):
                 self.say(f"dropped {effect.id}: the others explain what it did")
                 current = without
