@@ -36,7 +36,11 @@ def command(*words: object) -> list[str]:
 
 def prepare(data: Path, work: Path) -> None:
     """Write the prepared logs of all sets, and each set's mapping and model beside them."""
-    subprocess.run([sys.executable, data / "score" / "recordings.py", "prepare", work / "prepared"], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, data / "score" / "recordings.py", "prepare", work / "prepared"],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     for name in SETS:
         folder = work / name
         if folder.exists():
@@ -52,8 +56,16 @@ def run_set(name: str, data: Path, work: Path, jobs: int, seed: int) -> dict[str
     figures = {}
     for stage in STAGES:
         file = work / name / f"{stage}.npz"
-        subprocess.run(command("predict", mapping, "--fit", out, "--mode", SETS[name][0], "--stage", stage, "--out", file), check=True)
-        text = subprocess.run([sys.executable, data / "score" / "recordings.py", "score", name, file], check=True, capture_output=True, text=True).stdout
+        subprocess.run(
+            command("predict", mapping, "--fit", out, "--mode", SETS[name][0], "--stage", stage, "--out", file),
+            check=True,
+        )
+        text = subprocess.run(
+            [sys.executable, data / "score" / "recordings.py", "score", name, file],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
         values = [float(line.rpartition(":")[2]) for line in text.strip().splitlines()]
         figures[stage] = values[-len(SETS[name][3]) :]
     return figures

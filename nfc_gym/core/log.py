@@ -60,7 +60,9 @@ class Log:
 
     def __post_init__(self) -> None:
         if self.time.ndim != 1 or len(self.time) < 2:
-            raise InputError(f"log {self.name!r}: time must be a vector of two or more samples, got shape {self.time.shape}")
+            raise InputError(
+                f"log {self.name!r}: time must be a vector of two or more samples, got shape {self.time.shape}"
+            )
         back = np.flatnonzero(np.diff(self.time) <= 0)
         if back.size:
             k = int(back[0])

@@ -20,7 +20,6 @@ from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrid
 from nfc_gym.physics.parameters import ParameterSpace, parameters_from_toml
 from nfc_gym.physics.rollout import Plant
 
-
 _SAMPLES = 12_000  # of all logs together that an instant problem looks at; longer logs are thinned
 
 
@@ -55,7 +54,9 @@ class Bench:
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")
         layout = Layout(segments.length, segments.history, segments.horizons, segments.length, model.opt.timestep)
-        whole = RolloutProblem(model, logs, states, layout, servos(model, laws), linear, settle=segments.start == "settled")
+        whole = RolloutProblem(
+            model, logs, states, layout, servos(model, laws), linear, settle=segments.start == "settled"
+        )
         if most is None or len(whole) <= most:
             return whole
         return whole.take(np.unique(np.linspace(0, len(whole) - 1, most).round().astype(int)))
@@ -100,7 +101,11 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
             u[:, actuator_names(model).index(key.removeprefix("ctrl:"))] = values[rows]
         ctrl.append(u)
     qpos, qvel, qacc, ctrl = (np.concatenate(a) for a in (qpos, qvel, qacc, ctrl))
-    needed, pushed, acting = np.zeros((len(qpos), model.nv)), np.zeros((len(qpos), model.nv)), np.zeros((len(qpos), model.nu))
+    needed, pushed, acting = (
+        np.zeros((len(qpos), model.nv)),
+        np.zeros((len(qpos), model.nv)),
+        np.zeros((len(qpos), model.nu)),
+    )
     driven = np.zeros(model.nv)
     for k in range(len(qpos)):
         data.qpos[:], data.qvel[:], data.qacc[:], data.ctrl[:] = qpos[k], qvel[k], qacc[k], ctrl[k]
@@ -117,10 +122,15 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
     first = logs[0]
     exogenous = {k: float(np.median(np.concatenate([log.exogenous[k] for log in logs]))) for k in first.exogenous}
     channels = {
-        k: (float(np.std(np.concatenate([log.channels[k].values.reshape(len(log), -1) for log in logs]), axis=0).max()), first.channels[k].noise or 0.0)
+        k: (
+            float(np.std(np.concatenate([log.channels[k].values.reshape(len(log), -1) for log in logs]), axis=0).max()),
+            first.channels[k].noise or 0.0,
+        )
         for k in first.channels
     }
-    return Scales(force, rms(qvel), ctrl.std(0) + 0.1 * np.abs(ctrl).mean(0), rms(acting), first.interval, exogenous, channels)
+    return Scales(
+        force, rms(qvel), ctrl.std(0) + 0.1 * np.abs(ctrl).mean(0), rms(acting), first.interval, exogenous, channels
+    )
 
 
 def candidates(bench: Bench, logs: Sequence[Log]) -> list[Effect]:

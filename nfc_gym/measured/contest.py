@@ -129,7 +129,9 @@ def dispersion(fitted: Fit) -> float:
     return max(float(fitted.losses.sum()) / count, 1e-6)
 
 
-def not_worse(best: Judged, other: Judged, blocks_fit: NDArray[np.intp], blocks_select: NDArray[np.intp], rng: np.random.Generator) -> bool:
+def not_worse(
+    best: Judged, other: Judged, blocks_fit: NDArray[np.intp], blocks_select: NDArray[np.intp], rng: np.random.Generator
+) -> bool:
     """Whether `other` explains the data not significantly worse than `best` (2.5 % level, both sets of logs)."""
     apart = np.concatenate([best.fit_gains - other.fit_gains, best.gains - other.gains])
     blocks = np.concatenate([blocks_fit, blocks_select + int(blocks_fit.max()) + 1])
@@ -138,7 +140,7 @@ def not_worse(best: Judged, other: Judged, blocks_fit: NDArray[np.intp], blocks_
     return bool(np.quantile(draws, 0.025) <= 0)
 
 
-def shortlist(screened: Sequence, size: int = 8, each: int = 3) -> list:  # noqa: ANN401
+def shortlist(screened: Sequence, size: int = 8, each: int = 3) -> list:
     """The best candidates with at most `each` of one family, so that one family's places do not crowd out the others."""
     out, count = [], {}
     for s in screened:

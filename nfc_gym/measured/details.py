@@ -29,11 +29,21 @@ def details(bench: Bench, v: Verified, models: Models, logs: Sequence[Log]) -> d
 
 def _misfit(v: Verified, stage: str) -> dict[str, Any]:
     squares = np.where(v.problem.mask, np.minimum(v.white[stage] ** 2, 1e6), np.nan)
-    places = dict.fromkeys(f"{p} {g}" if not p.startswith("sensor") else p for p, g in zip(v.problem.columns.place, v.problem.columns.group, strict=True))
-    labels = [f"{p} {g}" if not p.startswith("sensor") else p for p, g in zip(v.problem.columns.place, v.problem.columns.group, strict=True)]
+    places = dict.fromkeys(
+        f"{p} {g}" if not p.startswith("sensor") else p
+        for p, g in zip(v.problem.columns.place, v.problem.columns.group, strict=True)
+    )
+    labels = [
+        f"{p} {g}" if not p.startswith("sensor") else p
+        for p, g in zip(v.problem.columns.place, v.problem.columns.group, strict=True)
+    ]
     with np.errstate(invalid="ignore"):
         by_place = {p: _mean(squares[:, [lab == p for lab in labels]]) for p in places}
-        by_log = {n: _mean(squares[v.problem.log_of == i]) for i, n in enumerate(v.problem.names) if (v.problem.log_of == i).any()}
+        by_log = {
+            n: _mean(squares[v.problem.log_of == i])
+            for i, n in enumerate(v.problem.names)
+            if (v.problem.log_of == i).any()
+        }
     rows = np.linspace(0, len(squares) - 1, min(len(squares), 300)).astype(int)
     return {
         "place": by_place,
@@ -59,7 +69,11 @@ def _rollout_traces(v: Verified, models: Models) -> list[dict[str, Any]]:
     one = problem.take(pick)
     time = np.arange(one.segments.steps + 1) * one.segments.dt
     keep = np.unique(np.linspace(0, len(time) - 1, min(len(time), _POINTS)).astype(int))
-    curves = {stage: one.predict(p, x[None], one.segments, one.observers)[0] for stage, p, x in models.items() if stage != "nominal"}
+    curves = {
+        stage: one.predict(p, x[None], one.segments, one.observers)[0]
+        for stage, p, x in models.items()
+        if stage != "nominal"
+    }
     rows = []
     for i, o in enumerate(one.observers):
         step, measured = one.samples(i)
@@ -85,7 +99,11 @@ def _instant_traces(v: Verified, models: Models) -> list[dict[str, Any]]:
     problem = v.problem
     i = int(problem.log_of[0])
     t = problem.tracks[i]  # type: ignore[attr-defined]
-    curves = {stage: problem.smoothed(problem.evaluate(p, x[None], [t])[0][0]) for stage, p, x in models.items() if stage != "nominal"}  # type: ignore[attr-defined]
+    curves = {
+        stage: problem.smoothed(problem.evaluate(p, x[None], [t])[0][0])
+        for stage, p, x in models.items()
+        if stage != "nominal"
+    }  # type: ignore[attr-defined]
     measured = problem.smoothed(np.nan_to_num(t.measured))  # type: ignore[attr-defined]
     good = np.flatnonzero(t.mask.any(1))
     rows = good[: 3 * _POINTS : max(1, len(good[: 3 * _POINTS]) // _POINTS)]

@@ -12,6 +12,9 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
+# Steps of the differences, in scaled parameters. Contact makes residuals rough, and only a coarse step sees past that; the
+# curved valleys of coupled parameters (a payload's mass and place) need a fine one. A fit goes from the first to the second.
+COARSE, FINE = 1e-1, 2e-4
 _PRIOR = 0.5  # of the prior's range: standard deviation of the weak pull towards nominal psi
 
 
@@ -35,7 +38,9 @@ def box(plant: Plant) -> Box:
     for effect in plant.effects:
         low.append(effect.low)
         high.append(effect.high)
-        sizes = [max((abs(p - q.null) for p in q.probes), default=q.high - q.low) or q.high - q.low for q in effect.params]
+        sizes = [
+            max((abs(p - q.null) for p in q.probes), default=q.high - q.low) or q.high - q.low for q in effect.params
+        ]
         scale.append(np.array(sizes, float))
         free.append(np.ones(len(effect.params), bool))
         prior.append(np.full(len(effect.params), np.inf))
@@ -43,9 +48,21 @@ def box(plant: Plant) -> Box:
     return Box(join(low), join(high), join(scale), join(free), plant.null, join(prior))
 
 
-def jacobian(problem: Problem, metric: Metric, plant: Plant, x: Array, base: Array, which: NDArray[np.intp], limits: Box) -> Array:
-    """(S, m, len(which)) derivative of the whitened residual by scaled parameters, forward differences, one batch."""
-    step = 2e-4 * limits.scale[which]
+def jacobian(
+    problem: Problem,
+    metric: Metric,
+    plant: Plant,
+    x: Array,
+    base: Array,
+    which: NDArray[np.intp],
+    limits: Box,
+    size: float = FINE,
+) -> Array:
+    """(S, m, len(which)) derivative of the whitened residual by scaled parameters, forward differences, one batch.
+
+    `size` is the step in scaled parameters.
+    """
+    step = size * limits.scale[which]
     step = np.where(x[which] + step > limits.high[which], -step, step)
     rows = np.repeat(x[None], len(which), 0)
     rows[np.arange(len(which)), which] += step
@@ -115,23 +132,25 @@ def fit(
 
     last: dict[str, Array] = {}
 
-    def derivative(z: Array) -> Array:
+    def derivative(z: Array, size: float) -> Array:
         tick()
         x = full(z)
         base = metric.whiten(problem.residual(plant, x[None]))[0]
-        fresh = jacobian(problem, metric, plant, x, base, free[kept:], limits)
+        fresh = jacobian(problem, metric, plant, x, base, free[kept:], limits, size)
         last["jacobian"] = fresh if known is None else np.concatenate([known, fresh], -1)
-        return np.concatenate([last["jacobian"].reshape(-1, len(free)), np.diag(limits.scale[free] / limits.prior[free])])
+        return np.concatenate(
+            [last["jacobian"].reshape(-1, len(free)), np.diag(limits.scale[free] / limits.prior[free])]
+        )
 
     low, high = limits.low[free] / limits.scale[free], limits.high[free] / limits.scale[free]
-    z0 = np.clip(start[free] / limits.scale[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
-    if len(free):
+    x = start.copy()
+    for size, share in ((COARSE, rounds // 2), (FINE, rounds - rounds // 2)) if len(free) else ():
+        z0 = np.clip(x[free] / limits.scale[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
         solved = least_squares(
-            residual, z0, derivative, (low, high), loss="soft_l1", f_scale=TURN, x_scale="jac", max_nfev=rounds, ftol=1e-5, xtol=1e-5, gtol=1e-8
-        )
+            residual, z0, lambda z, size=size: derivative(z, size), (low, high), loss="soft_l1", f_scale=TURN, x_scale="jac",
+            max_nfev=max(share, 1), ftol=1e-5, xtol=1e-5, gtol=1e-8,
+        )  # fmt: skip
         x = full(solved.x)
-    else:
-        x = start.copy()
     white = metric.whiten(problem.residual(plant, x[None]))[0]
     jac = last.get("jacobian", np.zeros((*shape, 0)))
     return Fit(plant, x, white, jac)

@@ -109,7 +109,9 @@ class InstantProblem(Problem):
                     log_of.append(i)
                     rows.append(block)
         if not rows:
-            raise InputError(f"no log is long enough for one block of {length:g} s with a valid sample: shorten segments.length")
+            raise InputError(
+                f"no log is long enough for one block of {length:g} s with a valid sample: shorten segments.length"
+            )
         self.log_of, self.rows = np.array(log_of), np.array(rows)
         self.mask = np.stack([self.tracks[i].mask[r].ravel() for i, r in zip(self.log_of, self.rows, strict=True)])
         self.time_of = np.array([self.tracks[i].time[r[0]] for i, r in zip(self.log_of, self.rows, strict=True)])
@@ -147,7 +149,12 @@ class InstantProblem(Problem):
     def take(self, index: NDArray[np.intp]) -> "InstantProblem":
         """See `Problem`."""
         out = copy.copy(self)
-        out.log_of, out.rows, out.mask, out.time_of = self.log_of[index], self.rows[index], self.mask[index], self.time_of[index]
+        out.log_of, out.rows, out.mask, out.time_of = (
+            self.log_of[index],
+            self.rows[index],
+            self.mask[index],
+            self.time_of[index],
+        )
         return out
 
     def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "InstantProblem":
@@ -168,7 +175,9 @@ class InverseProblem(InstantProblem):
         """The force channels."""
         found = [c for c in log.channels if c.startswith("force:")]
         if not found:
-            raise InputError("segments.mode inverse compares actuator forces: map at least one channel force:<actuator>")
+            raise InputError(
+                "segments.mode inverse compares actuator forces: map at least one channel force:<actuator>"
+            )
         self.actuators = [actuator_names(model).index(c.removeprefix("force:")) for c in found]
         return found
 
@@ -177,7 +186,9 @@ class InverseProblem(InstantProblem):
         hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
         kinds = [int(model.jnt_type[model.actuator_trnid[a, 0]]) for a in self.actuators]
         return [
-            ("torque", "N m", f"actuator:{actuator_names(model)[a]}") if k == hinge else ("force", "N", f"actuator:{actuator_names(model)[a]}")
+            ("torque", "N m", f"actuator:{actuator_names(model)[a]}")
+            if k == hinge
+            else ("force", "N", f"actuator:{actuator_names(model)[a]}")
             for a, k in zip(self.actuators, kinds, strict=True)
         ]
 
@@ -202,7 +213,16 @@ def actuator_forces(plant: Plant, x: Array, t: Track) -> Array:
     base = model.dof_frictionloss.copy()
     motion = _Motion(model, data, t)
     rubbing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "friction")]
-    ctx = Context(plant.model, t.dt, t.qpos, t.qvel, t.ctrl, t.exogenous, motion.data, lambda name: _tile(base if name == "dof_frictionloss" else getattr(model, name), len(t.time)))
+    ctx = Context(
+        plant.model,
+        t.dt,
+        t.qpos,
+        t.qvel,
+        t.ctrl,
+        t.exogenous,
+        motion.data,
+        lambda name: _tile(base if name == "dof_frictionloss" else getattr(model, name), len(t.time)),
+    )
     force = None if rubbing else motion.inverse(None)
     for _ in range(_LOAD_PASSES if rubbing else 0):
         level = np.tile(base, (len(t.time), 1))
@@ -292,7 +312,9 @@ class ForwardProblem(InstantProblem):
         found = [c for c in log.channels if c.startswith("sensor:")]
         if not found:
             raise InputError("segments.mode forward compares sensors: map at least one channel sensor:<name>")
-        self.observers: list[Observer] = [o for c in found if (o := observer(model, c, log.channels[c].axes)) is not None]
+        self.observers: list[Observer] = [
+            o for c in found if (o := observer(model, c, log.channels[c].axes)) is not None
+        ]
         return found
 
     def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str]]:
@@ -303,10 +325,15 @@ class ForwardProblem(InstantProblem):
         """See `InstantProblem`."""
         commands = delivered(plant, x, tracks)
         turn = max(1, 200_000 // sum(len(t.time) for t in tracks))
-        parts = [self._turn(plant, x[i : i + turn], tracks, [(u[i : i + turn], a[i : i + turn]) for u, a in commands]) for i in range(0, len(x), turn)]
+        parts = [
+            self._turn(plant, x[i : i + turn], tracks, [(u[i : i + turn], a[i : i + turn]) for u, a in commands])
+            for i in range(0, len(x), turn)
+        ]
         return [np.concatenate([p[i] for p in parts]) for i in range(len(tracks))]
 
-    def _turn(self, plant: Plant, x: Array, tracks: Sequence[Track], commands: Sequence[tuple[Array, Array]]) -> list[Array]:
+    def _turn(
+        self, plant: Plant, x: Array, tracks: Sequence[Track], commands: Sequence[tuple[Array, Array]]
+    ) -> list[Array]:
         count = len(x)
         lengths = [len(t.time) for t in tracks]
         samples = sum(lengths)
@@ -333,7 +360,9 @@ class ForwardProblem(InstantProblem):
                     batch.forward()
                 return values
 
-            ctx = Context(plant.model, tracks[0].dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, derived, fields.__getitem__)
+            ctx = Context(
+                plant.model, tracks[0].dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, derived, fields.__getitem__
+            )
             out = Forces(np.zeros_like(batch.qfrc_applied), np.zeros_like(batch.xfrc_applied))
             for effect, theta in pushing:
                 effect.force(ctx, theta, out)

@@ -80,7 +80,12 @@ def close_loop(
     mujoco.set_mju_user_warning(lambda message: None)
     dataset = require(mapping)[0]
     bench = make_bench(dataset, jobs)
-    key = digest(mapping, model_path(dataset.mapping.model_file, dataset.folder), *dataset.files, extra=f"{seed} {version('nfc_gym')}")
+    key = digest(
+        mapping,
+        model_path(dataset.mapping.model_file, dataset.folder),
+        *dataset.files,
+        extra=f"{seed} {version('nfc_gym')}",
+    )
     folds = [dataset.fold(fold)] if fold is not None else list(dataset.folds)
     if len(dataset.folds) == 1:
         return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)
@@ -94,7 +99,9 @@ def close_loop(
         if finished.exists() and resume and not overwrite:
             reports[f.name] = json.loads(finished.read_text())
             continue
-        reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, digest(extra=key + f.name), overwrite, resume, console)
+        reports[f.name] = _fold(
+            bench, dataset, f, out / f.name, seed, digest(extra=key + f.name), overwrite, resume, console
+        )
     if fold is not None:  # other folds may be running beside this one; the summary is the whole run's
         return reports[fold]
     summary = _summary(dataset, reports)
@@ -112,14 +119,32 @@ def _summary(dataset: Dataset, reports: dict[str, dict[str, Any]]) -> dict[str, 
             counts[e["id"]] = counts.get(e["id"], 0) + 1
     keys = ("schema", "model", "seed", "versions")
     return {k: first[k] for k in keys} | {
-        "folds": {name: {"verdict": r["verdict"], "effects": [e["id"] for e in r["effects"]], "chi2": r["chi2"], "error": r["error"]} for name, r in reports.items()},
-        "effects_found_in": {k: f"{n} of {len(reports)} folds" for k, n in sorted(counts.items(), key=lambda kv: -kv[1])},
+        "folds": {
+            name: {
+                "verdict": r["verdict"],
+                "effects": [e["id"] for e in r["effects"]],
+                "chi2": r["chi2"],
+                "error": r["error"],
+            }
+            for name, r in reports.items()
+        },
+        "effects_found_in": {
+            k: f"{n} of {len(reports)} folds" for k, n in sorted(counts.items(), key=lambda kv: -kv[1])
+        },
         "seconds": sum(r["seconds"] for r in reports.values()),
     }
 
 
 def _fold(
-    bench: Bench, dataset: Dataset, fold: Fold, out: Path, seed: int, key: str, overwrite: bool, resume: bool, console: Console | None
+    bench: Bench,
+    dataset: Dataset,
+    fold: Fold,
+    out: Path,
+    seed: int,
+    key: str,
+    overwrite: bool,
+    resume: bool,
+    console: Console | None,
 ) -> dict[str, Any]:
     began = time.monotonic()
     stages = Stages(out, key, overwrite, resume)
@@ -142,7 +167,10 @@ def _fold(
     report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole)
     report["seconds"] = round(time.monotonic() - began, 1)
     _write(out, bench, final, report)
-    tell(f"[bold]{report['verdict']}[/bold]: " + ("; ".join(e["sentence"] for e in report["effects"]) or "no effect claimed"))
+    tell(
+        f"[bold]{report['verdict']}[/bold]: "
+        + ("; ".join(e["sentence"] for e in report["effects"]) or "no effect claimed")
+    )
     return report
 
 
@@ -176,7 +204,9 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
         run.stages.put("calibrated", pack(calibrated))
     pool = candidates(bench, fitting)
     data = Data(work, sigma)
-    search = Search(data, Data(select, select.covariance(plant, calibrated.x)), plant, pool, Options(seed=run.seed), run.say)
+    search = Search(
+        data, Data(select, select.covariance(plant, calibrated.x)), plant, pool, Options(seed=run.seed), run.say
+    )
     return search.run(calibrated)
 
 
@@ -194,7 +224,9 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
     return out[0], out[1]
 
 
-def _report(run: _Run, dataset: Dataset, fold: Fold, found: Found, final: tuple[Fit, Fit], problem: Problem, whole: Problem) -> dict[str, Any]:
+def _report(
+    run: _Run, dataset: Dataset, fold: Fold, found: Found, final: tuple[Fit, Fit], problem: Problem, whole: Problem
+) -> dict[str, Any]:
     calibrated, extended = final
     rng = np.random.default_rng(run.seed)
     nominal = (run.bench.plant, run.bench.plant.null)
@@ -216,7 +248,11 @@ def _report(run: _Run, dataset: Dataset, fold: Fold, found: Found, final: tuple[
         "unexplained": say.unexplained(v, found) if verdict in ("unexplained", "partly explained") else None,
         "error": say.errors(v),
         "chi2": {stage: v.chi2(stage) for stage in v.residual}
-        | {"null": float(v.null.mean()), "null_95": say.null_bound(v), "extended_over_calibrated_95": say.gain_interval(v, rng)},
+        | {
+            "null": float(v.null.mean()),
+            "null_95": say.null_bound(v),
+            "extended_over_calibrated_95": say.gain_interval(v, rng),
+        },
         "identifiability": say.identifiability(found),
         "rounds": [r.__dict__ for r in found.rounds],
         "noise": _noise(run.bench, dataset, fold),
@@ -232,7 +268,8 @@ def _noise(bench: Bench, dataset: Dataset, fold: Fold) -> list[dict[str, Any]]:
 
     log = dataset.of("fit", fold)[0]
     return [
-        {"channel": k, "noise": channel_noise(log, k), "unit": c.unit, "estimated": c.noise is None} for k, c in log.channels.items()
+        {"channel": k, "noise": channel_noise(log, k), "unit": c.unit, "estimated": c.noise is None}
+        for k, c in log.channels.items()
     ]
 
 
@@ -243,7 +280,12 @@ def _write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, An
     write_whole(out / "model.xml", xml)
     rows = {e["id"]: e for e in report["effects"]}
     listed = [rows[e.id] for e, _ in effects_of(extended.plant, extended.x, outside)]
-    effects = {"version": 1, "model_sha256": digest(out / "model.xml"), "effects": listed, "carried_by_model": [i for i in rows if i not in {e["id"] for e in listed}]}
+    effects = {
+        "version": 1,
+        "model_sha256": digest(out / "model.xml"),
+        "effects": listed,
+        "carried_by_model": [i for i in rows if i not in {e["id"] for e in listed}],
+    }
     write_whole(out / "effects.yaml", yaml.safe_dump(effects, sort_keys=False, allow_unicode=True))
     packed = {"nominal": {"psi": {}, "effects": []}, "calibrated": pack(calibrated), "extended": pack(extended)}
     write_whole(out / "fit.json", json.dumps({"fold": report["fold"], **packed}, indent=1))

@@ -20,7 +20,9 @@ from nfc_gym.physics.rollout import Plant
 Array = NDArray[np.float64]
 
 
-def predict(mapping: Path, fit: Path | None, mode: str, stage: str, out: Path, *, restart: float | None = None) -> dict[str, Array]:
+def predict(
+    mapping: Path, fit: Path | None, mode: str, stage: str, out: Path, *, restart: float | None = None
+) -> dict[str, Array]:
     """Predict every log and write one array a log to an npz file.
 
     Args:
@@ -64,7 +66,9 @@ def _models(bench: Bench, dataset: Dataset, fit: Path | None, stage: str) -> dic
     return out
 
 
-def _predict(bench: Bench, plant: Plant, x: Array, logs: list[Log], mode: str, restart: float | None) -> dict[str, Array]:
+def _predict(
+    bench: Bench, plant: Plant, x: Array, logs: list[Log], mode: str, restart: float | None
+) -> dict[str, Array]:
     if mode == "rollout":
         return {log.name: _roll(bench, plant, x, log, restart) for log in logs}
     kind = InverseProblem if mode == "inverse" else ForwardProblem
@@ -80,7 +84,9 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None)
     dt = float(plant.model.opt.timestep)
     length = min(restart, log.duration) if restart else log.duration
     starts = np.searchsorted(log.time, np.arange(0.0, log.duration, length) - 1e-9) if restart else np.array([0])
-    laws = servos(plant.model, {k: (c.servo.joint, c.servo.limit) for k, c in mapping.controls.items() if c.servo is not None})
+    laws = servos(
+        plant.model, {k: (c.servo.joint, c.servo.limit) for k, c in mapping.controls.items() if c.servo is not None}
+    )
     linear = frozenset(k for k, c in mapping.controls.items() if c.hold == "linear")
     pieces = []
     for i, begin in enumerate(starts):
@@ -88,10 +94,14 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None)
         part = log.part(int(begin), max(end, int(begin) + 2), log.name)
         states = _slice(bench.states[log.name], int(begin), max(end, int(begin) + 2))
         layout = Layout(part.duration, 0.0, (part.duration,), part.duration + 1, dt)
-        problem = RolloutProblem(plant.model, [part], [states], layout, laws, linear, settle=mapping.segments.start == "settled")
+        problem = RolloutProblem(
+            plant.model, [part], [states], layout, laws, linear, settle=mapping.segments.start == "settled"
+        )
         values, traj = problem.predict(plant, x[None], problem.segments, problem.observers)
         if not traj.stable.all():
-            raise InputError(f"log {log.name!r}: the simulation is unstable with this model; shorten segments.timestep or use --restart")
+            raise InputError(
+                f"log {log.name!r}: the simulation is unstable with this model; shorten segments.timestep or use --restart"
+            )
         step = (part.time / dt)[None]
         columns = [interpolate(v, step, o.quaternion)[0, 0] for v, o in zip(values, problem.observers, strict=True)]
         pieces.append(np.concatenate(columns, -1)[: end - begin])

@@ -18,7 +18,7 @@ from nfc_gym.measured.segments import Cut, Layout, cut, lay
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import overrides
 from nfc_gym.physics.rollout import Plant, Segments, Servo, Trajectory
-from nfc_gym.physics.state import integrate, vector_to_quat, quat_multiply
+from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
 
 Array = NDArray[np.float64]
 
@@ -109,9 +109,7 @@ class RolloutProblem(Problem):
     ) -> None:
         where = cut(logs, layout)
         self._kit = _Kit(model, tuple(logs), tuple(states), layout, servos or {}, linear, settle)
-        self._observers = [
-            o for key, c in logs[0].channels.items() if (o := observer(model, key, c.axes)) is not None
-        ]
+        self._observers = [o for key, c in logs[0].channels.items() if (o := observer(model, key, c.axes)) is not None]
         self.names = tuple(log.name for log in logs)
         self._place(where, None)
 
@@ -122,14 +120,26 @@ class RolloutProblem(Problem):
         segments = lay(kit.model, kit.logs, kit.states, where, kit.layout, kit.servos, kit.linear)
         self.segments = replace(segments, settle=round(0.5 / kit.layout.dt) if kit.settle else 0)
         self._start_sd = [
-            np.stack([getattr(kit.states[i], name)[s] for i, s in zip(where.log, where.start, strict=True)]) for name in ("qpos_sd", "qvel_sd")
+            np.stack([getattr(kit.states[i], name)[s] for i, s in zip(where.log, where.start, strict=True)])
+            for name in ("qpos_sd", "qvel_sd")
         ]
-        take = lambda o: np.stack([kit.logs[i].channels[o.name].values.reshape(len(kit.logs[i]), -1)[n] for i, n in zip(where.log, where.samples, strict=True)])  # noqa: E731
+        take = lambda o: np.stack(
+            [
+                kit.logs[i].channels[o.name].values.reshape(len(kit.logs[i]), -1)[n]
+                for i, n in zip(where.log, where.samples, strict=True)
+            ]
+        )
         self._measured = measured if measured is not None else [take(o) for o in self._observers]
         noise = [np.array([channel_noise(log, o.name) for log in kit.logs])[where.log] for o in self._observers]
         horizons = len(kit.layout.horizons)
-        self._noise = np.concatenate([np.repeat(n[:, None], horizons * o.size, 1) for n, o in zip(noise, self._observers, strict=True)], 1)
-        self.mask = np.isfinite(np.concatenate([self._flat(o.difference(m, m), o) for m, o in zip(self._measured, self._observers, strict=True)], -1))
+        self._noise = np.concatenate(
+            [np.repeat(n[:, None], horizons * o.size, 1) for n, o in zip(noise, self._observers, strict=True)], 1
+        )
+        self.mask = np.isfinite(
+            np.concatenate(
+                [self._flat(o.difference(m, m), o) for m, o in zip(self._measured, self._observers, strict=True)], -1
+            )
+        )
         self.columns = self._describe()
 
     @staticmethod
@@ -156,7 +166,9 @@ class RolloutProblem(Problem):
         """The first block's compared samples of a channel: (h,) physics steps after the start and (h, dim) values."""
         return self._where.step[0], self._measured[channel][0]
 
-    def predict(self, plant: Plant, x: Array, segments: Segments, observers: Sequence[Observer]) -> tuple[list[Array], Trajectory]:
+    def predict(
+        self, plant: Plant, x: Array, segments: Segments, observers: Sequence[Observer]
+    ) -> tuple[list[Array], Trajectory]:
         """What each channel would report along a roll-out, (P, S, K + 1, dim) each, sensor effects included."""
         traj = plant.shoot(x, segments, sensors=any(o.needs_sensors for o in observers))
         thetas = plant.split(x)[1]
@@ -169,7 +181,15 @@ class RolloutProblem(Problem):
             out.append(o.pick(values))
         return out, traj
 
-    def _compare(self, plant: Plant, x: Array, segments: Segments, measured: Sequence[Array], step: Array, mask: NDArray[np.bool_]) -> Array:
+    def _compare(
+        self,
+        plant: Plant,
+        x: Array,
+        segments: Segments,
+        measured: Sequence[Array],
+        step: Array,
+        mask: NDArray[np.bool_],
+    ) -> Array:
         values, traj = self.predict(plant, x, segments, self._observers)
         parts = [
             self._flat(o.difference(interpolate(v, step, o.quaternion), m), o)
@@ -210,7 +230,9 @@ class RolloutProblem(Problem):
         n = len(directions)
         repeated = _repeat(seg, n, np.concatenate(starts_q), np.concatenate(starts_v))
         measured = [np.concatenate([m] * n) for m in self._measured]
-        moved = self._compare(plant, x[None], repeated, measured, np.concatenate([self._where.step] * n), np.concatenate([self.mask] * n))
+        moved = self._compare(
+            plant, x[None], repeated, measured, np.concatenate([self._where.step] * n), np.concatenate([self.mask] * n)
+        )
         return list(moved[0].reshape(n, len(self), -1) - base)
 
     def _halved(self, plant: Plant, x: Array) -> Array:
@@ -246,17 +268,21 @@ class RolloutProblem(Problem):
         for o, v, m in zip(self._observers, values, self._measured, strict=True):
             clean = interpolate(v, step, o.quaternion)[0]
             width = m.shape[1] * o.size
-            noise = rng.normal(size=(*m.shape[:2], o.size)) * self._noise[:, at : at + width].reshape(*m.shape[:2], o.size)
+            noise = rng.normal(size=(*m.shape[:2], o.size)) * self._noise[:, at : at + width].reshape(
+                *m.shape[:2], o.size
+            )
             noisy = quat_multiply(clean, vector_to_quat(noise)) if o.quaternion else clean + noise
             measured.append(noisy[stable])
             at += width
         dq, dv = (rng.normal(size=sd.shape) * sd for sd in out._start_sd)
         out._measured = measured
-        out.segments = replace(out.segments, qpos=integrate(self._kit.model, out.segments.qpos, dq), qvel=out.segments.qvel + dv)
+        out.segments = replace(
+            out.segments, qpos=integrate(self._kit.model, out.segments.qpos, dq), qvel=out.segments.qvel + dv
+        )
         return out
 
 
-def _map(segments: Segments, rows, qpos: Array, qvel: Array) -> Segments:  # noqa: ANN001
+def _map(segments: Segments, rows, qpos: Array, qvel: Array) -> Segments:
     return replace(
         segments,
         qpos=qpos,

@@ -81,7 +81,9 @@ class Screen:
         x = np.concatenate([np.repeat(self.current.x[None], len(rows), 0), rows], 1)
         white = self.metric.whiten(self.problem.residual(plant, x))
         change = (self.weight * (white - self.current.white)).reshape(len(rows), -1).T
-        best = Screened(effect, 0.0, sets[0][0], np.zeros(self.full_tangent.shape[1]), np.zeros((len(self.target), 0)), np.zeros(0))
+        best = Screened(
+            effect, 0.0, sets[0][0], np.zeros(self.full_tangent.shape[1]), np.zeros((len(self.target), 0)), np.zeros(0)
+        )
         at = 0
         for probe in sets:
             raw = change[:, at : at + len(probe)]
@@ -89,7 +91,9 @@ class Screen:
             at += len(probe)
             gain, theta, multiple = self._combine(effect, probe, columns)
             if gain > best.gain or best.columns.shape[1] == 0:
-                sizes = (probe - effect.null)[np.arange(len(probe)), [i for i, p in enumerate(effect.params) if not p.shape]]
+                sizes = (probe - effect.null)[
+                    np.arange(len(probe)), [i for i, p in enumerate(effect.params) if not p.shape]
+                ]
                 best = Screened(effect, gain, theta, self._shift(raw @ multiple), columns, sizes)
         return best
 
@@ -104,7 +108,9 @@ class Screen:
         norms = np.linalg.norm(columns, axis=0)
         if not (norms > 1e-9).any():
             return 0.0, probe[0], np.zeros(len(probe))
-        solution = np.linalg.lstsq(columns / np.maximum(norms, 1e-12), -self.projected, rcond=1e-6)[0] / np.maximum(norms, 1e-12)
+        solution = np.linalg.lstsq(columns / np.maximum(norms, 1e-12), -self.projected, rcond=1e-6)[0] / np.maximum(
+            norms, 1e-12
+        )
         sizing = [i for i, p in enumerate(effect.params) if not p.shape]
         size = (probe - effect.null)[np.arange(len(probe)), sizing]
         low, high = (effect.low - effect.null)[sizing] / size, (effect.high - effect.null)[sizing] / size
@@ -116,7 +122,9 @@ class Screen:
         theta[sizing] = effect.null[sizing] + multiple * size
         return gain, np.clip(theta, effect.low, effect.high), multiple
 
-    def chance(self, found: Sequence[Screened], blocks: NDArray[np.intp], rng: np.random.Generator, draws: int = 199) -> dict[str, float]:
+    def chance(
+        self, found: Sequence[Screened], blocks: NDArray[np.intp], rng: np.random.Generator, draws: int = 199
+    ) -> dict[str, float]:
         """Gain of each candidate that only 1 % of residuals without any effect would bring the luckiest candidate to.
 
         What the best candidate leaves over takes a random sign in every block: such a residual is as large and as correlated

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Say = Callable[[str], None]
 _NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
 _SHARED = 0.8  # the same for the same law at a wider place
+_FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
 _CHORD = 10  # free parameters beyond which a candidate's refit reuses psi's Jacobian
 
@@ -88,7 +89,9 @@ class Data:
 class Search:
     """One greedy search on fit and selection problems."""
 
-    def __init__(self, fit_data: Data, select: Data, plant: Plant, candidates: Sequence[Effect], options: Options, say: Say) -> None:
+    def __init__(
+        self, fit_data: Data, select: Data, plant: Plant, candidates: Sequence[Effect], options: Options, say: Say
+    ) -> None:
         self.fit_data, self.select, self.plant = fit_data, select, plant
         self.named = [e for e in candidates if not e.generic]
         self.generics = [e for e in candidates if e.generic]
@@ -97,15 +100,23 @@ class Search:
         self.rng = np.random.default_rng(options.seed)
         self.fit_blocks, self.select_blocks = clusters(fit_data.problem), clusters(select.problem)
         self.folds = fold_of(fit_data.problem)
-        self.left_out: tuple[Fit | None, Metric | None, Array] = (None, None, np.zeros(0))  # of the model candidates are compared with
+        self.left_out: tuple[Fit | None, Metric | None, Array] = (
+            None,
+            None,
+            np.zeros(0),
+        )  # of the model candidates are compared with
 
     def metrics(self, current: Fit) -> tuple[Metric, Metric]:
         """Common metrics of a round, with what the current model leaves unexplained as extra variance."""
         residual = self.fit_data.problem.residual(current.plant, current.x[None])[0]
         extra = unexplained_variance(self.fit_data.problem, residual, self.fit_data.sigma)
-        return metric(self.fit_data.problem, self.fit_data.sigma, extra), metric(self.select.problem, self.select.sigma, extra)
+        return metric(self.fit_data.problem, self.fit_data.sigma, extra), metric(
+            self.select.problem, self.select.sigma, extra
+        )
 
-    def refit(self, current: Fit, under: Metric, plant: Plant | None = None, start: Array | None = None, rounds: int = 15) -> Fit:
+    def refit(
+        self, current: Fit, under: Metric, plant: Plant | None = None, start: Array | None = None, rounds: int = 15
+    ) -> Fit:
         """Full refit of every parameter under a metric."""
         plant, start = plant or current.plant, current.x if start is None else start
         return fit(self.fit_data.problem, under, plant, start, rounds)
@@ -122,9 +133,16 @@ class Search:
             rounds.append(outcome)
             if best is None or len(current.plant.effects) >= self.options.most:
                 break
-            current = self._prune(self.refit(best.fitted, fit_metric), fit_metric, select_metric)
+            current = self.refit(best.fitted, fit_metric)
+            # What the new effect explains must not go on as slack in the metric: refresh it, refit, and only then prune.
+            fit_metric, select_metric = self.metrics(current)
+            current = self._prune(self.refit(current, fit_metric), fit_metric, select_metric)
         generic = self._generic(screen, current, fit_metric, select_metric, outcome)
-        if generic is not None and current.plant.effects and self._outdone(generic, calibrated, current, fit_metric, select_metric):
+        if (
+            generic is not None
+            and current.plant.effects
+            and self._outdone(generic, calibrated, current, fit_metric, select_metric)
+        ):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
             current = self.refit(calibrated, fit_metric, rounds=6)
         return Found(calibrated, current, rounds, generic, screened, fit_metric, screen)
@@ -133,29 +151,42 @@ class Search:
         taken = {e.id.removesuffix(":each") for e in current.plant.effects}
         left = [e for e in pool if e.id not in taken and (e.id not in self.hopeless or len(e.where) > 1)]
         self.say(f"screening {len(left)} candidates")
-        found = screen_all(screen, left)
+        found = screen_all(screen, self._promising(screen, left))
         # Places that show nothing at all are not looked at again; sets of places stay, since they stand for many.
         floor = 1e-3 * float(screen.projected @ screen.projected)
         self.hopeless |= {f.effect.id for f in found[_KEEP:] if f.gain < floor}
         return found
 
-    def _generic(self, screen: Screen, current: Fit, fit_metric: Metric, select_metric: Metric, outcome: Round) -> Judged | None:
+    def _promising(self, screen: Screen, pool: list[Effect]) -> list[Effect]:
+        """Of a large pool, those that do best on every third block, and the best of each family."""
+        blocks = len(self.fit_data.problem)
+        if len(pool) <= _FIELD or blocks < _THIN * 20:
+            return pool
+        index = np.arange(0, blocks, _THIN)
+        current = screen.current
+        part = Fit(current.plant, current.x, current.white[index], current.jacobian[index])
+        rough = screen_all(Screen(self.fit_data.problem.take(index), screen.metric.take(index), part), pool)
+        families = {r.effect.family: r.effect for r in reversed(rough)}
+        best = [r.effect for r in rough[:_FIELD]]
+        return best + [e for e in families.values() if e not in best]
+
+    def _generic(
+        self, screen: Screen, current: Fit, fit_metric: Metric, select_metric: Metric, outcome: Round
+    ) -> Judged | None:
         """The smooth law of position, speed or time that still adds most to the accepted effects, if it is believed."""
         screened = self._screen(screen, self.generics, current)
         if not screened:
             return None
         base_losses = losses(self.select.problem, select_metric, current)
-        judged = [
-            self._try(current, [s], fit_metric, select_metric, base_losses)
-            for s in screened[:3]
-            if s.gain > 0
-        ]
+        judged = [self._try(current, [s], fit_metric, select_metric, base_losses) for s in screened[:3] if s.gain > 0]
         judged.sort(key=lambda j: -j.total)
         outcome.ranking += [self._row(j, current) for j in judged]
         chance = screen.chance(screened, self.fit_blocks, self.rng)
         return judged[0] if judged and self._believed(judged[0], chance, current, base_losses) else None
 
-    def _outdone(self, generic: Judged, calibrated: Fit, current: Fit, fit_metric: Metric, select_metric: Metric) -> bool:
+    def _outdone(
+        self, generic: Judged, calibrated: Fit, current: Fit, fit_metric: Metric, select_metric: Metric
+    ) -> bool:
         """Whether that generic law alone explains clearly more than all accepted effects together."""
         base = self.refit(calibrated, fit_metric, rounds=6)
         base_losses = losses(self.select.problem, select_metric, base)
@@ -164,7 +195,9 @@ class Search:
         alone = fit(self.fit_data.problem, fit_metric, plant, np.concatenate([base.x, effect.null]), 10)
         rival = self._judge(alone, base, fit_metric, select_metric, base_losses)
         named = self._judge(current, base, fit_metric, select_metric, base_losses)
-        return rival.total > 1.25 * named.total and not not_worse(rival, named, self.fit_blocks, self.select_blocks, self.rng)
+        return rival.total > 1.25 * named.total and not not_worse(
+            rival, named, self.fit_blocks, self.select_blocks, self.rng
+        )
 
     def _round(
         self, screen: Screen, screened: list[Screened], current: Fit, fit_metric: Metric, select_metric: Metric
@@ -185,13 +218,21 @@ class Search:
         believed = [j for j in judged if self._believed(j, chance, current, base_losses)]
         if not believed:
             name = self._label(judged[0], current) if judged else ""
-            outcome.reason = f"the best candidate, {name}, gains no more on unseen logs than chance" if judged else "no candidate reduces the misfit"
+            outcome.reason = (
+                f"the best candidate, {name}, gains no more on unseen logs than chance"
+                if judged
+                else "no candidate reduces the misfit"
+            )
             return outcome, None
         best = self._simplest(believed, screened, current, fit_metric, select_metric, base_losses)
         outcome.accepted = [e.id for e in self._new(best, current)]
         outcome.share = best.gain / max(float(base_losses.sum()), 1e-9)
         outcome.equivalents = [
-            self._label(j, current) for j in judged if self._label(j, current) not in outcome.accepted and j.total > _NEARLY * best.total and self._ties(believed[0], j)
+            self._label(j, current)
+            for j in judged
+            if self._label(j, current) not in outcome.accepted
+            and j.total > _NEARLY * best.total
+            and self._ties(believed[0], j)
         ]
         self.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best
@@ -206,7 +247,13 @@ class Search:
         return not_worse(best, other, self.fit_blocks, self.select_blocks, self.rng)
 
     def _simplest(
-        self, believed: list[Judged], screened: list[Screened], current: Fit, fit_metric: Metric, select_metric: Metric, base_losses: Array
+        self,
+        believed: list[Judged],
+        screened: list[Screened],
+        current: Fit,
+        fit_metric: Metric,
+        select_metric: Metric,
+        base_losses: Array,
     ) -> Judged:
         """Of the candidates that explain the data as well as the best one, that with the fewest parameters and the widest place.
 
@@ -226,7 +273,9 @@ class Search:
                     rivals.append(plain)
         return min(rivals, key=lambda j: (len(j.fitted.x), -len(self._new(j, current)[0].where), -j.total))
 
-    def _try(self, current: Fit, picks: Sequence[Screened], fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
+    def _try(
+        self, current: Fit, picks: Sequence[Screened], fit_metric: Metric, select_metric: Metric, base_losses: Array
+    ) -> Judged:
         """Refit screened candidates with everything fitted so far, from where the screening points or from where we are."""
         plant = current.plant.with_effects([*current.plant.effects, *(s.effect for s in picks)])
         limits, thetas = box(current.plant), [s.theta for s in picks]
@@ -240,7 +289,15 @@ class Search:
         fitted = fit(self.fit_data.problem, fit_metric, plant, start, 10, known=known)
         return self._judge(fitted, current, fit_metric, select_metric, base_losses)
 
-    def _try_split(self, current: Fit, effect: Effect, parts: tuple[Effect, Array], fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
+    def _try_split(
+        self,
+        current: Fit,
+        effect: Effect,
+        parts: tuple[Effect, Array],
+        fit_metric: Metric,
+        select_metric: Metric,
+        base_losses: Array,
+    ) -> Judged:
         """The same effect with a value of its own at each place."""
         each, copies = parts
         psi, thetas = current.plant.split(current.x)
@@ -293,7 +350,9 @@ class Search:
         for effect in list(current.plant.effects[:-1]):
             rest = [e for e in current.plant.effects if e is not effect]
             psi, thetas = current.plant.split(current.x)
-            start = np.concatenate([psi, *(t for e, t in zip(current.plant.effects, thetas, strict=True) if e is not effect)])
+            start = np.concatenate(
+                [psi, *(t for e, t in zip(current.plant.effects, thetas, strict=True) if e is not effect)]
+            )
             without = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(rest), start, 8)
             base = losses(self.select.problem, select_metric, without)
             kept = self._judge(current, without, fit_metric, select_metric, base)

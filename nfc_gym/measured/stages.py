@@ -67,13 +67,21 @@ class Stages:
         return file.read_text() if file.exists() else ""
 
     def _refuse(self, out: Path, key: str) -> None:
-        foreign = sorted(p.name for p in out.iterdir() if p.name not in (*OUTPUTS, _FOLDER) and not p.name.startswith("."))
+        foreign = sorted(
+            p.name for p in out.iterdir() if p.name not in (*OUTPUTS, _FOLDER) and not p.name.startswith(".")
+        )
         if (out / "report.json").exists():
-            raise InputError(f"{out} holds the report of a finished run: choose another --out, or say --overwrite to replace it")
+            raise InputError(
+                f"{out} holds the report of a finished run: choose another --out, or say --overwrite to replace it"
+            )
         if foreign and not self.folder.exists():
-            raise InputError(f"{out} exists and holds {foreign[0]!r}, which is not a run's: choose another --out, or say --overwrite")
+            raise InputError(
+                f"{out} exists and holds {foreign[0]!r}, which is not a run's: choose another --out, or say --overwrite"
+            )
         if self.folder.exists() and self._key() not in ("", key):
-            raise InputError(f"{out} holds an unfinished run on other inputs or another seed: choose another --out, or say --overwrite")
+            raise InputError(
+                f"{out} holds an unfinished run on other inputs or another seed: choose another --out, or say --overwrite"
+            )
 
     def get(self, name: str) -> Any | None:
         """Result of a finished stage, or None."""

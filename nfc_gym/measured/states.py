@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Channel, Log
 from nfc_gym.measured.smoothing import Local, estimate_noise, fresh_samples, local_polynomial, moving_average
-from nfc_gym.physics.state import rotate, rotate_back, vector_to_quat, quat_conjugate, quat_multiply, quat_to_vector
+from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back, vector_to_quat
 
 Array = NDArray[np.float64]
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)

@@ -160,7 +160,9 @@ def parameter_rows(fitted: Fit, nominal: Array, problem: Problem) -> list[dict[s
     return rows
 
 
-def effect_rows(fitted: Fit, rounds: Sequence[Round], problem: Problem, shares: dict[str, float]) -> list[dict[str, Any]]:
+def effect_rows(
+    fitted: Fit, rounds: Sequence[Round], problem: Problem, shares: dict[str, float]
+) -> list[dict[str, Any]]:
     """Accepted effects with sentences, intervals and equivalents."""
     sd = uncertainty(fitted, clusters(problem))
     at = len(fitted.plant.space)
@@ -241,5 +243,7 @@ def gain_interval(v: Verified, rng: np.random.Generator) -> tuple[float, float]:
     before = np.minimum(v.white["calibrated"] ** 2, 1e6).sum(1)
     after = np.minimum(v.white["extended"] ** 2, 1e6).sum(1)
     seed = int(rng.integers(2**31))
-    ratio = bootstrap(after, blocks, np.random.default_rng(seed)) / np.maximum(bootstrap(before, blocks, np.random.default_rng(seed)), 1e-12)
+    ratio = bootstrap(after, blocks, np.random.default_rng(seed)) / np.maximum(
+        bootstrap(before, blocks, np.random.default_rng(seed)), 1e-12
+    )
     return float(np.quantile(ratio, 0.025)), float(np.quantile(ratio, 0.975))

@@ -52,10 +52,14 @@ def rows_of(model: mujoco.MjModel, field: str, names: tuple[str, ...]) -> NDArra
     """Row indices of `field` that belong to the named objects (a joint's dofs for `dof_*`, its coordinates for `qpos_*`)."""
     prefix = field.split("_", 1)[0]
     if prefix not in _KINDS:
-        raise InputError(f"field {field!r}: rows are addressed by name for fields of {', '.join(sorted(_KINDS))}, or use opt.*")
+        raise InputError(
+            f"field {field!r}: rows are addressed by name for fields of {', '.join(sorted(_KINDS))}, or use opt.*"
+        )
     ids = [object_id(model, _KINDS[prefix], name) for name in names]
     if prefix == "dof":
-        return np.concatenate([np.arange(model.jnt_dofadr[j], model.jnt_dofadr[j] + _DOFS[int(model.jnt_type[j])]) for j in ids])
+        return np.concatenate(
+            [np.arange(model.jnt_dofadr[j], model.jnt_dofadr[j] + _DOFS[int(model.jnt_type[j])]) for j in ids]
+        )
     if prefix == "qpos":
         return np.array([model.jnt_qposadr[j] for j in ids], np.intp)
     return np.array(ids, np.intp)
@@ -80,7 +84,9 @@ class ModelFields:
 
     def nominal(self, name: str) -> NDArray:
         """The field in the unedited model, without batch dimension."""
-        return np.asarray(getattr(self.nominal_model.opt, name[4:]) if name.startswith("opt.") else getattr(self.nominal_model, name))
+        return np.asarray(
+            getattr(self.nominal_model.opt, name[4:]) if name.startswith("opt.") else getattr(self.nominal_model, name)
+        )
 
     def __getitem__(self, name: str) -> NDArray:
         """Live array of the field: its own shape for one model, `(nsim, ...)` for a batch."""

@@ -87,7 +87,9 @@ def split_field(field: str) -> tuple[str, int | None]:
     """`geom_friction[0]` -> (`geom_friction`, 0); without brackets the component is None."""
     match = _FIELD.match(field)
     if match is None:
-        raise InputError(f"field {field!r}: want a name of MjModel, with one component in brackets where it has several")
+        raise InputError(
+            f"field {field!r}: want a name of MjModel, with one component in brackets where it has several"
+        )
     return match[1], None if match[2] is None else int(match[2])
 
 
@@ -158,13 +160,19 @@ class ParameterSpace:
         self.low = np.array([p.low for p in parameters], float)
         self.high = np.array([p.high for p in parameters], float)
         self.nominal = np.array(
-            [self._read(model, b) if p.nominal is None else p.nominal for p, b in zip(parameters, self._bound, strict=True)], float
+            [
+                self._read(model, b) if p.nominal is None else p.nominal
+                for p, b in zip(parameters, self._bound, strict=True)
+            ],
+            float,
         )
         for p, value in zip(parameters, self.nominal, strict=True):
             if not p.low < p.high:
                 raise InputError(f"parameter {p.name!r}: low {p.low:g} must be below high {p.high:g}")
             if not p.low <= value <= p.high:
-                raise InputError(f"parameter {p.name!r}: nominal {value:g} {p.unit} lies outside [{p.low:g}, {p.high:g}]")
+                raise InputError(
+                    f"parameter {p.name!r}: nominal {value:g} {p.unit} lies outside [{p.low:g}, {p.high:g}]"
+                )
 
     def __len__(self) -> int:
         return len(self.parameters)

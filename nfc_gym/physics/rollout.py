@@ -93,7 +93,9 @@ class Plant:
       nthread: threads of the batch; 0 takes every core.
     """
 
-    def __init__(self, model: mujoco.MjModel, space: ParameterSpace, effects: Sequence[Effect] = (), nthread: int = 0) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, space: ParameterSpace, effects: Sequence[Effect] = (), nthread: int = 0
+    ) -> None:
         self.model, self.space, self.effects, self.nthread = model, space, tuple(effects), nthread
         for effect in self.effects:
             effect.bind(model)
@@ -147,7 +149,9 @@ class Plant:
 
     def _shoot(self, x: Array, segments: Segments, sensors: bool) -> Trajectory:
         count, size = len(x), len(segments)
-        rows = np.broadcast_to(x[:, None] if x.ndim == 2 else x, (count, size, self.size)).reshape(count * size, self.size)
+        rows = np.broadcast_to(x[:, None] if x.ndim == 2 else x, (count, size, self.size)).reshape(
+            count * size, self.size
+        )
         return _Run(self, rows, count, segments, sensors).roll()
 
 
@@ -253,7 +257,13 @@ class _Run:
         model, batch, steps = self.plant.model, self.batch, self.segments.steps
         rows = batch.nsim
         for k in range(-self.segments.history, 0):
-            advance_activations(model, self._command(k, self._exogenous(k)), batch.act, self.segments.dt, settle=k == -self.segments.history)
+            advance_activations(
+                model,
+                self._command(k, self._exogenous(k)),
+                batch.act,
+                self.segments.dt,
+                settle=k == -self.segments.history,
+            )
         qpos, qvel = np.empty((steps + 1, rows, model.nq)), np.empty((steps + 1, rows, model.nv))
         sensed = np.empty((steps + 1, rows, model.nsensordata)) if self.sensors else None
         if self.segments.settle:
@@ -289,7 +299,9 @@ class _Run:
         batch.step()
 
     def _result(self, qpos: Array, qvel: Array, sensed: Array | None) -> Trajectory:
-        stable = np.isfinite(qpos).all((0, 2)) & np.isfinite(qvel).all((0, 2)) & (self.batch.warning[..., 1].sum(-1) == 0)
+        stable = (
+            np.isfinite(qpos).all((0, 2)) & np.isfinite(qvel).all((0, 2)) & (self.batch.warning[..., 1].sum(-1) == 0)
+        )
         size = len(self.segments)
 
         def shape(a: Array) -> Array:

@@ -184,7 +184,9 @@ class Effect(ABC):
         """Hidden state before the first command; `ctrl` (..., nu) is that command, held since ever."""
         return None
 
-    def action(self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float) -> tuple[Array, Any]:
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
         """Command (..., nu) -> what the actuators receive, and the new hidden state."""
         return ctrl, memory
 
@@ -265,7 +267,28 @@ def groups(names: Sequence[str]) -> list[tuple[str, ...]]:
     Names are read as words; the words that tell corners and sides apart (fl, rear, left, 1) are set aside, and names that
     agree in the rest form a set.
     """
-    corners = {"fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br", "front", "rear", "back", "hind", "left", "right", "l", "r"}
+    corners = {
+        "fl",
+        "fr",
+        "rl",
+        "rr",
+        "lf",
+        "rf",
+        "lh",
+        "rh",
+        "hl",
+        "hr",
+        "bl",
+        "br",
+        "front",
+        "rear",
+        "back",
+        "hind",
+        "left",
+        "right",
+        "l",
+        "r",
+    }
     sets: dict[str, list[str]] = {}
     for name in names:
         words = [w for w in name.lower().replace("-", "_").split("_") if w not in corners and not w.isdigit()]

@@ -62,7 +62,9 @@ class Each(Effect):
         """See `Effect`."""
         return [m.state0(shape, ctrl, t, dt) for m, t in zip(self.members, self._theta(theta), strict=True)]
 
-    def action(self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float) -> tuple[Array, Any]:
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
         """See `Effect`."""
         kept = []
         for m, t, old in zip(self.members, self._theta(theta), memory, strict=True):
