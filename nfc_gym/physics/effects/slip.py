@@ -74,6 +74,11 @@ class Slip(Effect):
         Param("creep", "1", 0.0, 1e3, probes=(3.0, 30.0), resolution=0.1),
     )
 
+    @classmethod
+    def declare(cls, names: Sequence[str]) -> tuple[Param, ...]:
+        """All three parameters for the ground, the first two for single wheels."""
+        return cls.PARAMS[:2] if set(names) == {"lateral", "longitudinal"} else super().declare(names)
+
     def bind(self, model: mujoco.MjModel) -> None:
         found = wheels(model)
         if not found:
@@ -97,6 +102,8 @@ class Slip(Effect):
         self.ground = [g for g in ground if model.geom_contype[g] or model.geom_conaffinity[g]]
 
     def model(self, fields: ModelFields, theta: Array) -> None:
+        if theta.shape[-1] < 3:
+            return  # `impratio` is one number for all contacts: only the whole ground can creep
         ratio = fields["opt.impratio"]
         ratio[...] = ratio / (1 + theta[..., 2])
 
@@ -142,7 +149,7 @@ class Slip(Effect):
         if not wheels(model):
             return []
         places: Sequence[tuple[str, ...]] = [p for p in groups(named) if len(p) < len(named)] if named else []
-        return [cls(where, cls.PARAMS) for where in [("ground",), *places]]
+        return [cls(("ground",), cls.PARAMS), *(cls(where, cls.PARAMS[:2]) for where in places)]
 
 
 def _tree(model: mujoco.MjModel, geom: int) -> NDArray[np.intp]:
