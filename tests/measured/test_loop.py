@@ -1,0 +1,338 @@
+"""The loop end to end, on a one-joint machine that these tests simulate themselves with plain `mj_step`."""
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+import nfc_gym.measured.loop as loop
+from nfc_gym.core import InputError
+from nfc_gym.measured.loop import close_loop
+from nfc_gym.measured.predict import predict
+
+DT, SECONDS = 0.005, 3.0
+NOISE = {"q": 0.002, "v": 0.02}
+LOSS, DAMPING = 0.25, 0.12  # N m, N m s/rad: of the machine; the model knows no dry friction and a damping of 0.05
+
+MODEL = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0" damping="{damping}" frictionloss="{loss}"
+             solreffriction="0.01 1" solimpfriction="0.99 0.99 0.001 0.5 2"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>
+"""
+
+# What the maker believes: less damping, no dry friction, and therefore nothing said of its softness either.
+GIVEN = re.sub(r'frictionloss="{loss}"\s+sol.*"/>', "/>", MODEL).format(damping=0.05)
+
+MAPPING = """
+version: 1
+model: arm.xml
+parameters:
+  - {name: damping, field: dof_damping, of: [hinge], unit: N m s/rad, low: 0.0, high: 0.4}
+logs:
+  - {path: "fit_*.csv", split: fit}
+  - {path: "select.csv", split: select}
+  - {path: "verify.csv", split: verify}
+time: {column: t}
+controls:
+  "ctrl:motor": {column: torque, unit: Nm}
+channels:
+  "joint:hinge:pos": {column: q, unit: rad, noise: 0.002}
+  "joint:hinge:vel": {column: v, unit: rad/s, noise: 0.02}
+segments: {length: 0.4, history: 0.0, horizons: [0.1, 0.2, 0.4]}
+effects: {only: [coulomb, spring_offset, armature]}
+"""
+
+
+def write_log(path: Path, model: mujoco.MjModel, seed: int, seconds: float = SECONDS) -> None:
+    """One run of the machine: torque held over 10 ms, joint sampled at its start."""
+    rng = np.random.default_rng(seed)
+    data = mujoco.MjData(model)
+    data.qpos[0] = rng.uniform(-0.5, 0.5)
+    phase, rows = rng.uniform(0, 2 * np.pi, 3), []
+    for k in range(round(seconds / (2 * DT))):
+        t = 2 * k * DT
+        torque = 0.9 * np.sin(3.1 * t + phase[0]) + 0.5 * np.sin(7.7 * t + phase[1]) + 0.3 * np.sin(1.3 * t + phase[2])
+        q, v = data.qpos[0] + NOISE["q"] * rng.normal(), data.qvel[0] + NOISE["v"] * rng.normal()
+        rows.append(f"{t:.3f},{torque:.17g},{q:.17g},{v:.17g}")
+        data.ctrl[0] = torque
+        mujoco.mj_step(model, data, 2)
+    path.write_text("t,torque,q,v\n" + "\n".join(rows) + "\n")
+
+
+def machine(
+    folder: Path, loss: float = LOSS, damping: float = DAMPING, edits: tuple[tuple[str, str], ...] = ()
+) -> Path:
+    """Logs of the true machine, the model as its maker believes it, and the mapping; returns the mapping's path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    real = mujoco.MjModel.from_xml_string(MODEL.format(damping=damping, loss=loss))
+    for seed, name in enumerate(("fit_0", "fit_1", "fit_2", "select", "verify")):
+        write_log(folder / f"{name}.csv", real, seed)
+    (folder / "arm.xml").write_text(GIVEN)
+    text = MAPPING
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "mapping.yaml").write_text(text)
+    return folder / "mapping.yaml"
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A finished run."""
+
+    mapping: Path
+    out: Path
+    report: dict[str, Any]
+
+    def on_disk(self) -> dict[str, Any]:
+        return json.loads((self.out / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Closed:
+    folder = tmp_path_factory.mktemp("arm")
+    mapping = machine(folder)
+    out = folder / "out"
+    return Closed(mapping, out, close_loop(mapping, out, seed=3, jobs=1))
+
+
+def same(a: Any, b: Any) -> bool:
+    drop = lambda r: json.dumps({k: v for k, v in r.items() if k != "seconds"}, sort_keys=True)  # noqa: E731
+    return drop(a) == drop(b)
+
+
+def test_the_hidden_friction_is_found_and_sized(closed: Closed) -> None:
+    report = closed.report
+    assert [e["id"] for e in report["effects"]] == ["coulomb:hinge"]
+    assert report["verdict"] == "explained"
+    (level,) = report["effects"][0]["parameters"].values()
+    assert level["value"] == pytest.approx(LOSS, rel=0.03)
+    assert level["low"] < level["value"] < level["high"]
+    (damping,) = report["parameters"]
+    assert damping["estimate"] == pytest.approx(DAMPING, rel=0.15)
+    assert damping["identifiable"]
+    assert not damping["left_prior"]
+    chi2 = report["chi2"]
+    assert chi2["nominal"] > chi2["calibrated"] > 5 * chi2["extended"]
+    assert chi2["extended"] == pytest.approx(1, abs=0.3)
+    assert chi2["null"] == pytest.approx(1, abs=0.3)
+    assert report["effects"][0]["share_of_excess"] > 0.9
+
+
+def test_the_report_has_the_promised_keys(closed: Closed) -> None:
+    report = closed.on_disk()
+    assert same(report, closed.report)
+    assert set(report) >= {
+        "schema", "model", "logs", "independent_splits", "parameters", "effects", "verdict", "unexplained", "error",
+        "chi2", "identifiability", "seconds", "seed", "versions",
+    }  # fmt: skip
+    assert report["schema"] == 1
+    assert report["model"] == "arm.xml"
+    assert report["seed"] == 3
+    assert report["independent_splits"] is True
+    assert report["unexplained"] is None
+    assert report["logs"] == {"fit": ["fit_0", "fit_1", "fit_2"], "select": ["select"], "verify": ["verify"]}
+    assert report["versions"]["mujoco"] == mujoco.__version__
+    assert set(report["versions"]) == {"nfc_gym", "mujoco"}
+    assert set(report["chi2"]) >= {"nominal", "calibrated", "extended", "null", "null_95"}
+    for row in report["parameters"]:
+        assert set(row) >= {
+            "name", "unit", "nominal", "estimate", "low", "high", "identifiable", "left_prior"
+        }  # fmt: skip
+    for row in report["effects"]:
+        assert set(row) >= {"id", "family", "where", "sentence", "share_of_excess", "equivalents", "parameters"}
+        assert row["id"] == f"{row['family']}:{row['where']}"
+        assert all(set(p) >= {"value", "low", "high", "unit"} for p in row["parameters"].values())
+    for row in report["identifiability"]:
+        assert set(row) >= {"id", "smallest_detectable", "unit", "worst_mimic", "distinguishable"}
+    assert report["error"]["horizons_s"] == [0.1, 0.2, 0.4]
+    assert set(report["error"]["groups"]) == {"joint angle", "joint speed"}
+    for group in report["error"]["groups"].values():
+        assert set(group) == {"unit", "nominal", "calibrated", "extended", "noise_floor"}
+        assert all(len(group[stage]) == 3 for stage in ("nominal", "calibrated", "extended", "noise_floor"))
+        assert group["extended"][-1] < 0.5 * group["calibrated"][-1] <= group["nominal"][-1]
+
+
+def test_the_corrected_model_runs_in_plain_mujoco(closed: Closed) -> None:
+    """The written model, stepped by MuJoCo alone, moves as the machine does; the given one does not."""
+    corrected = mujoco.MjModel.from_xml_path(str(closed.out / "model.xml"))
+    (level,) = closed.report["effects"][0]["parameters"].values()
+    assert corrected.dof_frictionloss[0] == pytest.approx(level["value"], rel=1e-5)
+    assert corrected.dof_damping[0] == pytest.approx(closed.report["parameters"][0]["estimate"], rel=1e-5)
+
+    def swing(model: mujoco.MjModel) -> np.ndarray:
+        data, out = mujoco.MjData(model), []
+        data.qpos[0] = 1.0
+        for _ in range(300):
+            mujoco.mj_step(model, data)
+            out.append(data.qpos[0])
+        return np.array(out)
+
+    truth = swing(mujoco.MjModel.from_xml_string(MODEL.format(damping=DAMPING, loss=LOSS)))
+    given = swing(mujoco.MjModel.from_xml_path(str(closed.mapping.with_name("arm.xml"))))
+    assert np.abs(swing(corrected) - truth).max() < 0.02 < 0.2 * np.abs(given - truth).max()
+
+
+def test_effects_and_fit_files_agree_with_the_report(closed: Closed) -> None:
+    effects = yaml.safe_load((closed.out / "effects.yaml").read_text())
+    assert effects["version"] == 1
+    # A frictionloss is the model's own: nothing is left for a wrapper to add a second time.
+    assert effects["carried_by_model"] == ["coulomb:hinge"]
+    assert effects["effects"] == []
+    assert effects["model_sha256"] == hashlib.sha256((closed.out / "model.xml").read_bytes()).hexdigest()
+    fitted = json.loads((closed.out / "fit.json").read_text())
+    assert fitted["nominal"] == {"psi": {}, "effects": []}
+    assert fitted["calibrated"]["effects"] == []
+    assert len(fitted["extended"]["effects"]) == 1
+    assert fitted["extended"]["psi"]["damping"] == pytest.approx(closed.report["parameters"][0]["estimate"])
+    page = (closed.out / "report.html").read_text()
+    assert page.rstrip().endswith("</html>")
+    assert not list(closed.out.rglob("*.part"))
+
+
+def test_the_same_seed_gives_the_same_report(closed: Closed, tmp_path: Path) -> None:
+    again = close_loop(closed.mapping, tmp_path / "again", seed=3, jobs=1)
+    assert same(again, closed.report)
+    assert (tmp_path / "again" / "model.xml").read_bytes() == (closed.out / "model.xml").read_bytes()
+
+
+def test_a_machine_that_is_its_model_lacks_nothing(tmp_path: Path) -> None:
+    report = close_loop(machine(tmp_path, loss=0, damping=DAMPING), tmp_path / "out", jobs=1)
+    assert report["effects"] == []
+    assert report["verdict"] == "nothing missing"
+    assert report["parameters"][0]["estimate"] == pytest.approx(DAMPING, rel=0.05)
+    assert report["chi2"]["extended"] == pytest.approx(1, abs=0.3)
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml")).dof_frictionloss[0] == 0
+
+
+def test_every_stage_predicts_every_log_and_the_error_falls(closed: Closed, tmp_path: Path) -> None:
+    measured = {
+        f.stem: np.genfromtxt(f, delimiter=",", names=True) for f in sorted(closed.mapping.parent.glob("*.csv"))
+    }
+    error = {}
+    for stage in ("nominal", "calibrated", "extended"):
+        said = predict(closed.mapping, closed.out, "rollout", stage, tmp_path / f"{stage}.npz", restart=0.5)
+        written = np.load(tmp_path / f"{stage}.npz")
+        assert set(said) == set(written.files) == set(measured)
+        for name, table in measured.items():
+            assert said[name].shape == (len(table), 2)
+            np.testing.assert_array_equal(written[name], said[name])
+        off = said["verify"] - np.stack([measured["verify"]["q"], measured["verify"]["v"]], 1)
+        error[stage] = float(np.sqrt((off[:, 0] ** 2).mean()))
+    assert error["nominal"] > error["calibrated"] > 2 * error["extended"]
+    assert error["extended"] < 5 * NOISE["q"]
+
+
+def test_nominal_prediction_needs_no_fit_and_is_mujocos_own(closed: Closed, tmp_path: Path) -> None:
+    """From rest with the first samples' state, the nominal roll-out of a log is a plain `mj_step` loop."""
+    said = predict(closed.mapping, None, "rollout", "nominal", tmp_path / "p.npz")["verify"]
+    table = np.genfromtxt(closed.mapping.with_name("verify.csv"), delimiter=",", names=True)
+    model = mujoco.MjModel.from_xml_path(str(closed.mapping.with_name("arm.xml")))
+    data = mujoco.MjData(model)
+    data.qpos[0], data.qvel[0] = said[0]
+    for k, torque in enumerate(table["torque"]):
+        np.testing.assert_allclose(said[k], [data.qpos[0], data.qvel[0]], atol=1e-9)
+        data.ctrl[0] = torque
+        mujoco.mj_step(model, data, 2)
+
+
+def test_predict_without_a_run_says_what_to_do(closed: Closed, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"fit\.json does not exist: run close-loop"):
+        predict(closed.mapping, tmp_path / "nowhere", "rollout", "extended", tmp_path / "p.npz")
+    assert not (tmp_path / "p.npz").exists()
+
+
+def test_an_interrupted_run_goes_on(closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+
+    class Interrupted(loop.Search):
+        def run(self, calibrated: Any) -> Any:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "Search", Interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            close_loop(closed.mapping, out, seed=3, jobs=1)
+    assert sorted(p.name for p in (out / ".stages").iterdir()) == ["calibrated.json", "key"]
+    assert not (out / "report.json").exists()
+    # Something cut short in the middle of a write must not count as finished.
+    (out / ".stages" / ".final.json.part").write_text('{"calibrated": {"psi"')
+    with monkeypatch.context() as patch:  # the finished stage is not repeated
+        patch.setattr(loop, "_calibrate", lambda *_: pytest.fail("calibrated again"))
+        report = close_loop(closed.mapping, out, seed=3, jobs=1)
+    assert [e["id"] for e in report["effects"]] == ["coulomb:hinge"]
+    (level,), (before,) = (r["effects"][0]["parameters"].values() for r in (report, closed.report))
+    assert level["value"] == pytest.approx(before["value"], rel=0.01)
+    assert (out / "report.json").exists()
+
+
+def test_an_interruption_after_the_last_fit_loses_only_the_writing(
+    closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "_write", stop)
+        with pytest.raises(KeyboardInterrupt):
+            close_loop(closed.mapping, out, seed=3, jobs=1)
+    assert (out / ".stages" / "final.json").exists()
+    report = close_loop(closed.mapping, out, seed=3, jobs=1)
+    assert [e["id"] for e in report["effects"]] == ["coulomb:hinge"]
+    assert report["chi2"]["extended"] == pytest.approx(closed.report["chi2"]["extended"], rel=0.05)
+
+
+def test_a_finished_run_is_not_replaced_unasked(closed: Closed, tmp_path: Path, monkeypatch: Any) -> None:
+    before = (closed.out / "report.json").read_bytes()
+    with pytest.raises(InputError, match=r"holds the report of a finished run.*--overwrite"):
+        close_loop(closed.mapping, closed.out, seed=3, jobs=1)
+    assert (closed.out / "report.json").read_bytes() == before
+    strange = tmp_path / "strange"
+    strange.mkdir()
+    (strange / "thesis.tex").write_text("years of work")
+    with pytest.raises(InputError, match=r"holds 'thesis\.tex', which is not a run's"):
+        close_loop(closed.mapping, strange, jobs=1)
+    done = tmp_path / "done"
+    done.mkdir()
+    (done / "report.json").write_text("{}")
+    (done / "thesis.tex").write_text("years of work")
+    report = close_loop(closed.mapping, done, seed=3, jobs=1, overwrite=True)
+    assert same(json.loads((done / "report.json").read_text()), report)
+    assert (done / "thesis.tex").read_text() == "years of work"
+
+
+def test_logs_shorter_than_a_segment_are_refused(tmp_path: Path) -> None:
+    mapping = machine(tmp_path, edits=(("length: 0.4", "length: 9.0"), ("[0.1, 0.2, 0.4]", "[1.0, 9.0]")))
+    with pytest.raises(InputError, match=r"as long as the longest horizon, 9 s; the longest lasts 2\.99 s"):
+        close_loop(mapping, tmp_path / "out", jobs=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_blows_up_is_named(closed: Closed, tmp_path: Path) -> None:
+    """A servo far too stiff for an explicit step: MuJoCo diverges at once."""
+    mapping = machine(tmp_path)
+    wild = GIVEN.replace("implicitfast", "Euler")
+    wild = wild.replace('<motor name="motor" joint="hinge"/>', '<position name="motor" joint="hinge" kp="1e9"/>')
+    (tmp_path / "arm.xml").write_text(wild)
+    mapping.write_text(mapping.read_text().replace("unit: Nm", "unit: rad"))
+    with pytest.raises(InputError, match=r"log '.*': the simulation is unstable with this model"):
+        predict(mapping, None, "rollout", "nominal", tmp_path / "p.npz")
+    assert not (tmp_path / "p.npz").exists()
