@@ -1,10 +1,12 @@
-"""The six recorded machines: prepare the logs, close the loop on each, predict, score, and print the table with its goals.
+"""The six recorded machines: prepare the logs, close the loop on each, predict, score, print a table with the goals.
 
-    python benchmarks/measured_sets.py --data ../shared [--sets emps ...] [--work DIR] [--jobs N] [--json FILE] [--quick]
+    python benchmarks/measured_sets.py --data ../shared [--sets emps ...] [--work DIR] [--jobs N] [--json FILE]
+                                       [--quick]
 
 The recordings, their splits and their scores are those of `score/recordings.py` in the data folder; everything that is
-particular to a machine is in its folder under `benchmarks/measured/`: the model to start from, and a mapping file. Without
-the data the benchmark says so and ends. `--quick` runs one set (one fold of it) to show that the way through works.
+particular to a machine is in its folder under `benchmarks/measured/`: the model to start from, and a mapping file.
+Without the data the benchmark says so and ends. `--quick` runs one set (one fold of it) to show that the way through
+works.
 """
 
 import argparse
@@ -16,7 +18,7 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-# set -> (what `nfc-gym predict --mode` is asked for, figure of the start, figure of the reference, goal), by the scorer's figures
+# set -> (what `nfc-gym predict --mode` is asked for, figure of the start, figure of the reference, goal), by the scorer
 SETS = {
     "skidsteer_husky": ("rollout", (0.448, 1.383), (0.244, 0.128), (0.235, 0.115)),
     "bam_xl330": ("rollout", (0.088,), (0.076,), (0.072,)),
@@ -104,7 +106,8 @@ def main() -> None:
         for i, goal in enumerate(goals):
             rows.append(
                 {
-                    "name": name, "value": figures["extended"][i], "unit": "scorer's", "baseline": figures["calibrated"][i],
+                    "name": name, "value": figures["extended"][i], "unit": "scorer's",
+                    "baseline": figures["calibrated"][i],
                     "start": start[i], "reference": reference[i], "goal": goal, "holds": figures["extended"][i] <= goal,
                     "seeds": [args.seed], "seconds": round(seconds, 1), "claims": claims(args.work / name / "loop"),
                 }
@@ -112,8 +115,8 @@ def main() -> None:
     print(f"{'set':22} {'start':>8} {'reference':>9} {'psi alone':>9} {'extended':>9} {'goal':>8}  holds  minutes")
     for r in rows:
         print(
-            f"{r['name']:22} {r['start']:8.4g} {r['reference']:9.4g} {r['baseline']:9.4g} {r['value']:9.4g} {r['goal']:8.4g}  "
-            f"{'yes' if r['holds'] else 'NO':5}  {r['seconds'] / 60:.1f}"
+            f"{r['name']:22} {r['start']:8.4g} {r['reference']:9.4g} {r['baseline']:9.4g} {r['value']:9.4g} "
+            f"{r['goal']:8.4g}  {'yes' if r['holds'] else 'NO':5}  {r['seconds'] / 60:.1f}"
         )
         print(f"    {r['claims']}")
     if args.json:

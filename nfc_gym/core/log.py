@@ -1,4 +1,4 @@
-"""`Log`: what was observed, simulated and measured alike (channel names: `joint:<name>:pos`, `body:<name>:quat`, ...)."""
+"""`Log`: what was observed, simulated and measured alike (channels: `joint:<name>:pos`, `body:<name>:quat`, ...)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -67,7 +67,8 @@ class Log:
         if back.size:
             k = int(back[0])
             raise InputError(
-                f"log {self.name!r}: time must increase, but goes from {self.time[k]:g} to {self.time[k + 1]:g} s at row {k + 1}"
+                f"log {self.name!r}: time must increase, but goes from {self.time[k]:g} to {self.time[k + 1]:g} s "
+                f"at row {k + 1}"
             )
         rows = {**self.controls, **self.exogenous, **self.known, **{k: c.values for k, c in self.channels.items()}}
         for key, values in rows.items():

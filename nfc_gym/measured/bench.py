@@ -116,7 +116,8 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
         mujoco.mj_fwdActuation(model, data)
         pushed[k], acting[k] = data.qfrc_actuator, data.actuator_force
     rms = lambda a: np.sqrt((a**2).mean(0))  # noqa: E731
-    # An actuator behind a stiff servo may push thousands of newtons in this state-by-state view: what the motion needs counts first.
+    # An actuator behind a stiff servo may push thousands of newtons in this state-by-state view: what the motion needs
+    # counts first.
     need, push = rms(needed), rms(pushed)
     force = np.where(need > 1e-9, need, push)
     first = logs[0]
@@ -138,7 +139,7 @@ def candidates(bench: Bench, logs: Sequence[Log]) -> list[Effect]:
     choice = bench.dataset.mapping.effects
     found = propose(bench.plant.model, scales(bench, logs), only=choice.only, exclude=choice.exclude)
     if bench.mode == "inverse":
-        # Forces are predicted from motion: an effect on commands shows only if it can say what it would ask for instead.
+        # Forces are predicted from motion: an effect on commands shows only if it can say what it would ask for.
         hidden = lambda e: (overrides(e, "action") and not overrides(e, "demand")) or overrides(e, "sense")  # noqa: E731
         found = [e for e in found if not hidden(e)]
     available = set(logs[0].exogenous)

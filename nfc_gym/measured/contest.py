@@ -1,4 +1,4 @@
-"""Which of several fitted candidates to believe: gains on logs they were not fitted to, under a moving-block bootstrap."""
+"""Which of several fitted candidates to believe: gains on logs not fitted to, under a moving-block bootstrap."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -74,7 +74,7 @@ def judge(
     base_losses: Array,
     rng: np.random.Generator,
 ) -> Judged:
-    """Compare a fitted candidate with the model without it, on the selection logs and on fit blocks that were left out."""
+    """Compare a fitted candidate with the model without it, on the selection logs and on left-out fit blocks."""
     gains = base_losses - losses(select, metric, fitted)
     fit_gains = base_left_out - left_out_losses(problem, under, fitted, folds)
     extra = len(fitted.x) - len(base.x)
@@ -86,7 +86,7 @@ def judge(
 
 
 def left_out_losses(problem: Problem, under: Metric, fitted: Fit, folds: NDArray[np.intp]) -> Array:
-    """(S,) loss of each block when the fold it is in takes no part in the fit: one Gauss-Newton step from the whole fit.
+    """(S,) loss of each block when its fold takes no part in the fit: one Gauss-Newton step from the whole fit.
 
     At the optimum the blocks' gradients add up to zero; without fold k they add up to minus its own, and the parameters
     move by H_-k^{-1} g_k. The residuals there are rolled out, all folds in one batch.
@@ -124,7 +124,7 @@ def fold_of(problem: Problem, most: int = 8) -> NDArray[np.intp]:
 
 
 def dispersion(fitted: Fit) -> float:
-    """Loss per number that counts: about 1 where the metric describes the residual, the natural unit of a chance gain."""
+    """Loss per number that counts: about 1 where the metric fits the residual, the natural unit of a chance gain."""
     count = max(int((fitted.white != 0).sum()), 1)
     return max(float(fitted.losses.sum()) / count, 1e-6)
 
@@ -141,7 +141,7 @@ def not_worse(
 
 
 def shortlist(screened: Sequence, size: int = 8, each: int = 3) -> list:
-    """The best candidates with at most `each` of one family, so that one family's places do not crowd out the others."""
+    """The best candidates, at most `each` of one family, so that one family's places do not crowd out the others."""
     out, count = [], {}
     for s in screened:
         if s.gain <= 0 or count.get(s.effect.family, 0) >= each:

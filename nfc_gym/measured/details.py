@@ -20,8 +20,9 @@ def details(bench: Bench, v: Verified, models: Models, logs: Sequence[Log]) -> d
     """Everything the pictures need, JSON-able.
 
     Returns:
-      `traces`: a list of {title, unit, time, measured, calibrated, extended}; `misfit`: stage -> {"place": {name: value},
-      "log": {name: value}, "time": {"log": [...], "seconds": [...], "value": [...]}} of mean square whitened residuals.
+      `traces`: a list of {title, unit, time, measured, calibrated, extended}; `misfit`: stage ->
+      {"place": {name: value}, "log": {name: value}, "time": {"log": [...], "seconds": [...], "value": [...]}} of mean
+      square whitened residuals.
     """
     traces = _rollout_traces(v, models) if isinstance(v.problem, RolloutProblem) else _instant_traces(v, models)
     return {"traces": traces, "misfit": {stage: _misfit(v, stage) for stage in ("calibrated", "extended")}}

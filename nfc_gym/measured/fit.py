@@ -1,4 +1,4 @@
-"""Box-constrained least squares of psi and effects' parameters on whitened residuals; Jacobians are batched roll-outs."""
+"""Box-constrained least squares of psi and effects' parameters on whitened residuals; Jacobians from batched runs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,8 +12,9 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-# Steps of the differences, in scaled parameters. Contact makes residuals rough, and only a coarse step sees past that; the
-# curved valleys of coupled parameters (a payload's mass and place) need a fine one. A fit goes from the first to the second.
+# Steps of the differences, in scaled parameters. Contact makes residuals rough, and only a coarse step sees past that;
+# the curved valleys of coupled parameters (a payload's mass and place) need a fine one. A fit goes from the first to
+# the second.
 COARSE, FINE = 1e-1, 2e-4
 _PRIOR = 0.5  # of the prior's range: standard deviation of the weak pull towards nominal psi
 
@@ -147,7 +148,8 @@ def fit(
     for size, share in ((COARSE, rounds // 2), (FINE, rounds - rounds // 2)) if len(free) else ():
         z0 = np.clip(x[free] / limits.scale[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
         solved = least_squares(
-            residual, z0, lambda z, size=size: derivative(z, size), (low, high), loss="soft_l1", f_scale=TURN, x_scale="jac",
+            residual, z0, lambda z, size=size: derivative(z, size),  # pyright: ignore[reportArgumentType] (no stubs)
+            (low, high), loss="soft_l1", f_scale=TURN, x_scale="jac",
             max_nfev=max(share, 1), ftol=1e-5, xtol=1e-5, gtol=1e-8,
         )  # fmt: skip
         x = full(solved.x)

@@ -1,7 +1,7 @@
-"""Problems without roll-outs: actuator forces that a measured motion needs, and sensors at measured states and commands.
+"""Problems without roll-outs: actuator forces that a measured motion needs; sensors at measured states and commands.
 
-Both look at every sample at once. They carry less evidence than roll-outs, since accelerations come from differences; they
-are what a machine offers that measures forces, or whose states are known while only a sensor is to be predicted.
+Both look at every sample at once. They carry less evidence than roll-outs, since accelerations come from differences;
+they are what a machine offers that measures forces, or whose states are known while only a sensor is to be predicted.
 """
 
 import copy
@@ -65,7 +65,8 @@ def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[st
         masks.append(np.isfinite(values) & (np.ones(len(log), bool) if c.mask is None else c.mask)[:, None])
         noise += [channel_noise(log, name)] * values.shape[1]
     return Track(
-        log.name, log.time[rows], log.interval * stride, states.qpos[rows], states.qvel[rows], states.qacc[rows], ctrl[rows],
+        log.name, log.time[rows], log.interval * stride,
+        states.qpos[rows], states.qvel[rows], states.qacc[rows], ctrl[rows],
         {k: v[rows] for k, v in log.exogenous.items()}, known,
         np.concatenate(columns, 1)[rows], np.concatenate(masks, 1)[rows], np.array(noise),
     )  # fmt: skip
@@ -138,7 +139,7 @@ class InstantProblem(Problem):
         return np.where(self.mask, out, 0.0)
 
     def covariance(self, plant: Plant, x: Array) -> Array:
-        """Sensor noise alone: what the differentiated motion adds is not known and lands in the unexplained variance."""
+        """Sensor noise alone: what the differentiated motion adds is unknown and lands in the unexplained variance."""
         width = self.mask.shape[1]
         kernel = max(1, self.smooth // self.stride)
         noise = np.stack([np.tile(self.tracks[i].noise, width // len(self.tracks[i].noise)) for i in self.log_of])
@@ -387,7 +388,11 @@ class ForwardProblem(InstantProblem):
 
 
 def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[tuple[Array, Array]]:
-    """What reaches the actuators along each track: commands (P, T, nu) after the effects on them, and activations (P, T, na)."""
+    """What reaches the actuators along each track: commands after the effects on them, and activations.
+
+    Returns:
+      for each track, commands (P, T, nu) and activations (P, T, na).
+    """
     commanding = [i for i, e in enumerate(plant.effects) if overrides(e, "action")]
     model, count, longest = plant.model, len(x), max(len(t.time) for t in tracks)
     pad = lambda a: np.concatenate([a, np.repeat(a[-1:], longest - len(a), 0)])  # noqa: E731

@@ -1,4 +1,4 @@
-"""`close_loop`: measured logs in; calibrated parameters, named effects, errors before and after, and a corrected model out."""
+"""`close_loop`: measured logs in; calibrated parameters, named effects, errors before and after, a corrected model."""
 
 import json
 import time

@@ -36,10 +36,11 @@ class Metric:
 
 
 def unexplained_variance(problem: Problem, residual: Array, sigma: Array) -> Array:
-    """(m,) variance of each kind of column (quantity, place, horizon) beyond what the noise explains, from the middle of the residuals' spread.
+    """(m,) variance of each kind of column (quantity, place, horizon) beyond what the noise explains.
 
-    residual (S, m) and sigma (S, m, m) are those of the best model so far. Candidates of one round are compared under one
-    such variance, so that no model is flattered by a metric of its own.
+    It comes from the middle of the residuals' spread; residual (S, m) and sigma (S, m, m) are those of the best model
+    so far. Candidates of one round are compared under one such variance, so that no model is flattered by a metric of
+    its own.
     """
     values = np.where(problem.mask & np.isfinite(residual), residual, np.nan)
     expected = np.where(problem.mask, np.einsum("sii->si", sigma), np.nan)

@@ -84,7 +84,7 @@ class Observer:
         return values if self._axes is None else values[..., list(self._axes)]
 
     def difference(self, predicted: Array, measured: Array) -> Array:
-        """measured minus predicted, (..., size); for quaternions the rotation vector between them, in the predicted frame."""
+        """measured minus predicted, (..., size); for quaternions the rotation vector, in the predicted frame."""
         return quat_difference(predicted, measured) if self.quaternion else measured - predicted
 
 
@@ -107,7 +107,8 @@ def _body(model: mujoco.MjModel, name: str, body: str, quantity: str) -> Observe
     first = int(model.body_jntadr[b])
     if first < 0 or int(model.jnt_type[first]) != int(mujoco.mjtJoint.mjJNT_FREE):
         raise InputError(
-            f"channel {name!r}: body {body!r} has no free joint; measure it through joints or a frame sensor of the model"
+            f"channel {name!r}: body {body!r} has no free joint; "
+            "measure it through joints or a frame sensor of the model"
         )
     in_body = quantity.endswith("@body")
     quantity = quantity.removesuffix("@body")
@@ -120,7 +121,9 @@ def _body(model: mujoco.MjModel, name: str, body: str, quantity: str) -> Observe
 
 
 def observer(model: mujoco.MjModel, name: str, axes: tuple[int, ...] | None = None) -> Observer | None:
-    """Bind a channel to a model; None for channels that are inputs of a prediction rather than compared (accelerations, forces).
+    """Bind a channel to a model; None for channels that are inputs of a prediction rather than compared.
+
+    Such inputs are accelerations and forces.
 
     Raises:
       InputError: the model lacks the joint, body or sensor, or the quantity cannot be predicted.
@@ -149,14 +152,16 @@ def observer(model: mujoco.MjModel, name: str, axes: tuple[int, ...] | None = No
     if kind == "body":
         return _body(model, name, place, quantity)
     raise InputError(
-        f"channel {name!r}: want joint:<name>:pos|vel|acc, body:<name>:pos|quat|linvel|angvel, sensor:<name> or force:<actuator>"
+        f"channel {name!r}: want joint:<name>:pos|vel|acc, body:<name>:pos|quat|linvel|angvel, sensor:<name> "
+        "or force:<actuator>"
     )
 
 
 def sensor_unit(model: mujoco.MjModel, sensor: int) -> str:
     """SI unit of a sensor's reading."""
     units = {
-        "GYRO": "rad/s", "ACCELEROMETER": "m/s^2", "VELOCIMETER": "m/s", "FRAMEPOS": "m", "FRAMELINVEL": "m/s", "FRAMEANGVEL": "rad/s",
-        "JOINTPOS": "rad", "JOINTVEL": "rad/s", "ACTUATORFRC": "N", "JOINTACTFRC": "N m", "TOUCH": "N", "FORCE": "N", "TORQUE": "N m",
+        "GYRO": "rad/s", "ACCELEROMETER": "m/s^2", "VELOCIMETER": "m/s",
+        "FRAMEPOS": "m", "FRAMELINVEL": "m/s", "FRAMEANGVEL": "rad/s", "JOINTPOS": "rad", "JOINTVEL": "rad/s",
+        "ACTUATORFRC": "N", "JOINTACTFRC": "N m", "TOUCH": "N", "FORCE": "N", "TORQUE": "N m",
     }  # fmt: skip
     return units.get(mujoco.mjtSensor(int(model.sensor_type[sensor])).name.removeprefix("mjSENS_"), "1")

@@ -100,7 +100,8 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None)
         values, traj = problem.predict(plant, x[None], problem.segments, problem.observers)
         if not traj.stable.all():
             raise InputError(
-                f"log {log.name!r}: the simulation is unstable with this model; shorten segments.timestep or use --restart"
+                f"log {log.name!r}: the simulation is unstable with this model; "
+                "shorten segments.timestep or use --restart"
             )
         step = (part.time / dt)[None]
         columns = [interpolate(v, step, o.quaternion)[0, 0] for v, o in zip(values, problem.observers, strict=True)]

@@ -1,7 +1,7 @@
 """What a model is asked to explain: residuals of S blocks with m numbers each, and the noise to be expected in them.
 
-Three kinds share one face: roll-outs from measured starts (here), actuator forces that a measured motion needs, and sensors
-at measured states and commands (`instant`). The search above them never asks which it has.
+Three kinds share one face: roll-outs from measured starts (here), actuator forces that a measured motion needs, and
+sensors at measured states and commands (`instant`). The search above them never asks which it has.
 """
 
 from abc import ABC, abstractmethod
@@ -123,12 +123,15 @@ class RolloutProblem(Problem):
             np.stack([getattr(kit.states[i], name)[s] for i, s in zip(where.log, where.start, strict=True)])
             for name in ("qpos_sd", "qvel_sd")
         ]
-        take = lambda o: np.stack(
-            [
-                kit.logs[i].channels[o.name].values.reshape(len(kit.logs[i]), -1)[n]
-                for i, n in zip(where.log, where.samples, strict=True)
-            ]
-        )
+
+        def take(o: Observer) -> Array:
+            return np.stack(
+                [
+                    kit.logs[i].channels[o.name].values.reshape(len(kit.logs[i]), -1)[n]
+                    for i, n in zip(where.log, where.samples, strict=True)
+                ]
+            )
+
         self._measured = measured if measured is not None else [take(o) for o in self._observers]
         noise = [np.array([channel_noise(log, o.name) for log in kit.logs])[where.log] for o in self._observers]
         horizons = len(kit.layout.horizons)

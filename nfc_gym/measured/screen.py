@@ -1,6 +1,7 @@
 """Screening: which candidate effects could explain the residual, judged at realistic sizes with psi projected out.
 
-A secant instead of a derivative: delay, dry friction and saturation have no useful derivative at zero (LOOP.md's score test).
+A secant instead of a derivative: delay, dry friction and saturation have no useful derivative at zero (LOOP.md's score
+test).
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +25,8 @@ class Screened:
 
     Attributes:
       effect: the candidate.
-      gain: drop of the (weighted, squared) loss that its best linear combination reaches, psi and accepted effects refitted.
+      gain: drop of the (weighted, squared) loss that its best linear combination reaches, psi and accepted effects
+        refitted.
       theta: (k,) parameters to start a fit from.
       shift: (j,) change of the fitted model's scaled free parameters that goes with it.
       columns: (n, k') projected whitened change at the probe that did best, for the identifiability table.
@@ -40,7 +42,7 @@ class Screened:
 
 
 def probe_sets(effect: Effect) -> list[Array]:
-    """Sets of realistic parameter vectors, (k', k) each: one row for each sizing parameter, sharing the shape parameters."""
+    """Sets of realistic parameter vectors, (k', k) each: one row a sizing parameter, sharing the shape parameters."""
     sizing = [i for i, p in enumerate(effect.params) if not p.shape]
     shaping = [i for i, p in enumerate(effect.params) if p.shape]
     ranks = max(len(effect.params[i].probes) for i in sizing)
@@ -101,7 +103,7 @@ class Screen:
         """Step of the fitted parameters that answers a change of the residual; directions that hardly show stay put."""
         if not self.full_tangent.shape[1]:
             return np.zeros(0)
-        return np.linalg.lstsq(self.full_tangent, -(self.target + change), rcond=1e-3)[0]
+        return np.asarray(np.linalg.lstsq(self.full_tangent, -(self.target + change), rcond=1e-3)[0], np.float64)
 
     def _combine(self, effect: Effect, probe: Array, columns: Array) -> tuple[float, Array, Array]:
         """Best multiples of the probes within the parameters' bounds, and what they gain."""
@@ -127,9 +129,9 @@ class Screen:
     ) -> dict[str, float]:
         """Gain of each candidate that only 1 % of residuals without any effect would bring the luckiest candidate to.
 
-        What the best candidate leaves over takes a random sign in every block: such a residual is as large and as correlated
-        as the real one and holds nothing, yet the best of many candidates gains from it. Gains are compared in units of
-        each candidate's own average by chance, since laws with more parameters gain more.
+        What the best candidate leaves over takes a random sign in every block: such a residual is as large and as
+        correlated as the real one and holds nothing, yet the best of many candidates gains from it. Gains are compared
+        in units of each candidate's own average by chance, since laws with more parameters gain more.
         """
         kept = [s for s in found if s.columns.shape[1]]
         if not kept:

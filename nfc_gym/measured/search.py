@@ -1,7 +1,7 @@
-"""The search for what a model lacks: calibrate psi, screen all candidates, refit the best, select on held-out logs, repeat.
+"""The search for what a model lacks: calibrate psi, screen candidates, refit the best, select on held-out logs, repeat.
 
-Method and its reasons: Kennedy and O'Hagan (2001) for the discrepancy that must not be credited to psi; score tests with
-secants for the screening; a moving-block bootstrap (Kuensch 1989) for what is believed.
+Method and its reasons: Kennedy and O'Hagan (2001) for the discrepancy that must not be credited to psi; score tests
+with secants for the screening; a moving-block bootstrap (Kuensch 1989) for what is believed.
 """
 
 from collections.abc import Callable, Sequence
@@ -134,7 +134,7 @@ class Search:
             if best is None or len(current.plant.effects) >= self.options.most:
                 break
             current = self.refit(best.fitted, fit_metric)
-            # What the new effect explains must not go on as slack in the metric: refresh it, refit, and only then prune.
+            # What the new effect explains must not go on as slack in the metric: refresh it, refit, only then prune.
             fit_metric, select_metric = self.metrics(current)
             current = self._prune(self.refit(current, fit_metric), fit_metric, select_metric)
         generic = self._generic(screen, current, fit_metric, select_metric, outcome)
@@ -238,7 +238,7 @@ class Search:
         return outcome, best
 
     def _enough(self, j: Judged, best: Judged, current: Fit) -> float:
-        """Share of the best gain that a rival must reach: less for the best one's own law at a place that includes its place."""
+        """Share of the best gain a rival must reach: less for the best one's law at a place that includes its place."""
         rival, winner = self._new(j, current)[0], self._new(best, current)[0]
         wider = rival.family == winner.family and set(winner.where) < set(rival.where)
         return _SHARED if wider else _NEARLY
@@ -255,10 +255,10 @@ class Search:
         select_metric: Metric,
         base_losses: Array,
     ) -> Judged:
-        """Of the candidates that explain the data as well as the best one, that with the fewest parameters and the widest place.
+        """Of the candidates that explain the data as well as the best: fewest parameters, then widest place.
 
-        A law whose own feature does not show gives way to the plainer laws that it contains; and a cause that like parts share
-        is likelier than the same cause in just one of them, unless the data tell them apart.
+        A law whose own feature does not show gives way to the plainer laws that it contains; and a cause that like
+        parts share is likelier than the same cause in just one of them, unless the data tell them apart.
         """
         best = believed[0]
         rivals = [j for j in believed if j.total > self._enough(j, best, current) * best.total and self._ties(best, j)]
@@ -276,7 +276,7 @@ class Search:
     def _try(
         self, current: Fit, picks: Sequence[Screened], fit_metric: Metric, select_metric: Metric, base_losses: Array
     ) -> Judged:
-        """Refit screened candidates with everything fitted so far, from where the screening points or from where we are."""
+        """Refit screened candidates with everything fitted so far, from where screening points or where we are."""
         plant = current.plant.with_effects([*current.plant.effects, *(s.effect for s in picks)])
         limits, thetas = box(current.plant), [s.theta for s in picks]
         moved = current.x.copy()
@@ -293,7 +293,7 @@ class Search:
         self,
         current: Fit,
         effect: Effect,
-        parts: tuple[Effect, Array],
+        parts: tuple[Effect, NDArray[np.intp]],
         fit_metric: Metric,
         select_metric: Metric,
         base_losses: Array,
@@ -319,7 +319,7 @@ class Search:
         )  # fmt: skip
 
     def _believed(self, j: Judged, chance: dict[str, float], current: Fit, base_losses: Array) -> bool:
-        """Whether the gain holds on unseen logs, is worth naming, and is more than the luckiest candidate gains by chance."""
+        """Whether the gain holds on unseen logs, is worth naming, and exceeds the luckiest candidate's by chance."""
         worth = self.options.worth * (float(base_losses.sum()) + float(current.losses.sum()))
         lucky = max((chance.get(e.id, 0.0) for e in self._new(j, current)), default=0.0)
         return j.lower > 0 and j.gain > 0 and j.total > worth and float(j.fit_gains.sum()) > lucky

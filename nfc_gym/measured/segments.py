@@ -1,4 +1,4 @@
-"""Cutting logs into segments: starts, commands on the grid of physics steps, and where the samples fall on that grid."""
+"""Cutting logs into segments: starts, commands on the grid of physics steps, and where the samples fall on it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -70,7 +70,8 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
     if not which:
         longest = max(log.duration for log in logs)
         raise InputError(
-            f"no log is long enough for one segment of {max(layout.horizons):g} s (the longest has {longest:.3g} s): shorten segments.length"
+            f"no log is long enough for one segment of {max(layout.horizons):g} s (the longest has {longest:.3g} s): "
+            "shorten segments.length"
         )
     return Cut(np.array(which), np.array(starts), np.array(samples), np.array(steps))
 

@@ -1,4 +1,4 @@
-"""Local polynomial regression of a sampled signal: value, slope and curvature with their noise gain, and its noise level."""
+"""Local polynomial regression of a sampled signal: value, slope, curvature, their noise gain; noise level."""
 
 from dataclasses import dataclass
 
@@ -64,7 +64,8 @@ def estimate_noise(values: Array) -> float:
     """Standard deviation of white noise on a smooth signal (N,) or (N, k), from the spread of its third differences.
 
     Third differences of white noise have 20 times its variance while a smooth signal hardly shows in them. The median
-    absolute value ignores the instants where the signal is not smooth. Never less than what a quantised signal's step implies.
+    absolute value ignores the instants where the signal is not smooth. Never less than what a quantised signal's step
+    implies.
     """
     columns = values.reshape(len(values), -1)
     if len(columns) < 8:
@@ -78,7 +79,7 @@ def estimate_noise(values: Array) -> float:
 
 
 def moving_average(values: Array, samples: int) -> Array:
-    """Centred moving average along the first axis; the ends are zero-padded as `numpy.convolve(..., "same")` has them."""
+    """Centred moving average along the first axis; the ends are zero-padded as by `numpy.convolve(..., "same")`."""
     if samples <= 1:
         return values
     kernel = np.ones(samples) / samples

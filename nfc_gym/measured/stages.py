@@ -80,7 +80,8 @@ class Stages:
             )
         if self.folder.exists() and self._key() not in ("", key):
             raise InputError(
-                f"{out} holds an unfinished run on other inputs or another seed: choose another --out, or say --overwrite"
+                f"{out} holds an unfinished run on other inputs or another seed: "
+                "choose another --out, or say --overwrite"
             )
 
     def get(self, name: str) -> Any | None:

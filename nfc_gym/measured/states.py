@@ -21,7 +21,8 @@ class States:
 
     Attributes:
       qpos, qvel, qacc: (T, nq), (T, nv), (T, nv).
-      qpos_sd, qvel_sd: (T, nv) standard deviations in tangent space; 0 for what was never measured and is taken as at rest.
+      qpos_sd, qvel_sd: (T, nv) standard deviations in tangent space; 0 for what was never measured and is taken as at
+        rest.
       observed: (nv,) whether the degree of freedom was measured at all.
     """
 
@@ -154,6 +155,7 @@ def estimate_states(model: mujoco.MjModel, log: Log, points: int = 7) -> States:
             build.scalar(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j), q, v)
     if not build.observed.any():
         raise InputError(
-            f"log {log.name!r}: none of its channels ({', '.join(log.channels)}) measures a joint or a free body of the model"
+            f"log {log.name!r}: none of its channels ({', '.join(log.channels)}) measures a joint or a free body "
+            "of the model"
         )
     return States(build.qpos, build.qvel, build.qacc, build.qpos_sd, build.qvel_sd, build.observed)

@@ -122,17 +122,19 @@ def unexplained(v: Verified, found: Found) -> dict[str, Any] | None:
     keys = list(dict.fromkeys(zip(c.place, c.group, strict=True)))
     share = [squares[:, [k == key for k in zip(c.place, c.group, strict=True)]].sum() for key in keys]
     place, group = keys[int(np.argmax(share))]
+    largest = float(np.max(share) / max(sum(share), 1e-9))
     last = found.rounds[-1]
     nearest = next((r for r in last.ranking if not r["generic"]), None)
     total = max(float(found.extended.losses.sum()), 1e-9)
     text = last.reason or "no effect of the library explains it"
     generic = next((r for r in last.ranking if r["generic"]), None)
     if found.generic is not None and generic is not None:
-        text = f"looks like a function of {generic['id'].split(':', 1)[1]} ({generic['id'].split(':', 1)[0].replace('_', ' ')})"
+        law, where = generic["id"].split(":", 1)
+        text = f"looks like a function of {where} ({law.replace('_', ' ')})"
     return {
         "coordinate": place if place.startswith("sensor") else f"{place} ({group})",
         "where": place,
-        "description": f"largest share of the remaining misfit: {float(np.max(share) / max(sum(share), 1e-9)):.0%}; {text}",
+        "description": f"largest share of the remaining misfit: {largest:.0%}; {text}",
         "nearest": nearest["id"] if nearest else None,
         "nearest_share": max(nearest["gain_fit"], 0.0) / total if nearest else 0.0,
     }

@@ -1,1 +1,1 @@
-"""Physics over batches: model fields and parameters, tangent-space states, roll-outs, effects. Needs numpy and mujoco alone."""
+"""Physics over batches: model fields, parameters, tangent-space states, roll-outs, effects. Needs numpy, mujoco."""

@@ -16,10 +16,10 @@ def _table() -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
 
 
 def restitution_solref(restitution: ArrayLike) -> NDArray[np.float64]:
-    """Direct `solref` (..., 2) = (-omega^2, -2 zeta omega) of a contact that bounces with the given coefficient (...,), [0, 1].
+    """Direct `solref` (..., 2) = (-omega^2, -2 zeta omega) of a contact that bounces by a coefficient (...,), [0, 1].
 
-    zeta comes from a table measured with one-sided contacts at 5 ms; the textbook zeta(e) of a two-sided oscillator creates
-    energy there. Values outside the table take its ends.
+    zeta comes from a table measured with one-sided contacts at 5 ms; the textbook zeta(e) of a two-sided oscillator
+    creates energy there. Values outside the table take its ends.
     """
     omega, e, zeta = _table()
     order = np.argsort(e)

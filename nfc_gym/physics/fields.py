@@ -1,7 +1,7 @@
 """`ModelFields`: one door to the fields of a single `MjModel` or of every simulation of a `mujoco.batch.Batch`.
 
-Whoever writes a parameter or an effect writes it once, against arrays with any leading batch shape; writes start from the
-nominal model, so that repeated randomisation never compounds, and derived constants follow at `commit`.
+Whoever writes a parameter or an effect writes it once, against arrays with any leading batch shape; writes start from
+the nominal model, so that repeated randomisation never compounds, and derived constants follow at `commit`.
 """
 
 import mujoco
@@ -49,7 +49,7 @@ def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
 
 
 def rows_of(model: mujoco.MjModel, field: str, names: tuple[str, ...]) -> NDArray[np.intp]:
-    """Row indices of `field` that belong to the named objects (a joint's dofs for `dof_*`, its coordinates for `qpos_*`)."""
+    """Row indices of `field` that belong to the named objects (joints' dofs for `dof_*`, coordinates for `qpos_*`)."""
     prefix = field.split("_", 1)[0]
     if prefix not in _KINDS:
         raise InputError(

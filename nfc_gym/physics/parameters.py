@@ -72,7 +72,7 @@ def _write_restitution(fields: ModelFields, rows: NDArray[np.intp], value: Array
     fields["geom_solref"][..., rows, :] = restitution_solref(value)
 
 
-# Compound fields: several model fields that one physical number moves together -> (field its rows are named by, writer).
+# Compound fields: several model fields that one physical number moves together -> (field that names its rows, writer).
 COMPOUND = {
     "body_mass": ("body_mass", _write_mass),
     "servo_kv": ("actuator_gainprm", _write_servo_kv),

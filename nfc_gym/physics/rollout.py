@@ -1,8 +1,8 @@
 """Batched multiple-shooting roll-outs on `mujoco.batch`, with effects acting through their hooks at every physics step.
 
-Rows of the batch are pairs (parameter vector, segment), parameter vectors slowest. Derived quantities that effects read are
-one substep behind the state, exactly as they are in an `MjData` between two calls of `mj_step`, so that a wrapper around a
-single environment and this roll-out agree bit for bit.
+Rows of the batch are pairs (parameter vector, segment), parameter vectors slowest. Derived quantities that effects read
+are one substep behind the state, exactly as they are in an `MjData` between two calls of `mj_step`, so that a wrapper
+around a single environment and this roll-out agree bit for bit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,8 +44,8 @@ class Segments:
       exogenous: name -> (S, H + K).
       known: (field, object names) -> (S, H + K) model fields that the log itself gives.
       servo: per `Servo`, its gain, supply and damping, (S, H + K) each.
-      settle: steps for which the first command is held before the start; velocities and hidden states are then kept, the
-        positions go back to the measured ones. 0 starts at the measured velocities.
+      settle: steps for which the first command is held before the start; velocities and hidden states are then kept,
+        the positions go back to the measured ones. 0 starts at the measured velocities.
     """
 
     dt: float
@@ -313,7 +313,7 @@ class _Run:
 
 
 def advance_activations(model: mujoco.MjModel, ctrl: Array, act: Array, dt: float, settle: bool) -> None:
-    """One step of first-order actuator states (..., na) under commands (..., nu), in place; `settle` holds them for ever."""
+    """One step of first-order actuator states (..., na) under commands (..., nu), in place; `settle`: held for ever."""
     filters = {int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)}
     for i in range(model.nu):
         if int(model.actuator_dyntype[i]) not in filters:

@@ -1,7 +1,7 @@
 """Differences and sums of MuJoCo states in tangent space, over arrays with any leading batch shape.
 
-A configuration holds unit quaternions (free and ball joints), whose differences live in three numbers: the rotation vector
-in the body's own frame, as `mj_differentiatePos` and `mj_integratePos` have it.
+A configuration holds unit quaternions (free and ball joints), whose differences live in three numbers: the rotation
+vector in the body's own frame, as `mj_differentiatePos` and `mj_integratePos` have it.
 """
 
 import mujoco

@@ -1,9 +1,9 @@
 """`Effect`: one physical effect that a model may lack.
 
-The same object is calibrated, wrapped around an environment, saved beside a model and named in a report. It acts through
-one or more hooks. Every hook is a pure function over arrays with any leading batch shape `...`; `theta` is (..., k), the
-effect's parameters in the order of `params`. In one physics step hooks run in this order: `action` on the command, `model`
-(once, when a simulation is set up), `friction` and `force` on the state before the step, `sense` on what is measured.
+The same object is calibrated, wrapped around an environment, saved beside a model and named in a report. It acts
+through one or more hooks. Every hook is a pure function over arrays with any leading batch shape `...`; `theta` is
+(..., k), the effect's parameters in the order of `params`. In one physics step hooks run in this order: `action` on the
+command, `model` (once, at set-up), `friction` and `force` on the state before the step, `sense` on what is measured.
 
 At its null value an effect leaves the simulator's result unchanged bit for bit, by arithmetic and not by skipping it.
 """
@@ -95,7 +95,7 @@ class Context:
 
 @dataclass
 class Forces:
-    """Where `force` hooks add: generalised forces (..., nv) and world-frame body wrenches (..., nbody, 6) at the com."""
+    """Where `force` hooks add: generalised forces (..., nv); world-frame body wrenches (..., nbody, 6) at the com."""
 
     qfrc: Array
     xfrc: Array
@@ -113,7 +113,7 @@ class Effect(ABC):
     summary: ClassVar[str]
     # A member of the generic alternatives takes part in every contest but is never claimed by name.
     generic: ClassVar[bool] = False
-    # Families that together do the same at the same place unless this law's own feature shows: claimed instead where it does not.
+    # Families that together do the same at the same place unless this law's own feature shows; else claimed instead.
     simpler: ClassVar[tuple[tuple[str, ...], ...]] = ()
     # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
     PARAMS: ClassVar[tuple[Param, ...]] = ()
@@ -168,7 +168,7 @@ class Effect(ABC):
             raise InputError(f"{cls.family} has the parameters {', '.join(known)}, got: {', '.join(names) or 'none'}")
         return cls.PARAMS
 
-    def bind(self, model: mujoco.MjModel) -> None:
+    def bind(self, model: mujoco.MjModel) -> None:  # noqa: B027 (most effects need no more than names)
         """Resolve names to addresses once; a name that the model lacks raises `InputError`."""
 
     # ---- hooks ----------------------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ class Effect(ABC):
         """Structural edit that lets plain MJCF carry the effect; returns whether it now does. theta (k,)."""
         return False
 
-    def model(self, fields: ModelFields, theta: Array) -> None:
+    def model(self, fields: ModelFields, theta: Array) -> None:  # noqa: B027 (a hook: does nothing by design)
         """Edit model fields in place, starting from what is there (nominal, or psi's value)."""
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
@@ -194,11 +194,11 @@ class Effect(ABC):
         """Dry friction to add: (dofs (n,), level (..., n) >= 0 in N or N m). MuJoCo's constraint solver applies it."""
         raise NotImplementedError
 
-    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:  # noqa: B027 (a hook: does nothing by design)
         """Add generalised forces or body wrenches for the coming step."""
 
     def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
-        """Inverse mode: forces that a motion needs of the actuators along time (T, nu) -> forces that were commanded. theta (k,)."""
+        """Inverse mode: forces (T, nu) that a motion needs of the actuators -> those commanded. theta (k,)."""
         return force
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
@@ -262,10 +262,10 @@ def actuator_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp
 
 
 def groups(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Places made of `names`: each alone, all together, and the sets that share a kind (`fl_hip`, `fr_hip`, ... -> hips).
+    """Places made of `names`: each alone, all together, and sets that share a kind (`fl_hip`, `fr_hip`, ... -> hips).
 
-    Names are read as words; the words that tell corners and sides apart (fl, rear, left, 1) are set aside, and names that
-    agree in the rest form a set.
+    Names are read as words; the words that tell corners and sides apart (fl, rear, left, 1) are set aside, and names
+    that agree in the rest form a set.
     """
     corners = {
         "fl",

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -29,7 +30,7 @@ class Each(Effect):
         params = [replace(p, name=f"{p.name}@{m.place}") for m in members for p in m.params]
         super().__init__([w for m in members for w in m.where], params)
         sizes = np.cumsum([0, *(len(m.params) for m in members)])
-        self._parts = [slice(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+        self._parts = [slice(a, b) for a, b in pairwise(sizes)]
 
     @property
     def id(self) -> str:
@@ -99,7 +100,7 @@ def each(members: Sequence[Effect]) -> Each:
 
 
 def split(effect: Effect, plant: "Plant") -> tuple[Effect, NDArray[np.intp]] | None:
-    """A tied effect at several places as an `Each`, and which old parameter each new one starts from; None where it cannot."""
+    """A tied effect of several places as `Each`, and the old parameter each new one starts from; None if it cannot."""
     if isinstance(effect, Each) or len(effect.where) < 2 or effect.generic:
         return None
     members = [type(effect)((name,), effect.params) for name in effect.where]
