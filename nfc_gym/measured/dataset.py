@@ -141,7 +141,7 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
     if defects:
         return None, defects
     parts = {"controls": controls, "channels": channels, "exogenous": exogenous, "known": known, "servo": servo}
-    log = attempt("log", lambda: Log(name=source.name, time=time, group=source.group, **parts))  # pyright: ignore
+    log = attempt("log", lambda: Log(name=source.name, time=time, group=source.group, **parts))
     return log, defects
 
 

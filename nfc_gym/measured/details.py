@@ -99,13 +99,13 @@ def _instant_traces(v: Verified, models: Models) -> list[dict[str, Any]]:
     """The first stretch of a verification log: measured and predicted values."""
     problem = v.problem
     i = int(problem.log_of[0])
-    t = problem.tracks[i]  # type: ignore[attr-defined]
+    t = problem.tracks[i]
     curves = {
         stage: problem.smoothed(problem.evaluate(p, x[None], [t])[0][0])
         for stage, p, x in models.items()
         if stage != "nominal"
-    }  # type: ignore[attr-defined]
-    measured = problem.smoothed(np.nan_to_num(t.measured))  # type: ignore[attr-defined]
+    }
+    measured = problem.smoothed(np.nan_to_num(t.measured))
     good = np.flatnonzero(t.mask.any(1))
     rows = good[: 3 * _POINTS : max(1, len(good[: 3 * _POINTS]) // _POINTS)]
     what = list(dict.fromkeys(zip(problem.columns.place, problem.columns.unit, strict=True)))

@@ -18,7 +18,7 @@ _LIGHT = 1e-3  # share of mass below which a body only carries another
 
 def sized(params: Iterable[Param], **changes: dict[str, object]) -> tuple[Param, ...]:
     """The same parameters with some attributes replaced, by parameter name."""
-    return tuple(replace(p, **changes.get(p.name, {})) for p in params)  # type: ignore[arg-type]
+    return tuple(replace(p, **changes.get(p.name, {})) for p in params)
 
 
 def with_units(params: Iterable[Param], units: dict[str, str]) -> tuple[Param, ...]:
