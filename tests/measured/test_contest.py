@@ -1,0 +1,196 @@
+"""Believing a candidate: folds that leave out, clusters that belong together, and gains that are not chance."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nfc_gym.measured.contest import (
+    Judged,
+    bootstrap,
+    clusters,
+    dispersion,
+    fold_of,
+    left_out_losses,
+    not_worse,
+    shortlist,
+)
+from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.metric import loss, metric
+from nfc_gym.measured.problem import Columns, Problem
+
+
+class Line(Problem):
+    """y = 1 + noise in blocks of four numbers, fitted by Legendre polynomials of t: every answer is known.
+
+    Bounds are so wide that the pull towards nominal is nothing and the fit is plain regression.
+    """
+
+    def __init__(self, blocks: int, noise: float, seed: int, logs: int = 5) -> None:
+        rng = np.random.default_rng(seed)
+        self.t = rng.uniform(-1, 1, (blocks, 4))
+        self.y = 1.0 + noise * rng.normal(size=self.t.shape)
+        self.noise = noise
+        self.mask = np.ones(self.t.shape, bool)
+        self.log_of = np.repeat(np.arange(logs), -(-blocks // logs))[:blocks]
+        self.time_of = 0.4 * (np.arange(blocks) - np.searchsorted(self.log_of, self.log_of))
+        self.names = tuple(f"log_{k}" for k in range(logs))
+        self.columns = Columns(("y",) * 4, ("1",) * 4, np.zeros(4), ("joint:j",) * 4)
+
+    def basis(self, size: int) -> np.ndarray:
+        return np.polynomial.legendre.legvander(self.t, size - 1)
+
+    def residual(self, plant: Any, x: np.ndarray) -> np.ndarray:
+        return self.y - np.einsum("smk,pk->psm", self.basis(x.shape[1]), x)
+
+    def covariance(self, plant: Any, x: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self.noise**2 * np.eye(4), (len(self), 4, 4))
+
+    def take(self, index): ...  # type: ignore[override]
+    def synthetic(self, plant, x, rng): ...  # type: ignore[override]
+
+
+def flat(size: int) -> Any:
+    """A plant with `size` free numbers and no model: regression needs none."""
+    wide = np.full(size, 1e9)
+    space = SimpleNamespace(low=-wide, high=wide, free=np.ones(size, bool))
+    return SimpleNamespace(space=space, effects=(), null=np.zeros(size))
+
+
+def regress(problem: Line, size: int) -> tuple[Fit, Any]:
+    """Least squares of a polynomial with `size` coefficients, as a `Fit`."""
+    plant = flat(size)
+    x = np.linalg.lstsq(problem.basis(size).reshape(-1, size), problem.y.ravel(), rcond=None)[0]
+    under = metric(problem, problem.covariance(plant, x))
+    scale = (plant.space.high - plant.space.low) / 4
+    white = under.whiten(problem.residual(plant, x[None]))[0]
+    return Fit(plant, x, white, -problem.basis(size) * scale / problem.noise), under
+
+
+def placed(log_of: list[int], time_of: list[float]) -> Any:
+    return SimpleNamespace(log_of=np.array(log_of), time_of=np.array(time_of), __len__=None)
+
+
+def test_blocks_near_in_time_share_a_cluster_and_logs_never_do() -> None:
+    found = clusters(placed([0, 0, 0, 1, 1, 2], [0.0, 0.4, 0.6, 0.0, 0.2, 0.0]))
+    assert found.shape == (6,)
+    assert found[0] == found[1] != found[2]
+    assert found[3] == found[4]
+    assert len(set(found.tolist())) == 4
+    assert set(found.tolist()) == set(range(4))
+    assert len(set(clusters(placed([0] * 4, [0, 0.4, 0.8, 1.2]), 10.0).tolist())) == 1
+
+
+def test_whole_logs_are_left_out_where_there_are_several() -> None:
+    problem = Line(40, 1, 0, logs=5)
+    folds = fold_of(problem)
+    for k in range(5):
+        assert len(set(folds[problem.log_of == k].tolist())) == 1
+    assert len(set(folds.tolist())) == 5
+    many = Line(60, 1, 0, logs=20)
+    assert set(fold_of(many, most=8).tolist()) == set(range(8))
+    assert all(len(set(fold_of(many)[many.log_of == k].tolist())) == 1 for k in range(20))
+
+
+@pytest.mark.parametrize("logs", [1, 2])
+def test_few_logs_are_cut_in_stretches(logs: int) -> None:
+    problem = Line(40, 1, 0, logs=logs)
+    folds = fold_of(problem)
+    assert np.bincount(folds).tolist() == [5] * 8
+    for k in range(logs):  # consecutive in time, never interleaved
+        of = problem.log_of == k
+        assert (np.diff(folds[of][np.argsort(problem.time_of[of])]) >= 0).all()
+
+
+def test_bootstrap_has_the_mean_and_spread_of_a_sum_over_clusters() -> None:
+    rng = np.random.default_rng(0)
+    blocks = np.repeat(np.arange(50), 4)
+    common = np.repeat(rng.normal(1, 1, 50), 4)  # the blocks of a cluster all err alike
+    draws = bootstrap(common, blocks, rng, draws=20_000)
+    sums = np.bincount(blocks, common)
+    assert draws.mean() == pytest.approx(common.sum(), abs=0.03 * np.sqrt(50) * sums.std())
+    assert draws.std() == pytest.approx(np.sqrt(50) * sums.std(), rel=0.03)
+    apart = bootstrap(common, np.arange(200), rng, draws=20_000)
+    assert draws.std() == pytest.approx(2 * apart.std(), rel=0.1)  # taken as independent they would seem surer
+
+
+def test_left_out_losses_are_those_of_a_refit() -> None:
+    """Against regression that truly leaves each fold out; the damped step comes within a few per cent of its cost."""
+    problem = Line(40, 0.1, 1)
+    result, under = regress(problem, 3)
+    folds = fold_of(problem)
+    found = left_out_losses(problem, under, result, folds)
+    exact = np.empty(len(problem))
+    for k in np.unique(folds):
+        of = folds == k
+        x = np.linalg.lstsq(problem.basis(3)[~of].reshape(-1, 3), problem.y[~of].ravel(), rcond=None)[0]
+        exact[of] = loss(under.whiten(problem.residual(None, x[None])))[0][of]
+    inside = result.losses
+    assert (found - inside).sum() == pytest.approx((exact - inside).sum(), rel=0.25)
+    np.testing.assert_allclose(found, exact, atol=0.2 * inside.mean())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_superfluous_parameter_pays_on_what_it_did_not_see(seed: int) -> None:
+    """y has no slope and no curvature: in-sample they always gain, left out they lose."""
+    problem = Line(30, 0.1, seed)
+    (small, under), (large, _) = regress(problem, 1), regress(problem, 6)
+    folds = fold_of(problem)
+    outside = [left_out_losses(problem, under, f, folds).sum() for f in (small, large)]
+    assert large.losses.sum() < small.losses.sum()
+    for f, out in zip((small, large), outside, strict=True):
+        assert out > f.losses.sum()
+    optimism = [out - f.losses.sum() for f, out in zip((small, large), outside, strict=True)]
+    assert optimism[1] > optimism[0]
+
+
+def test_superfluous_parameters_lose_on_average() -> None:
+    lost = []
+    for seed in range(40):
+        problem = Line(30, 0.1, 100 + seed)
+        (small, under), (large, _) = regress(problem, 1), regress(problem, 6)
+        folds = fold_of(problem)
+        out = [left_out_losses(problem, under, f, folds).sum() for f in (small, large)]
+        lost.append(out[1] - out[0])
+    assert np.mean(lost) > 3 * np.std(lost) / np.sqrt(len(lost))
+
+
+def test_dispersion_is_the_loss_of_one_number() -> None:
+    assert dispersion(regress(Line(2000, 0.3, 2), 1)[0]) == pytest.approx(0.93, abs=0.05)  # robust: a little below 1
+
+
+def judged(gains: np.ndarray, fit_gains: np.ndarray) -> Judged:
+    return Judged(None, gains, fit_gains, float(gains.sum() + fit_gains.sum()), 0.0)  # type: ignore[arg-type]
+
+
+def test_not_worse_is_symmetric_between_equals() -> None:
+    rng = np.random.default_rng(3)
+    blocks = np.arange(100)
+    base = rng.normal(5, 1, 100)
+    one, same = judged(base, base), judged(base, base)
+    other = judged(base + rng.normal(0, 1, 100), base + rng.normal(0, 1, 100))
+    assert not_worse(one, same, blocks, blocks, rng)
+    assert not_worse(one, other, blocks, blocks, rng)
+    assert not_worse(other, one, blocks, blocks, rng)
+
+
+def test_not_worse_tells_a_clear_difference_from_one_lucky_block() -> None:
+    rng = np.random.default_rng(4)
+    blocks = np.arange(100)
+    base = rng.normal(5, 1, 100)
+    best, worse = judged(base, base), judged(base - 1, base - 1)
+    assert not not_worse(best, worse, blocks, blocks, rng)
+    assert not_worse(worse, best, blocks, blocks, rng)
+    lucky = base + rng.normal(0, 0.1, 100)
+    lucky[0] += 500
+    assert not_worse(judged(lucky, base), best, blocks, blocks, rng)
+
+
+def test_no_family_crowds_out_the_others() -> None:
+    row = lambda family, gain: SimpleNamespace(effect=SimpleNamespace(family=family), gain=gain)  # noqa: E731
+    screened = [row("coulomb", 100 - k) for k in range(10)] + [row("lag", 50), row("gain", 40), row("offset", -1)]
+    picked = shortlist(screened, size=8, each=3)
+    assert [s.effect.family for s in picked] == ["coulomb"] * 3 + ["lag", "gain"]
+    assert [s.gain for s in picked] == [100, 99, 98, 50, 40]
+    assert len(shortlist(screened, size=2)) == 2
