@@ -1,0 +1,243 @@
+"""What is compared with what: residuals at the truth are noise; forces and sensors are those of the closed form."""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+
+from nfc_gym.core import Channel, InputError, Log
+from nfc_gym.measured.instant import ForwardProblem, InverseProblem
+from nfc_gym.measured.metric import metric
+from nfc_gym.measured.problem import RolloutProblem, interpolate
+from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.states import estimate_states
+from nfc_gym.physics.parameters import Parameter, ParameterSpace
+from nfc_gym.physics.rollout import Plant
+
+DT, MASS, LENGTH, DAMPING, GEAR = 0.005, 0.5, 0.3, 0.1, 2.0
+SD_Q, SD_V = 0.002, 0.02
+PENDULUM = f"""
+<mujoco>
+  <option timestep="{DT}" integrator="implicitfast"/>
+  <worldbody>
+    <body name="bob">
+      <joint name="hinge" axis="0 1 0" damping="{DAMPING}"/>
+      <geom name="ball" size="0.03" pos="0 0 -{LENGTH}" mass="{MASS}"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" gear="{GEAR}"/></actuator>
+</mujoco>
+"""
+BODY = f"""
+<mujoco>
+  <option timestep="{DT}"/>
+  <worldbody>
+    <body name="base" pos="0 0 1">
+      <freejoint name="root"/>
+      <geom name="hull" type="box" size="0.1 0.1 0.05" mass="2"/>
+      <site name="imu"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="thrust" site="imu" gear="0 0 1 0 0 0"/></actuator>
+  <sensor><accelerometer name="acc" site="imu"/><gyro name="gyro" site="imu"/></sensor>
+</mujoco>
+"""
+
+
+def torque(t: np.ndarray, seed: int) -> np.ndarray:
+    a, b = np.random.default_rng(seed).uniform(0, 6, 2)
+    return 0.4 * np.sin(3 * t + a) + 0.2 * np.sin(7 * t + b)
+
+
+def run(model: mujoco.MjModel, seed: int, seconds: float = 3.0, clean: bool = False, every: int = 2) -> Log:
+    """A swing stepped by MuJoCo alone and measured at every second step, with the declared noise."""
+    rng = np.random.default_rng(1000 + seed)
+    data = mujoco.MjData(model)
+    data.qpos[0] = rng.uniform(-1, 1)
+    t = np.arange(round(seconds / DT / every)) * DT * every
+    u, q, v = torque(t, seed), np.empty(len(t)), np.empty(len(t))
+    for k in range(len(t)):
+        q[k], v[k] = data.qpos[0], data.qvel[0]
+        data.ctrl[0] = u[k]
+        mujoco.mj_step(model, data, every)
+    noise = 0 if clean else 1
+    q, v = q + noise * SD_Q * rng.normal(size=len(t)), v + noise * SD_V * rng.normal(size=len(t))
+    channels = {"joint:hinge:pos": Channel(q, "rad", SD_Q), "joint:hinge:vel": Channel(v, "rad/s", SD_V)}
+    return Log(f"run_{seed}", t, {"ctrl:motor": u}, channels)
+
+
+@pytest.fixture(scope="module")
+def plant() -> Plant:
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    return Plant(
+        model, ParameterSpace(model, [Parameter("damping", "dof_damping", ("hinge",), "N m s", 0, 0.5)]), nthread=1
+    )
+
+
+def rollouts(plant: Plant, clean: bool = False, history: float = 0.0, logs: int = 5) -> RolloutProblem:
+    runs = [run(plant.model, seed, clean=clean) for seed in range(logs)]
+    states = [estimate_states(plant.model, log) for log in runs]
+    return RolloutProblem(plant.model, runs, states, Layout(0.3, history, (0.1, 0.2, 0.3), 0.3, DT))
+
+
+def chi2(problem: RolloutProblem, plant: Plant, x: np.ndarray) -> np.ndarray:
+    return metric(problem, problem.covariance(plant, x)).whiten(problem.residual(plant, x[None]))[0] ** 2
+
+
+@pytest.mark.parametrize("history", [0.0, 0.2])
+def test_at_the_truth_the_residual_is_noise(plant: Plant, history: float) -> None:
+    problem = rollouts(plant, history=history)
+    right, wrong = np.array([DAMPING]), np.array([2 * DAMPING])
+    assert problem.columns.group == ("joint angle",) * 3 + ("joint speed",) * 3
+    np.testing.assert_allclose(problem.columns.horizon, [0.1, 0.2, 0.3] * 2)
+    assert chi2(problem, plant, right).mean() == pytest.approx(1, abs=0.2)
+    assert chi2(problem, plant, wrong).mean() > 3
+
+
+def test_synthetic_data_are_noise_at_their_own_parameters(plant: Plant) -> None:
+    rng, x = np.random.default_rng(0), np.array([0.25])
+    problem = rollouts(plant)
+    twins = [problem.synthetic(plant, x, rng) for _ in range(8)]
+    assert np.mean([chi2(t, plant, x).mean() for t in twins]) == pytest.approx(1, abs=0.15)
+    assert all(chi2(t, plant, np.array([DAMPING])).mean() > 2 for t in twins)
+    assert chi2(problem, plant, x).mean() > 2  # the original is left as it was
+    differ = twins[0].residual(plant, x[None]) - twins[1].residual(plant, x[None])
+    assert (differ != 0).all()
+
+
+def test_covariance_holds_the_noise_of_the_start(plant: Plant) -> None:
+    """Sensor noise alone is too little: a start speed that is off carries through the segment, as repeats show."""
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    model.opt.timestep = dt = DT / 10  # so fine that the discretisation adds nothing
+    fine, x = Plant(model, plant.space, nthread=1), np.array([DAMPING])
+    log = run(plant.model, 0)
+    problem = RolloutProblem(model, [log], [estimate_states(model, log)], Layout(0.3, 0, (0.1, 0.2, 0.3), 0.3, dt))
+    sigma = np.einsum("sii->si", problem.covariance(fine, x))
+    sensor = np.repeat([SD_Q**2, SD_V**2], 3)
+    assert (sigma >= sensor * (1 - 1e-9)).all()
+    assert (sigma[:, :3] > 1.2 * SD_Q**2).all()
+    rng = np.random.default_rng(1)
+    errors = np.stack([problem.synthetic(fine, x, rng).residual(fine, x[None])[0] for _ in range(200)])
+    found = errors.var(0)
+    assert (found > 1.05 * sensor)[:, :3].mean() > 0.9
+    assert np.mean(found / sigma) == pytest.approx(1, abs=0.1)
+
+
+def test_rollouts_of_clean_logs_start_where_the_machine_was(plant: Plant) -> None:
+    """Without noise what remains is the local fit's own error at the start, far below the declared noise."""
+    residual = rollouts(plant, clean=True).residual(plant, np.array([[DAMPING]]))[0]
+    assert np.sqrt((residual[:, :3] ** 2).mean()) < 0.2 * SD_Q
+    assert np.sqrt((residual[:, 3:] ** 2).mean()) < 0.2 * SD_V
+
+
+def test_take_picks_blocks(plant: Plant) -> None:
+    problem, x = rollouts(plant), np.array([0.2])
+    index = np.array([7, 0, 31])
+    some = problem.take(index)
+    assert len(some) == 3
+    np.testing.assert_array_equal(some.log_of, problem.log_of[index])
+    np.testing.assert_array_equal(some.time_of, problem.time_of[index])
+    np.testing.assert_allclose(some.residual(plant, x[None])[0], problem.residual(plant, x[None])[0, index], atol=1e-12)
+    np.testing.assert_allclose(some.covariance(plant, x), problem.covariance(plant, x)[index], atol=1e-15)
+    np.testing.assert_allclose(
+        some.take(np.array([2])).residual(plant, x[None])[0], some.residual(plant, x[None])[0, 2:], atol=1e-12
+    )
+
+
+def test_an_unstable_roll_out_has_no_residual(plant: Plant) -> None:
+    problem = rollouts(plant, logs=1)
+    residual = problem.residual(plant, np.array([[DAMPING], [-400.0]]))
+    assert np.isfinite(residual[0]).all()
+    assert np.isnan(residual[1]).all()
+
+
+def test_too_short_logs_are_named(plant: Plant) -> None:
+    log = run(plant.model, 0, seconds=0.2)
+    with pytest.raises(
+        InputError, match=r"no log is long enough for one segment of 0\.3 s \(the longest has 0\.19 s\)"
+    ):
+        RolloutProblem(plant.model, [log], [estimate_states(plant.model, log)], Layout(0.3, 0, (0.1, 0.3), 0.3, DT))
+
+
+def test_interpolation_between_steps() -> None:
+    grid = np.arange(5.0).reshape(1, 1, 5, 1) ** 2
+    out = interpolate(grid, np.array([[0.0, 0.5, 2.25, 4.0]]), quaternion=False)
+    np.testing.assert_allclose(out[0, 0, :, 0], [0, 0.5, 4 + 0.25 * 5, 16])
+
+
+def analytic(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return 0.8 * np.sin(3 * t), 2.4 * np.cos(3 * t), -7.2 * np.sin(3 * t)
+
+
+def forces(q: np.ndarray, v: np.ndarray, a: np.ndarray, damping: float) -> np.ndarray:
+    """What the motor must give for the motion of a ball on a rod: (I a + d v + m g l sin q) / gear."""
+    inertia = MASS * (LENGTH**2 + 0.4 * 0.03**2)
+    return (inertia * a + damping * v + MASS * 9.81 * LENGTH * np.sin(q)) / GEAR
+
+
+def test_inverse_problem_gives_the_forces_of_the_closed_form(plant: Plant) -> None:
+    t = np.arange(0, 3, 0.005)
+    q, v, a = analytic(t)
+    sd = 1e-3
+    measured = forces(q, v, a, DAMPING) + sd * np.random.default_rng(0).normal(size=len(t))
+    channels = {
+        "joint:hinge:pos": Channel(q, "rad", 1e-4),
+        "joint:hinge:vel": Channel(v, "rad/s", 1e-4),
+        "joint:hinge:acc": Channel(a, "rad/s^2", 1e-4),
+        "force:motor": Channel(measured, "N m", sd),
+    }
+    log = Log("swing", t, {"ctrl:motor": np.zeros_like(t)}, channels)
+    problem = InverseProblem(plant.model, [log], [estimate_states(plant.model, log)], 0.25)
+    x = np.array([[DAMPING], [0.3]])
+    predicted = problem.evaluate(plant, x, problem.tracks)[0]
+    for row, damping in zip(predicted, x[:, 0], strict=True):
+        np.testing.assert_allclose(row[:, 0], forces(q, v, a, damping), atol=1e-4)
+    residual = problem.residual(plant, x)
+    assert (residual[0] ** 2 / sd**2).mean() == pytest.approx(1, abs=0.2)
+    assert (residual[1] ** 2 / sd**2).mean() > 100
+    assert problem.columns.group[0] == "torque"
+    assert problem.columns.place[0] == "actuator:motor"
+    np.testing.assert_allclose(problem.take(np.array([4, 2])).residual(plant, x), residual[:, [4, 2]], atol=1e-12)
+    twin = problem.synthetic(plant, x[1], np.random.default_rng(1))
+    assert (twin.residual(plant, x[1:]) ** 2 / sd**2).mean() == pytest.approx(1, abs=0.2)
+
+
+def flight(rotating: bool) -> Log:
+    """A body that leans, under a thrust that varies: its accelerometer shows thrust / mass along its own z."""
+    t = np.arange(0, 2, 0.01)
+    thrust = 20 + 5 * np.sin(4 * t)
+    angle = 0.4 * t if rotating else np.full_like(t, 0.3)
+    quat = np.stack([np.cos(angle / 2), np.sin(angle / 2), 0 * t, 0 * t], 1)
+    position = np.stack([0 * t, 0 * t, 1 + 0.3 * t], 1)
+    acc = np.stack([0 * t, 0 * t, thrust / 2.0], 1)
+    channels = {
+        "body:base:pos": Channel(position, "m", 1e-3),
+        "body:base:quat": Channel(quat, "1", 1e-4),
+        "sensor:acc": Channel(acc + 0.01 * np.random.default_rng(0).normal(size=acc.shape), "m/s^2", 0.01),
+        "sensor:gyro": Channel(np.stack([np.full_like(t, 0.4 if rotating else 0.0), 0 * t, 0 * t], 1), "rad/s", 0.01),
+    }
+    return Log("flight", t, {"ctrl:thrust": thrust}, channels)
+
+
+@pytest.mark.parametrize("rotating", [False, True])
+def test_forward_problem_reads_the_accelerometer_of_the_closed_form(rotating: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(BODY)
+    plant = Plant(model, ParameterSpace(model, [Parameter("mass", "body_mass", ("base",), "kg", 1, 4)]), nthread=1)
+    log = flight(rotating)
+    problem = ForwardProblem(model, [log], [estimate_states(model, log)], 0.25)
+    predicted = problem.evaluate(plant, np.array([[2.0], [3.0]]), problem.tracks)[0]
+    for row, mass in zip(predicted, (2.0, 3.0), strict=True):
+        np.testing.assert_allclose(row[:, :2], 0, atol=1e-6)
+        np.testing.assert_allclose(row[:, 2], log.controls["ctrl:thrust"] / mass, rtol=1e-6)
+        np.testing.assert_allclose(row[:, 3:], log.channels["sensor:gyro"].values, atol=1e-6)
+    residual = problem.residual(plant, np.array([[2.0]]))[0]
+    acc = np.array([g == "sensor acc" for g in problem.columns.group])
+    assert (residual[:, acc] ** 2).mean() == pytest.approx(1e-4, rel=0.2)
+
+
+@pytest.mark.parametrize(("kind", "word"), [(InverseProblem, "force:<actuator>"), (ForwardProblem, "sensor:<name>")])
+def test_instant_problems_say_which_channel_they_need(plant: Plant, kind: Callable, word: str) -> None:
+    log = run(plant.model, 0)
+    with pytest.raises(InputError, match=word):
+        kind(plant.model, [log], [estimate_states(plant.model, log)], 0.25)

@@ -1,0 +1,108 @@
+"""Local polynomials reproduce what they can represent, say truly how noisy they are, and noise is read off a signal."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nfc_gym.measured.smoothing import estimate_noise, fresh_samples, local_polynomial, moving_average
+
+uneven = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.015, 80))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(st.floats(-3, 3), min_size=4, max_size=4),
+    st.integers(5, 11),
+    st.lists(st.floats(-0.02, 0.85), min_size=1, max_size=5),
+)
+def test_a_cubic_is_reproduced_with_its_derivatives(c: list[float], points: int, at: list[float]) -> None:
+    """Anywhere: between samples, at both ends, a little beyond them, and with uneven steps."""
+    cubic, times = np.polynomial.Polynomial(c), np.array(at)
+    fit = local_polynomial(uneven, np.stack([cubic(uneven), 2 * cubic(uneven)], 1), times, points)
+    for scale, column in ((1, 0), (2, 1)):
+        np.testing.assert_allclose(fit.value[:, column], scale * cubic(times), atol=1e-8)
+        np.testing.assert_allclose(fit.slope[:, column], scale * cubic.deriv()(times), atol=1e-6)
+        np.testing.assert_allclose(fit.curvature[:, column], scale * cubic.deriv(2)(times), atol=1e-3)
+
+
+def test_the_error_on_a_smooth_signal_is_of_fourth_order() -> None:
+    def worst(step: float) -> float:
+        t = np.arange(0, 1, step)
+        at = np.linspace(0.3, 0.7, 37)
+        return float(np.abs(local_polynomial(t, np.sin(5 * t)[:, None], at).slope[:, 0] - 5 * np.cos(5 * at)).max())
+
+    # The slope of a cubic fit errs by step^3; half the step, an eighth of the error.
+    assert 5 < worst(0.02) / worst(0.01) < 13
+
+
+@pytest.mark.parametrize("points", [5, 7, 11])
+def test_noise_gain_is_what_a_monte_carlo_finds(points: int) -> None:
+    rng = np.random.default_rng(1)
+    at = np.array([uneven[0], uneven[3], 0.31, uneven[40], uneven[-1]])  # the ends are the noisiest
+    draws = rng.normal(size=(len(uneven), 20_000))
+    fit = local_polynomial(uneven, draws, at, points)
+    np.testing.assert_allclose(fit.value_gain, fit.value.std(1), rtol=0.03)
+    np.testing.assert_allclose(fit.slope_gain, fit.slope.std(1), rtol=0.03)
+    assert fit.value_gain[0] > fit.value_gain[3]
+
+
+def test_short_signals_lower_the_degree() -> None:
+    t = np.array([0.0, 0.1, 0.2])
+    fit = local_polynomial(t, (3 * t + 1)[:, None], t)
+    np.testing.assert_allclose(fit.slope[:, 0], 3, atol=1e-9)
+    np.testing.assert_array_equal(fit.curvature, 0)
+    two = local_polynomial(t[:2], np.array([[1.0], [2.0]]), t[:2])
+    np.testing.assert_allclose(two.value[:, 0], 1.5)
+    np.testing.assert_allclose(two.value_gain, np.sqrt(0.5))
+
+
+@pytest.mark.parametrize("sd", [1e-4, 1e-2, 0.3])
+@pytest.mark.parametrize("columns", [1, 3])
+def test_noise_is_estimated_on_a_smooth_signal(sd: float, columns: int) -> None:
+    rng = np.random.default_rng(2)
+    t = np.arange(0, 20, 0.01)
+    smooth = np.sin(2 * t)[:, None] * np.arange(1, columns + 1) + 0.1 * t[:, None] ** 2
+    assert estimate_noise(smooth + sd * rng.normal(size=smooth.shape)) == pytest.approx(sd, rel=0.15)
+
+
+def test_jumps_do_not_pass_for_noise() -> None:
+    rng = np.random.default_rng(3)
+    t = np.arange(0, 20, 0.01)
+    steps = np.floor(t) % 2 * 5.0
+    assert estimate_noise(steps + 0.01 * rng.normal(size=len(t))) == pytest.approx(0.01, rel=0.15)
+
+
+def test_a_quantised_signal_is_no_better_than_its_step() -> None:
+    t = np.arange(0, 20, 0.01)
+    step = 0.05
+    assert estimate_noise(np.round(np.sin(t) / step) * step) >= 0.99 * step / np.sqrt(12)
+    assert estimate_noise(np.zeros(100)) == 0
+    assert estimate_noise(np.arange(5.0)) == 0  # too short to tell
+
+
+def test_held_samples_are_recognised() -> None:
+    t = np.arange(40) * 0.01
+    held = np.repeat(np.random.default_rng(4).normal(size=8), 5)
+    np.testing.assert_array_equal(fresh_samples(t, held, 20.0), np.arange(0, 40, 5))
+    np.testing.assert_array_equal(fresh_samples(t, held, None), np.arange(40))
+    np.testing.assert_array_equal(fresh_samples(t, np.zeros(40), 20.0), np.arange(40))  # nothing to go by
+
+
+def test_noise_of_a_held_signal_is_that_of_its_fresh_samples() -> None:
+    rng = np.random.default_rng(5)
+    fresh = np.sin(np.arange(0, 100, 0.05)) + 0.02 * rng.normal(size=2000)
+    held = np.repeat(fresh, 5)
+    index = fresh_samples(np.arange(10_000) * 0.01, held, 20.0)
+    assert estimate_noise(held[index]) == pytest.approx(0.02, rel=0.15)
+
+
+@pytest.mark.parametrize("samples", [1, 5, 15])
+def test_moving_average(samples: int) -> None:
+    values = np.random.default_rng(6).normal(size=(60, 2))
+    out = moving_average(values, samples)
+    assert out.shape == values.shape
+    half = samples // 2
+    for k in (half, 30, 59 - half):
+        np.testing.assert_allclose(out[k], values[k - half : k + half + 1].mean(0))
+    np.testing.assert_allclose(moving_average(values[:, 0], samples), out[:, 0])
