@@ -80,6 +80,7 @@ def close_loop(
     mujoco.set_mju_user_warning(lambda message: None)
     dataset = require(mapping)[0]
     bench = make_bench(dataset, jobs)
+    _require_stable(bench)
     key = digest(
         mapping,
         model_path(dataset.mapping.model_file, dataset.folder),
@@ -108,6 +109,17 @@ def close_loop(
     write_whole(out / "report.html", render_summary(summary))
     write_whole(out / "report.json", json.dumps(summary, indent=1))
     return summary
+
+
+def _require_stable(bench: Bench) -> None:
+    """Raises `InputError` where the model as given diverges on every segment: no fit can begin there."""
+    problem = bench.problem(bench.dataset.of("fit"), most=40)
+    residual = problem.residual(bench.plant, bench.plant.null[None])
+    if not np.isfinite(residual).all(-1).any():
+        raise InputError(
+            f"model {bench.dataset.mapping.model_file}: the simulation is unstable on every segment that was tried, at "
+            f"a step of {bench.plant.model.opt.timestep:g} s; shorten segments.timestep, or check gains and units"
+        )
 
 
 def _summary(dataset: Dataset, reports: dict[str, dict[str, Any]]) -> dict[str, Any]:
