@@ -118,7 +118,7 @@ def test_covariance_holds_the_noise_of_the_start(plant: Plant) -> None:
     assert (sigma >= sensor * (1 - 1e-9)).all()
     assert (sigma[:, :3] > 1.2 * SD_Q**2).all()
     rng = np.random.default_rng(1)
-    errors = np.stack([problem.synthetic(fine, x, rng).residual(fine, x[None])[0] for _ in range(200)])
+    errors = np.stack([problem.synthetic(fine, x, rng).residual(fine, x[None])[0] for _ in range(80)])
     found = errors.var(0)
     assert (found > 1.05 * sensor)[:, :3].mean() > 0.9
     assert np.mean(found / sigma) == pytest.approx(1, abs=0.1)
