@@ -145,7 +145,8 @@ def fit(
 
     low, high = limits.low[free] / limits.scale[free], limits.high[free] / limits.scale[free]
     x = start.copy()
-    for size, share in ((COARSE, rounds // 2), (FINE, rounds - rounds // 2)) if len(free) else ():
+    stages = ((COARSE, rounds // 2), (FINE, rounds - rounds // 2)) if problem.rough else ((FINE, rounds),)
+    for size, share in stages if len(free) else ():
         z0 = np.clip(x[free] / limits.scale[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
         solved = least_squares(
             residual, z0, lambda z, size=size: derivative(z, size),  # pyright: ignore[reportArgumentType] (no stubs)

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from nfc_gym.measured.metric import metric, unexplained_variance
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.report import render, render_summary
-from nfc_gym.measured.search import Data, Found, Options, Search
+from nfc_gym.measured.search import Data, Found, Options, Round, Search
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole
 from nfc_gym.physics.rollout import Plant
@@ -202,7 +202,7 @@ def _calibrate(problem: Problem, plant: Plant, x: Array, tell: Callable[[str], N
 
 
 def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
-    """Calibrate, then search; both are stages. A resumed run repeats the cheap last screening for its tables."""
+    """Calibrate, then search; a stage after calibration and after every round. A resumed run goes on from the last."""
     bench, plant = run.bench, run.bench.plant
     run.say(f"{len(work)} segments to fit, {len(select)} to select on")
     done = run.stages.get("calibrated")
@@ -219,7 +219,20 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     search = Search(
         data, Data(select, select.covariance(plant, calibrated.x)), plant, pool, Options(seed=run.seed), run.say
     )
-    return search.run(calibrated)
+    saved = run.stages.get("search")
+    begun = None
+    if saved:
+        grown, x = unpack(saved["model"], plant)
+        rounds = [Round(**r) for r in saved["rounds"]]
+        begun = (Fit(grown, x, calibrated.white, calibrated.jacobian), rounds)
+        run.say(f"going on after {len(rounds)} rounds of the search")
+    return search.run(
+        calibrated,
+        begun,
+        lambda current, rounds: run.stages.put(
+            "search", {"model": pack(current), "rounds": [asdict(r) for r in rounds]}
+        ),
+    )
 
 
 def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:

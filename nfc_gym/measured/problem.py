@@ -44,6 +44,8 @@ class Problem(ABC):
       mask: (S, m) where a number is compared.
       log_of: (S,) index of the log each block is from; blocks of a log are in order of time.
       names: names of the logs.
+      time_of: (S,) seconds into its log at which each block starts.
+      rough: whether residuals are rough functions of the parameters, as they are where bodies touch.
     """
 
     columns: Columns
@@ -51,6 +53,7 @@ class Problem(ABC):
     log_of: NDArray[np.intp]
     names: tuple[str, ...]
     time_of: Array
+    rough = False
 
     def __len__(self) -> int:
         return len(self.log_of)
@@ -111,6 +114,7 @@ class RolloutProblem(Problem):
         self._kit = _Kit(model, tuple(logs), tuple(states), layout, servos or {}, linear, settle)
         self._observers = [o for key, c in logs[0].channels.items() if (o := observer(model, key, c.axes)) is not None]
         self.names = tuple(log.name for log in logs)
+        self.rough = bool((model.geom_contype[:, None] & model.geom_conaffinity).any())
         self._place(where, None)
 
     def _place(self, where: Cut, measured: list[Array] | None) -> None:

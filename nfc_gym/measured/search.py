@@ -121,9 +121,20 @@ class Search:
         plant, start = plant or current.plant, current.x if start is None else start
         return fit(self.fit_data.problem, under, plant, start, rounds)
 
-    def run(self, calibrated: Fit) -> Found:
-        """Greedy rounds from a calibrated model until nothing more is believed; then the generic alternatives' turn."""
-        current, rounds = calibrated, []
+    def run(
+        self,
+        calibrated: Fit,
+        begun: tuple[Fit, list[Round]] | None = None,
+        keep: Callable[[Fit, list[Round]], None] = lambda current, rounds: None,
+    ) -> Found:
+        """Greedy rounds from a calibrated model until nothing more is believed; then the generic alternatives' turn.
+
+        Args:
+          calibrated: psi alone, fitted.
+          begun: model and rounds of a search that was interrupted, to go on from.
+          keep: called with model and rounds after every round that accepted something.
+        """
+        current, rounds = begun or (calibrated, [])
         while True:
             fit_metric, select_metric = self.metrics(current)
             current = self.refit(current, fit_metric, rounds=6)
@@ -137,6 +148,7 @@ class Search:
             # What the new effect explains must not go on as slack in the metric: refresh it, refit, only then prune.
             fit_metric, select_metric = self.metrics(current)
             current = self._prune(self.refit(current, fit_metric), fit_metric, select_metric)
+            keep(current, rounds)
         generic = self._generic(screen, current, fit_metric, select_metric, outcome)
         if (
             generic is not None
