@@ -248,7 +248,7 @@ class Segments(Strict):
     history: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5
     horizons: tuple[Positive, ...] = ()
     timestep: Positive | None = None
-    start: Literal["measured", "settled", "rest"] = "measured"
+    start: Literal["measured", "settled"] = "measured"
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

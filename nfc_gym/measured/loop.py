@@ -216,9 +216,7 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
         run.stages.put("calibrated", pack(calibrated))
     pool = candidates(bench, fitting)
     data = Data(work, sigma)
-    search = Search(
-        data, Data(select, select.covariance(plant, calibrated.x)), plant, pool, Options(seed=run.seed), run.say
-    )
+    search = Search(data, Data(select, select.covariance(plant, calibrated.x)), pool, Options(seed=run.seed), run.say)
     saved = run.stages.get("search")
     begun = None
     if saved:

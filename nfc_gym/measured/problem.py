@@ -4,6 +4,7 @@ Three kinds share one face: roll-outs from measured starts (here), actuator forc
 sensors at measured states and commands (`instant`). The search above them never asks which it has.
 """
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -244,8 +245,6 @@ class RolloutProblem(Problem):
 
     def _halved(self, plant: Plant, x: Array) -> Array:
         """Residual with the physics step halved."""
-        import copy
-
         model = copy.copy(plant.model)
         model.opt.timestep = plant.model.opt.timestep / 2
         fine = Plant(model, plant.space, plant.effects, plant.nthread)

@@ -17,7 +17,6 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screen, Screened, screen_all
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each, split
-from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 Say = Callable[[str], None]
@@ -66,7 +65,6 @@ class Found:
       rounds: in order, the last one being the round that accepted nothing.
       generic: a generic alternative that beat every named effect, or None.
       screened: the last round's screening, from which the identifiability table is made.
-      metric: the whitening of the last round on the fit logs.
     """
 
     calibrated: Fit
@@ -74,8 +72,6 @@ class Found:
     rounds: list[Round]
     generic: Judged | None
     screened: list[Screened]
-    metric: Metric
-    screen: Screen
 
 
 @dataclass
@@ -89,10 +85,8 @@ class Data:
 class Search:
     """One greedy search on fit and selection problems."""
 
-    def __init__(
-        self, fit_data: Data, select: Data, plant: Plant, candidates: Sequence[Effect], options: Options, say: Say
-    ) -> None:
-        self.fit_data, self.select, self.plant = fit_data, select, plant
+    def __init__(self, fit_data: Data, select: Data, candidates: Sequence[Effect], options: Options, say: Say) -> None:
+        self.fit_data, self.select = fit_data, select
         self.named = [e for e in candidates if not e.generic]
         self.generics = [e for e in candidates if e.generic]
         self.hopeless: set[str] = set()
@@ -114,12 +108,9 @@ class Search:
             self.select.problem, self.select.sigma, extra
         )
 
-    def refit(
-        self, current: Fit, under: Metric, plant: Plant | None = None, start: Array | None = None, rounds: int = 15
-    ) -> Fit:
+    def refit(self, current: Fit, under: Metric, rounds: int = 15) -> Fit:
         """Full refit of every parameter under a metric."""
-        plant, start = plant or current.plant, current.x if start is None else start
-        return fit(self.fit_data.problem, under, plant, start, rounds)
+        return fit(self.fit_data.problem, under, current.plant, current.x, rounds)
 
     def run(
         self,
@@ -157,7 +148,7 @@ class Search:
         ):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
             current = self.refit(calibrated, fit_metric, rounds=6)
-        return Found(calibrated, current, rounds, generic, screened, fit_metric, screen)
+        return Found(calibrated, current, rounds, generic, screened)
 
     def _screen(self, screen: Screen, pool: Sequence[Effect], current: Fit) -> list[Screened]:
         taken = {e.id.removesuffix(":each") for e in current.plant.effects}

@@ -4,6 +4,8 @@ Whoever writes a parameter or an effect writes it once, against arrays with any 
 the nominal model, so that repeated randomisation never compounds, and derived constants follow at `commit`.
 """
 
+import copy
+
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
@@ -77,7 +79,7 @@ class ModelFields:
         self._target = target
         self.batched = isinstance(target, Batch)
         model = target.model if isinstance(target, Batch) else target
-        self.nominal_model = nominal if nominal is not None else _copy(model)
+        self.nominal_model = nominal if nominal is not None else copy.copy(model)
         self._arrays: dict[str, NDArray] = {}
         self._scalars: set[str] = set()  # options of one model that are plain numbers: written back at `commit`
         self._dirty = False
@@ -121,9 +123,3 @@ class ModelFields:
         else:
             mujoco.mj_setConst(self._target, mujoco.MjData(self._target))
         self._dirty = False
-
-
-def _copy(model: mujoco.MjModel) -> mujoco.MjModel:
-    import copy
-
-    return copy.copy(model)
