@@ -20,6 +20,7 @@ from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrid
 from nfc_gym.physics.parameters import ParameterSpace, parameters_from_toml
 from nfc_gym.physics.rollout import Plant
 
+_MOMENTS = 1000  # at which typical magnitudes are taken
 _SAMPLES = 12_000  # of all logs together that an instant problem looks at; longer logs are thinned
 
 
@@ -86,40 +87,26 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
 
 
 def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
-    """Typical magnitudes along the logs, from states, commands and inverse dynamics without contact."""
+    """Typical magnitudes along the logs: speeds and forces of the motion, and what its actuators push."""
     model = bench.plant.model
+    motion = _rolled(bench, logs) if bench.mode == "rollout" else _measured(bench, logs)
     data = mujoco.MjData(model)
-    qpos, qvel, qacc, ctrl, acting = [], [], [], [], []
-    for log in logs:
-        s = bench.states[log.name]
-        rows = np.linspace(0, len(log) - 1, min(len(log), max(20, 1000 // len(logs)))).astype(int)
-        qpos.append(s.qpos[rows])
-        qvel.append(s.qvel[rows])
-        qacc.append(s.qacc[rows])
-        u = np.zeros((len(rows), model.nu))
-        for key, values in log.controls.items():
-            u[:, actuator_names(model).index(key.removeprefix("ctrl:"))] = values[rows]
-        ctrl.append(u)
-    qpos, qvel, qacc, ctrl = (np.concatenate(a) for a in (qpos, qvel, qacc, ctrl))
-    needed, pushed, acting = (
-        np.zeros((len(qpos), model.nv)),
-        np.zeros((len(qpos), model.nv)),
-        np.zeros((len(qpos), model.nu)),
-    )
+    count = len(motion.qpos)
+    needed, pushed, acting = np.zeros((count, model.nv)), np.zeros((count, model.nv)), np.zeros((count, model.nu))
     driven = np.zeros(model.nv)
-    for k in range(len(qpos)):
-        data.qpos[:], data.qvel[:], data.qacc[:], data.ctrl[:] = qpos[k], qvel[k], qacc[k], ctrl[k]
+    for k in range(count):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = motion.qpos[k], motion.qvel[k], motion.ctrl[k]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
-        mujoco.mj_mulM(model, data, driven, qacc[k])
+        mujoco.mj_mulM(model, data, driven, motion.qacc[k])
         needed[k] = driven + data.qfrc_bias
         mujoco.mj_fwdActuation(model, data)
         pushed[k], acting[k] = data.qfrc_actuator, data.actuator_force
     rms = lambda a: np.sqrt((a**2).mean(0))  # noqa: E731
-    # An actuator behind a stiff servo may push thousands of newtons in this state-by-state view: what the motion needs
-    # counts first.
     need, push = rms(needed), rms(pushed)
-    force = np.where(need > 1e-9, need, push)
+    # A driven wheel needs little for its own motion and pushes the vehicle: roll-outs show what it pushes. At measured
+    # states one by one a stiff servo would seem to push thousands of newtons: there the need counts first.
+    force = np.maximum(need, push) if bench.mode == "rollout" else np.where(need > 1e-9, need, push)
     first = logs[0]
     exogenous = {k: float(np.median(np.concatenate([log.exogenous[k] for log in logs]))) for k in first.exogenous}
     channels = {
@@ -129,9 +116,47 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
         )
         for k in first.channels
     }
-    return Scales(
-        force, rms(qvel), ctrl.std(0) + 0.1 * np.abs(ctrl).mean(0), rms(acting), first.interval, exogenous, channels
-    )
+    command = motion.ctrl.std(0) + 0.1 * np.abs(motion.ctrl).mean(0)
+    return Scales(force, rms(motion.qvel), command, rms(acting), first.interval, exogenous, channels)
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """States, accelerations and commands at n moments: (n, nq), (n, nv), (n, nv), (n, nu)."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    qacc: np.ndarray
+    ctrl: np.ndarray
+
+
+def _measured(bench: Bench, logs: Sequence[Log]) -> _Motion:
+    """The motion as estimated from the logs; joints that no channel shows stand still."""
+    model = bench.plant.model
+    parts = []
+    for log in logs:
+        s = bench.states[log.name]
+        rows = np.linspace(0, len(log) - 1, min(len(log), max(20, _MOMENTS // len(logs)))).astype(int)
+        u = np.zeros((len(rows), model.nu))
+        for key, values in log.controls.items():
+            u[:, actuator_names(model).index(key.removeprefix("ctrl:"))] = values[rows]
+        parts.append((s.qpos[rows], s.qvel[rows], s.qacc[rows], u))
+    return _Motion(*(np.concatenate(a) for a in zip(*parts, strict=True)))
+
+
+def _rolled(bench: Bench, logs: Sequence[Log]) -> _Motion:
+    """The nominal model's own motion from the logs' starts, under their commands: every joint moves as it would."""
+    problem = bench.problem(logs, most=40)
+    assert isinstance(problem, RolloutProblem)
+    plant, seg = bench.plant, problem.segments
+    traj = plant.shoot(plant.null[None], seg)
+    stable = traj.stable[0]
+    each = max(1, int(stable.sum()) * seg.steps // _MOMENTS)
+    at = np.arange(1, seg.steps, each)
+    qpos, qvel = traj.qpos[0, stable], traj.qvel[0, stable]
+    qacc = (qvel[:, at + 1] - qvel[:, at - 1]) / (2 * seg.dt)
+    flat = lambda a: a.reshape(-1, a.shape[-1])  # noqa: E731
+    return _Motion(flat(qpos[:, at]), flat(qvel[:, at]), flat(qacc), flat(seg.ctrl[stable][:, seg.history + at]))
 
 
 def candidates(bench: Bench, logs: Sequence[Log]) -> list[Effect]:

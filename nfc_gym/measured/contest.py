@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.fit import Fit, box
+from nfc_gym.measured.box import box
+from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import Metric, loss, loss_weight
 from nfc_gym.measured.problem import Problem
 
@@ -35,7 +36,7 @@ class Judged:
       fitted: on the fit logs.
       gains: (S,) drop of the loss per block of the selection logs against the model without it.
       fit_gains: the same on the fit logs, each group of blocks predicted by a fit that left it out.
-      total: drop over both, less a penalty for each parameter.
+      total: drop over both, less a price for each parameter (the Bayesian information criterion, Schwarz 1978).
       lower: 0.5 % bootstrap quantile of the gain over both.
     """
 
@@ -81,7 +82,9 @@ def judge(
     blocks = clusters(select)
     both = np.concatenate([gains, fit_gains])
     draws = bootstrap(both, np.concatenate([blocks, fit_blocks + int(blocks.max()) + 1]), rng)
-    total = float(both.sum()) - 2 * extra * dispersion(base)
+    # Schwarz's price of a parameter: which law is at work is asked, and not only which predicts best.
+    count = int(problem.mask.sum()) + int(select.mask.sum())
+    total = float(both.sum()) - np.log(max(count, 2)) * extra * dispersion(base)
     return Judged(fitted, gains, fit_gains, total, float(np.quantile(draws, 0.005)))
 
 
@@ -96,19 +99,17 @@ def left_out_losses(problem: Problem, under: Metric, fitted: Fit, folds: NDArray
         return fitted.losses
     weight = loss_weight(white) ** 2
     limits = box(fitted.plant)
-    free = np.flatnonzero(limits.free)
-    pull = np.diag((limits.scale[free] / limits.prior[free]) ** 2)
     hessians = np.einsum("smi,sm,smj->sij", jac, weight, jac)
     gradients = np.einsum("smi,sm->si", jac, weight * white)
-    whole = hessians.sum(0) + pull
+    whole = hessians.sum(0) + np.diag(limits.pull**2)
     # Damped as in a Levenberg-Marquardt step: where the other folds say nothing, the linear model must not run away.
-    ridge = _DAMPING * np.diag(np.diag(whole)) + 1e-12 * np.eye(len(free))
+    ridge = _DAMPING * np.diag(np.diag(whole)) + 1e-12 * np.eye(len(whole))
     names = np.unique(folds)
-    x = np.repeat(fitted.x[None], len(names), 0)
-    for row, k in zip(x, names, strict=True):
+    z = np.repeat(limits.at(fitted.x)[None], len(names), 0)
+    for row, k in zip(z, names, strict=True):
         of = folds == k
-        row[free] += np.linalg.solve(whole - hessians[of].sum(0) + ridge, gradients[of].sum(0)) * limits.scale[free]
-    losses = loss(under.whiten(problem.residual(fitted.plant, np.clip(x, limits.low, limits.high))))
+        row += np.linalg.solve(whole - hessians[of].sum(0) + ridge, gradients[of].sum(0))
+    losses = loss(under.whiten(problem.residual(fitted.plant, limits.x(z, fitted.x))))
     return losses[np.searchsorted(names, folds), np.arange(len(folds))]
 
 

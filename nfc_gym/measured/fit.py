@@ -3,72 +3,22 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cma
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from nfc_gym.measured.metric import TURN, Metric, loss
+from nfc_gym.measured.box import Box, box
+from nfc_gym.measured.metric import TURN, Metric, loss, loss_weight
 from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 # Steps of the differences, in scaled parameters. Contact makes residuals rough, and only a coarse step sees past that;
-# the curved valleys of coupled parameters (a payload's mass and place) need a fine one. A fit goes from the first to
-# the second.
-COARSE, FINE = 1e-1, 2e-4
-_PRIOR = 0.5  # of the prior's range: standard deviation of the weak pull towards nominal psi
-
-
-@dataclass(frozen=True)
-class Box:
-    """Bounds, typical sizes and free entries of a full parameter vector (n,)."""
-
-    low: Array
-    high: Array
-    scale: Array
-    free: NDArray[np.bool_]
-    centre: Array
-    prior: Array
-
-
-def box(plant: Plant) -> Box:
-    """Bounds and scales of psi followed by every effect's parameters."""
-    space = plant.space
-    low, high = [space.low], [space.high]
-    scale, free, prior = [(space.high - space.low) / 4], [space.free], [_PRIOR * (space.high - space.low)]
-    for effect in plant.effects:
-        low.append(effect.low)
-        high.append(effect.high)
-        sizes = [
-            max((abs(p - q.null) for p in q.probes), default=q.high - q.low) or q.high - q.low for q in effect.params
-        ]
-        scale.append(np.array(sizes, float))
-        free.append(np.ones(len(effect.params), bool))
-        prior.append(np.full(len(effect.params), np.inf))
-    join = np.concatenate
-    return Box(join(low), join(high), join(scale), join(free), plant.null, join(prior))
-
-
-def jacobian(
-    problem: Problem,
-    metric: Metric,
-    plant: Plant,
-    x: Array,
-    base: Array,
-    which: NDArray[np.intp],
-    limits: Box,
-    size: float = FINE,
-) -> Array:
-    """(S, m, len(which)) derivative of the whitened residual by scaled parameters, forward differences, one batch.
-
-    `size` is the step in scaled parameters.
-    """
-    step = size * limits.scale[which]
-    step = np.where(x[which] + step > limits.high[which], -step, step)
-    rows = np.repeat(x[None], len(which), 0)
-    rows[np.arange(len(which)), which] += step
-    moved = metric.whiten(problem.residual(plant, rows))
-    return np.moveaxis((moved - base) / (step / limits.scale[which])[:, None, None], 0, -1)
+# near the optimum a fine one is better. A rough fit goes from the first to the second, and what depends on the slopes
+# afterwards (what psi could also explain, intervals) takes them over the middle one.
+COARSE, MIDDLE, FINE = 1e-1, 1e-2, 2e-4
+_SPREAD = 0.3  # of a polish's first draws, in scaled parameters
 
 
 @dataclass(frozen=True)
@@ -79,7 +29,7 @@ class Fit:
       plant: the machine with the effects that were fitted.
       x: (size,) parameters.
       white: (S, m) whitened residual at x.
-      jacobian: (S, m, n free) by scaled free parameters, at x or near it.
+      jacobian: (S, m, f) by scaled free coordinates (`Box`), at x or near it.
     """
 
     plant: Plant
@@ -91,6 +41,24 @@ class Fit:
     def losses(self) -> Array:
         """(S,) loss of each block."""
         return loss(self.white)
+
+
+def jacobian(
+    problem: Problem, metric: Metric, limits: Box, x: Array, base: Array, which: NDArray[np.intp], size: float = FINE
+) -> Array:
+    """(S, m, len(which)) derivative of the whitened residual by scaled free coordinates, one-sided, in one batch.
+
+    Args:
+      base: (S, m) whitened residual at x.
+      which: of the free coordinates.
+      size: step in scaled coordinates.
+    """
+    z = limits.at(x)
+    step = np.where(z[which] + size > limits.roof[which], -size, size)
+    rows = np.repeat(z[None], len(which), 0)
+    rows[np.arange(len(which)), which] += step
+    moved = metric.whiten(problem.residual(limits.plant, limits.x(rows, x)))
+    return np.moveaxis((moved - base) / step[:, None, None], 0, -1)
 
 
 def fit(
@@ -115,48 +83,77 @@ def fit(
       The fit; never worse than the start under the loss.
     """
     limits = box(plant)
-    free = np.flatnonzero(limits.free)
-    kept = 0 if known is None else known.shape[-1]
-    shape = (len(problem), len(problem.columns))
+    fresh = np.arange(0 if known is None else known.shape[-1], len(limits.scale))
 
-    def full(z: Array) -> Array:
-        x = start.copy()
-        x[free] = z * limits.scale[free]
-        return np.clip(x, limits.low, limits.high)
-
-    def pull(x: Array) -> Array:
-        return (x - limits.centre)[free] / limits.prior[free]
+    def white(x: Array) -> Array:
+        return metric.whiten(problem.residual(plant, x[None]))[0]
 
     def residual(z: Array) -> Array:
-        x = full(z)
-        return np.concatenate([metric.whiten(problem.residual(plant, x[None]))[0].ravel(), pull(x)])
+        return np.concatenate([white(limits.x(z, start)).ravel(), (z - limits.centre) * limits.pull])
+
+    def slopes(x: Array, size: float) -> Array:
+        found = jacobian(problem, metric, limits, x, white(x), fresh, size)
+        return found if known is None else np.concatenate([known, found], -1)
 
     last: dict[str, Array] = {}
 
     def derivative(z: Array, size: float) -> Array:
         tick()
-        x = full(z)
-        base = metric.whiten(problem.residual(plant, x[None]))[0]
-        fresh = jacobian(problem, metric, plant, x, base, free[kept:], limits, size)
-        last["jacobian"] = fresh if known is None else np.concatenate([known, fresh], -1)
-        return np.concatenate(
-            [last["jacobian"].reshape(-1, len(free)), np.diag(limits.scale[free] / limits.prior[free])]
-        )
+        last["jacobian"] = slopes(limits.x(z, start), size)
+        return np.concatenate([last["jacobian"].reshape(-1, len(z)), np.diag(limits.pull)])
 
-    low, high = limits.low[free] / limits.scale[free], limits.high[free] / limits.scale[free]
+    room = 1e-6 * (limits.roof - limits.floor)
     x = start.copy()
     stages = ((COARSE, rounds // 2), (FINE, rounds - rounds // 2)) if problem.rough else ((FINE, rounds),)
-    for size, share in stages if len(free) else ():
-        z0 = np.clip(x[free] / limits.scale[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+    for size, share in stages if len(limits.scale) else ():
         solved = least_squares(
-            residual, z0, lambda z, size=size: derivative(z, size),  # pyright: ignore[reportArgumentType] (no stubs)
-            (low, high), loss="soft_l1", f_scale=TURN, x_scale="jac",
+            residual, np.clip(limits.at(x), limits.floor + room, limits.roof - room),
+            lambda z, size=size: derivative(z, size),  # pyright: ignore[reportArgumentType] (no stubs)
+            (limits.floor, limits.roof), loss="soft_l1", f_scale=TURN, x_scale="jac",
             max_nfev=max(share, 1), ftol=1e-5, xtol=1e-5, gtol=1e-8,
         )  # fmt: skip
-        x = full(solved.x)
-    white = metric.whiten(problem.residual(plant, x[None]))[0]
-    jac = last.get("jacobian", np.zeros((*shape, 0)))
-    return Fit(plant, x, white, jac)
+        x = limits.x(solved.x, start)
+    if problem.rough and len(limits.scale):
+        last["jacobian"] = slopes(x, MIDDLE)
+    base = white(x)
+    return Fit(plant, x, base, last.get("jacobian", np.zeros((*base.shape, 0))))
+
+
+def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed: int) -> Fit:
+    """Go on without derivatives (CMA-ES, Hansen 2001) from a fit in which roughness may have stopped them.
+
+    Args:
+      evaluations: parameter vectors to try.
+      seed: of its draws.
+
+    Returns:
+      The better of both.
+    """
+    limits = box(found.plant)
+    if not len(limits.scale):
+        return found
+    z = np.clip(limits.at(found.x), limits.floor, limits.roof)
+    if len(z) == 1:  # CMA-ES wants two dimensions: a scan does for one
+        draws = np.linspace(limits.floor, limits.roof, evaluations)
+        values = _values(problem, metric, limits, draws, found.x)
+        best, value = draws[values.argmin()], float(values.min())
+    else:
+        bounds = [limits.floor.tolist(), limits.roof.tolist()]
+        options = {"bounds": bounds, "maxfevals": evaluations, "verbose": -9, "seed": seed + 1}  # 0: the time of day
+        search = cma.CMAEvolutionStrategy(z, _SPREAD, options)
+        while not search.stop():
+            draws = np.array(search.ask())
+            search.tell(list(draws), _values(problem, metric, limits, draws, found.x).tolist())
+        best, value = np.asarray(search.result.xbest), float(search.result.fbest)
+    if value >= _values(problem, metric, limits, z[None], found.x)[0]:
+        return found
+    return fit(problem, metric, found.plant, limits.x(best, found.x), 4)
+
+
+def _values(problem: Problem, metric: Metric, limits: Box, z: Array, around: Array) -> Array:
+    """(P,) what a fit minimises, at scaled coordinates (P, f)."""
+    white = metric.whiten(problem.residual(limits.plant, limits.x(z, around)))
+    return loss(white).sum(-1) + (((z - limits.centre) * limits.pull) ** 2).sum(-1)
 
 
 def uncertainty(result: Fit, blocks: NDArray[np.intp]) -> Array:
@@ -167,21 +164,15 @@ def uncertainty(result: Fit, blocks: NDArray[np.intp]) -> Array:
 
     Anchored parameters get 0; directions that the data do not show keep the prior's spread.
     """
-    from nfc_gym.measured.metric import loss_weight
-
     limits = box(result.plant)
-    free = np.flatnonzero(limits.free)
     weight = loss_weight(result.white) ** 2
     jac = result.jacobian
-    pull = limits.scale[free] / limits.prior[free]
-    hessian = np.einsum("smi,sm,smj->ij", jac, weight, jac) + np.diag(pull**2)
+    hessian = np.einsum("smi,sm,smj->ij", jac, weight, jac) + np.diag(limits.pull**2)
     scores = np.einsum("smi,sm->si", jac, weight * result.white)
-    clustered = np.zeros((int(blocks.max()) + 1, len(free)))
+    clustered = np.zeros((int(blocks.max()) + 1, len(limits.scale)))
     np.add.at(clustered, blocks, scores)
     inverse = np.linalg.pinv(hessian, rcond=1e-12, hermitian=True)
-    meat = clustered.T @ clustered
-    plain = np.diag(inverse)
-    robust = np.diag(inverse @ meat @ inverse)
-    out = np.zeros(len(limits.free))
-    out[free] = np.sqrt(np.maximum(plain, robust)) * limits.scale[free]
-    return out
+    robust = inverse @ (clustered.T @ clustered) @ inverse
+    slopes = limits.slopes(result.x)
+    spread = lambda covariance: np.einsum("ni,ij,nj->n", slopes, covariance, slopes)  # noqa: E731
+    return np.sqrt(np.maximum(np.maximum(spread(inverse), spread(robust)), 0.0))

@@ -22,14 +22,14 @@ from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.details import details
 from nfc_gym.measured.export import corrected, effects_of, pack, unpack
 from nfc_gym.measured.fit import Fit, fit
-from nfc_gym.measured.metric import metric, unexplained_variance
+from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.report import render, render_summary
 from nfc_gym.measured.search import Data, Found, Options, Round, Search
+from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole
-from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
@@ -186,18 +186,12 @@ def _fold(
     return report
 
 
-def _calibrate(problem: Problem, plant: Plant, x: Array, tell: Callable[[str], None]) -> tuple[Fit, Array]:
-    """Psi alone, under a metric that is refreshed with what it leaves unexplained, and the noise covariance there."""
-    sigma = problem.covariance(plant, x)
-    current = x
-    fitted = None
-    for turn in range(3):
-        residual = problem.residual(plant, current[None])[0]
-        under = metric(problem, sigma, unexplained_variance(problem, residual, sigma))
-        fitted = fit(problem, under, plant, current, rounds=12)
-        current = fitted.x
-        tell(f"calibrating psi, pass {turn + 1} of 3")
-    assert fitted is not None
+def _calibrate(run: _Run, problem: Problem) -> tuple[Fit, Array]:
+    """Psi alone, and the noise covariance there."""
+    plant = run.bench.plant
+    tick = lambda turn: run.say(f"calibrating psi, pass {turn} of at most {TURNS}")  # noqa: E731
+    sigma = problem.covariance(plant, plant.null)
+    fitted, _, _ = settle(problem, sigma, plant, plant.null, run.seed, tick=tick)
     return fitted, problem.covariance(plant, fitted.x)
 
 
@@ -209,10 +203,9 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     start = plant.space.vector(done["psi"]) if done else plant.null
     if done:
         sigma = work.covariance(plant, start)
-        under = metric(work, sigma, unexplained_variance(work, work.residual(plant, start[None])[0], sigma))
-        calibrated = fit(work, under, plant, start, rounds=1)
+        calibrated = fit(work, metric(work, sigma, slack(work, sigma, plant, start)), plant, start, rounds=1)
     else:
-        calibrated, sigma = _calibrate(work, plant, start, run.say)
+        calibrated, sigma = _calibrate(run, work)
         run.stages.put("calibrated", pack(calibrated))
     pool = candidates(bench, fitting)
     data = Data(work, sigma)
@@ -240,9 +233,11 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
     for name, start in (("calibrated", found.calibrated), ("extended", found.extended)):
         plant, x = unpack(done[name], run.bench.plant) if done else (start.plant, start.x)
         sigma = whole.covariance(plant, x)
-        under = metric(whole, sigma, unexplained_variance(whole, whole.residual(plant, x[None])[0], sigma))
         run.say(f"fitting the {name} model on all {len(whole)} segments")
-        out.append(fit(whole, under, plant, x, rounds=1 if done else 12))
+        if done:
+            out.append(fit(whole, metric(whole, sigma, slack(whole, sigma, plant, x)), plant, x, rounds=1))
+        else:
+            out.append(settle(whole, sigma, plant, x, run.seed)[0])
     run.stages.put("final", {"calibrated": pack(out[0]), "extended": pack(out[1])})
     return out[0], out[1]
 

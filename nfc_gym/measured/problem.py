@@ -217,7 +217,9 @@ class RolloutProblem(Problem):
         sigma[:, np.arange(width), np.arange(width)] = np.where(self.mask, self._noise**2, 1.0)
         base = self.residual(plant, x[None])[0]
         carried = self._carried(plant, x, base)
-        discretised = self._halved(plant, x) - base
+        # A first-order integrator's whole error is twice the change that half its step makes.
+        order = 4 if plant.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else 1
+        discretised = (self._halved(plant, x) - base) / (1 - 0.5**order)
         for column in [*carried, discretised]:
             column = np.where(np.isfinite(column), column, 0.0)
             sigma += column[:, :, None] * column[:, None, :]

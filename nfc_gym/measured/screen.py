@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import Metric, loss_weight
 from nfc_gym.measured.problem import Problem
-from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.base import Effect, overrides
 
 Array = NDArray[np.float64]
 
@@ -42,12 +42,25 @@ class Screened:
 
 
 def probe_sets(effect: Effect) -> list[Array]:
-    """Sets of realistic parameter vectors, (k', k) each: one row a sizing parameter, sharing the shape parameters."""
+    """Sets of realistic parameter vectors, (k', k) each: one row a sizing parameter, sharing the shape parameters.
+
+    An effect with a chart of its own has one set, whose rows span its coordinates.
+    """
+    if overrides(effect, "chart"):
+        rows = np.repeat(np.array([p.probes[0] for p in effect.params])[None], len(effect.params), 0)
+        for i, p in enumerate(effect.params):
+            rows[i, i] = p.probes[-1]
+        return [rows]
     sizing = [i for i, p in enumerate(effect.params) if not p.shape]
     shaping = [i for i, p in enumerate(effect.params) if p.shape]
     ranks = max(len(effect.params[i].probes) for i in sizing)
     sets = []
-    for shape in product(*(effect.params[i].probes for i in shaping)):
+    # A law with values of its own at each place tries one shape at all of them: their product would be endless.
+    kinds = list(dict.fromkeys(effect.params[i].name.split("@")[0] for i in shaping))
+    of = [kinds.index(effect.params[i].name.split("@")[0]) for i in shaping]
+    probed = [effect.params[shaping[of.index(k)]].probes for k in range(len(kinds))]
+    for choice in product(*(range(len(p)) for p in probed)):
+        shape = [effect.params[i].probes[choice[k]] for i, k in zip(shaping, of, strict=True)]
         for rank in range(ranks):
             rows = np.repeat(effect.null[None], len(sizing), 0)
             rows[:, shaping] = shape
@@ -113,16 +126,24 @@ class Screen:
         solution = np.linalg.lstsq(columns / np.maximum(norms, 1e-12), -self.projected, rcond=1e-6)[0] / np.maximum(
             norms, 1e-12
         )
+        if overrides(effect, "chart"):
+            null = effect.chart(effect.null)
+            spanned = effect.chart(probe) - null
+            theta = np.clip(effect.unchart(np.asarray(null + solution @ spanned)), effect.low, effect.high)
+            multiple = np.asarray(np.linalg.lstsq(spanned.T, effect.chart(theta) - null, rcond=None)[0], np.float64)
+            return self._gain(columns, multiple), theta, multiple
         sizing = [i for i, p in enumerate(effect.params) if not p.shape]
         size = (probe - effect.null)[np.arange(len(probe)), sizing]
         low, high = (effect.low - effect.null)[sizing] / size, (effect.high - effect.null)[sizing] / size
         low, high = np.minimum(low, high), np.maximum(low, high)
         multiple = np.clip(solution, np.maximum(low, -4.0), np.minimum(high, 4.0))
-        after = self.projected + columns @ multiple
-        gain = float(self.projected @ self.projected - after @ after)
         theta = probe[0].copy()
         theta[sizing] = effect.null[sizing] + multiple * size
-        return gain, np.clip(theta, effect.low, effect.high), multiple
+        return self._gain(columns, multiple), np.clip(theta, effect.low, effect.high), multiple
+
+    def _gain(self, columns: Array, multiple: Array) -> float:
+        after = self.projected + columns @ multiple
+        return float(self.projected @ self.projected - after @ after)
 
     def chance(
         self, found: Sequence[Screened], blocks: NDArray[np.intp], rng: np.random.Generator, draws: int = 199

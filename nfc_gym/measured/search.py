@@ -10,11 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.measured.box import box
 from nfc_gym.measured.contest import Judged, clusters, fold_of, judge, left_out_losses, losses, not_worse, shortlist
-from nfc_gym.measured.fit import Fit, box, fit
-from nfc_gym.measured.metric import Metric, loss, metric, unexplained_variance
+from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screen, Screened, screen_all
+from nfc_gym.measured.settle import settle
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each, split
 
@@ -24,6 +26,8 @@ _NEARLY = 0.95  # share of the best candidate's gain that a simpler law must rea
 _SHARED = 0.8  # the same for the same law at a wider place
 _FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
+_LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
+_ALIKE = 0.1  # of a parameter's effect on the motion: what must remain when all others imitate it
 _CHORD = 10  # free parameters beyond which a candidate's refit reuses psi's Jacobian
 
 
@@ -100,17 +104,11 @@ class Search:
             np.zeros(0),
         )  # of the model candidates are compared with
 
-    def metrics(self, current: Fit) -> tuple[Metric, Metric]:
-        """Common metrics of a round, with what the current model leaves unexplained as extra variance."""
-        residual = self.fit_data.problem.residual(current.plant, current.x[None])[0]
-        extra = unexplained_variance(self.fit_data.problem, residual, self.fit_data.sigma)
-        return metric(self.fit_data.problem, self.fit_data.sigma, extra), metric(
-            self.select.problem, self.select.sigma, extra
-        )
-
-    def refit(self, current: Fit, under: Metric, rounds: int = 15) -> Fit:
-        """Full refit of every parameter under a metric."""
-        return fit(self.fit_data.problem, under, current.plant, current.x, rounds)
+    def settle(self, current: Fit) -> tuple[Fit, Metric, Metric]:
+        """The model refitted, and the common metrics of the round that starts from it."""
+        data = self.fit_data
+        fitted, under, extra = settle(data.problem, data.sigma, current.plant, current.x, self.options.seed)
+        return fitted, under, metric(self.select.problem, self.select.sigma, extra)
 
     def run(
         self,
@@ -126,19 +124,21 @@ class Search:
           keep: called with model and rounds after every round that accepted something.
         """
         current, rounds = begun or (calibrated, [])
+        current, fit_metric, select_metric = self.settle(current)
         while True:
-            fit_metric, select_metric = self.metrics(current)
-            current = self.refit(current, fit_metric, rounds=6)
             screen = Screen(self.fit_data.problem, fit_metric, current)
             screened = self._screen(screen, self.named, current)
             outcome, best = self._round(screen, screened, current, fit_metric, select_metric)
+            if best is not None and (better := self._psi_alone(best, current, fit_metric)) is not None:
+                # What psi can do by itself is not the candidate's to claim: the round begins again from there.
+                self.say("the candidate's psi alone does better than the model before it: judging again")
+                current = better
+                outcome, best = self._round(screen, screened, current, fit_metric, select_metric)
             rounds.append(outcome)
             if best is None or len(current.plant.effects) >= self.options.most:
                 break
-            current = self.refit(best.fitted, fit_metric)
-            # What the new effect explains must not go on as slack in the metric: refresh it, refit, only then prune.
-            fit_metric, select_metric = self.metrics(current)
-            current = self._prune(self.refit(current, fit_metric), fit_metric, select_metric)
+            current, fit_metric, select_metric = self.settle(best.fitted)
+            current = self._prune(current, fit_metric, select_metric)
             keep(current, rounds)
         generic = self._generic(screen, current, fit_metric, select_metric, outcome)
         if (
@@ -147,8 +147,20 @@ class Search:
             and self._outdone(generic, calibrated, current, fit_metric, select_metric)
         ):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
-            current = self.refit(calibrated, fit_metric, rounds=6)
+            current = fit(self.fit_data.problem, fit_metric, calibrated.plant, calibrated.x, 6)
         return Found(calibrated, current, rounds, generic, screened)
+
+    def _psi_alone(self, best: Judged, current: Fit, under: Metric) -> Fit | None:
+        """The model without the candidate, fitted from where the candidate's fit took the rest, if that is better.
+
+        Fits of robots in contact end in one of many hollows; leading to another is no merit of a candidate.
+        """
+        if not self.fit_data.problem.rough or len(best.fitted.plant.effects) != len(current.plant.effects) + 1:
+            return None
+        start = best.fitted.x[: len(current.x)]
+        other = fit(self.fit_data.problem, under, current.plant, start, 10)
+        gained = float(current.losses.sum() - other.losses.sum())
+        return other if gained > 0.1 * float(best.fit_gains.sum() + best.gain) else None
 
     def _screen(self, screen: Screen, pool: Sequence[Effect], current: Fit) -> list[Screened]:
         taken = {e.id.removesuffix(":each") for e in current.plant.effects}
@@ -212,10 +224,7 @@ class Search:
         for s in shortlist(screened, self.options.short):
             self.say(f"refitting {s.effect.id}")
             judged.append(self._try(current, [s], fit_metric, select_metric, base_losses))
-        for effect in current.plant.effects:
-            parts = split(effect, current.plant)
-            if parts is not None:
-                judged.append(self._try_split(current, effect, parts, fit_metric, select_metric, base_losses))
+        judged += self._apart(judged, current, fit_metric, select_metric, base_losses)
         judged.sort(key=lambda j: -j.total)
         outcome = Round([], 0.0, [self._row(j, current) for j in judged])
         believed = [j for j in judged if self._believed(j, chance, current, base_losses)]
@@ -227,7 +236,7 @@ class Search:
                 else "no candidate reduces the misfit"
             )
             return outcome, None
-        best = self._simplest(believed, screened, current, fit_metric, select_metric, base_losses)
+        best = self._simplest(believed, screen, screened, current, fit_metric, select_metric, base_losses)
         outcome.accepted = [e.id for e in self._new(best, current)]
         outcome.share = best.gain / max(float(base_losses.sum()), 1e-9)
         outcome.equivalents = [
@@ -235,10 +244,33 @@ class Search:
             for j in judged
             if self._label(j, current) not in outcome.accepted
             and j.total > _NEARLY * best.total
+            and not any(_contains(e, w) for e in self._new(j, current) for w in self._new(best, current))
             and self._ties(believed[0], j)
         ]
         self.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best
+
+    def _apart(
+        self, judged: Sequence[Judged], current: Fit, fit_metric: Metric, select_metric: Metric, base_losses: Array
+    ) -> list[Judged]:
+        """Values of their own at each place: for what was accepted before, and for the leading laws at several places.
+
+        Asked in the same round, lest a law that suits all places alike with more parameters of its own wins first.
+        """
+        best = max((j.total for j in judged), default=0.0)
+        pairs = [(current, e) for e in current.plant.effects]
+        families: set[str] = set()
+        for j in sorted(judged, key=lambda j: -j.total):
+            new = self._new(j, current)
+            if len(new) == 1 and len(new[0].where) > 1 and j.total > _LEADING * best and new[0].family not in families:
+                families.add(new[0].family)
+                pairs.append((j.fitted, new[0]))
+        out = []
+        for start, effect in pairs:
+            parts = split(effect, current.plant)
+            if parts is not None:
+                out.append(self._try_split(start, effect, parts, current, fit_metric, select_metric, base_losses))
+        return out
 
     def _enough(self, j: Judged, best: Judged, current: Fit) -> float:
         """Share of the best gain a rival must reach: less for the best one's law at a place that includes its place."""
@@ -252,6 +284,7 @@ class Search:
     def _simplest(
         self,
         believed: list[Judged],
+        screen: Screen,
         screened: list[Screened],
         current: Fit,
         fit_metric: Metric,
@@ -267,13 +300,18 @@ class Search:
         rivals = [j for j in believed if j.total > self._enough(j, best, current) * best.total and self._ties(best, j)]
         by_id = {s.effect.id: s for s in screened}
         effect = self._new(best, current)[0]
-        for families in effect.simpler if not isinstance(effect, Each) else ():
-            parts = [by_id.get(f"{f}:{effect.place}") for f in families]
-            if all(p is not None for p in parts):
-                self.say(f"refitting {' and '.join(families)} instead")
-                plain = self._try(current, [p for p in parts if p is not None], fit_metric, select_metric, base_losses)
-                if plain.lower > 0 and plain.total > _NEARLY * best.total and self._ties(best, plain):
-                    rivals.append(plain)
+        added = len(best.fitted.plant.effects) > len(current.plant.effects)
+        for families in effect.simpler if added else ():
+            parts = [by_id[i] for f in families if (i := f"{f}:{effect.place}") in by_id]
+            if len(parts) < len(families):
+                continue
+            if isinstance(effect, Each):
+                apart = [split(p.effect, current.plant) for p in parts]
+                parts = [screen.try_one(a[0]) for a in apart if a is not None]
+            self.say(f"refitting {' and '.join(families)} instead")
+            plain = self._try(current, parts, fit_metric, select_metric, base_losses)
+            if plain.lower > 0 and plain.total > _NEARLY * best.total and self._ties(best, plain):
+                rivals.append(plain)
         return min(rivals, key=lambda j: (len(j.fitted.x), -len(self._new(j, current)[0].where), -j.total))
 
     def _try(
@@ -282,35 +320,36 @@ class Search:
         """Refit screened candidates with everything fitted so far, from where screening points or where we are."""
         plant = current.plant.with_effects([*current.plant.effects, *(s.effect for s in picks)])
         limits, thetas = box(current.plant), [s.theta for s in picks]
-        moved = current.x.copy()
-        moved[limits.free] += picks[0].shift * limits.scale[limits.free]
-        starts = np.stack([np.concatenate([x, *thetas]) for x in (np.clip(moved, limits.low, limits.high), current.x)])
+        moved = limits.x(limits.at(current.x) + picks[0].shift, current.x)
+        starts = np.stack([np.concatenate([x, *thetas]) for x in (moved, current.x)])
         white = fit_metric.whiten(self.fit_data.problem.residual(plant, starts))
         start = starts[int(loss(white).sum(-1).argmin())]
         # With few parameters a full Jacobian costs little; with many, psi keeps the one that it has (the chord method).
-        known = current.jacobian if int(limits.free.sum()) > _CHORD else None
+        known = current.jacobian if len(limits.scale) > _CHORD else None
         fitted = fit(self.fit_data.problem, fit_metric, plant, start, 10, known=known)
         return self._judge(fitted, current, fit_metric, select_metric, base_losses)
 
     def _try_split(
         self,
-        current: Fit,
+        start: Fit,
         effect: Effect,
         parts: tuple[Effect, NDArray[np.intp]],
+        current: Fit,
         fit_metric: Metric,
         select_metric: Metric,
         base_losses: Array,
     ) -> Judged:
         """The same effect with a value of its own at each place."""
         each, copies = parts
-        psi, thetas = current.plant.split(current.x)
+        psi, thetas = start.plant.split(start.x)
         pieces: list[Array] = [psi]
         effects: list[Effect] = []
-        for e, theta in zip(current.plant.effects, thetas, strict=True):
+        for e, theta in zip(start.plant.effects, thetas, strict=True):
             effects.append(each if e is effect else e)
             pieces.append(theta[copies] if e is effect else theta)
         self.say(f"refitting {each.id} with values of its own at each place")
-        fitted = fit(self.fit_data.problem, fit_metric, current.plant.with_effects(effects), np.concatenate(pieces), 8)
+        plant = current.plant.with_effects(effects)
+        fitted = fit(self.fit_data.problem, fit_metric, plant, np.concatenate(pieces), 8)
         return self._judge(fitted, current, fit_metric, select_metric, base_losses)
 
     def _judge(self, fitted: Fit, base: Fit, fit_metric: Metric, select_metric: Metric, base_losses: Array) -> Judged:
@@ -323,9 +362,27 @@ class Search:
 
     def _believed(self, j: Judged, chance: dict[str, float], current: Fit, base_losses: Array) -> bool:
         """Whether the gain holds on unseen logs, is worth naming, and exceeds the luckiest candidate's by chance."""
+        if not self._told_apart(j, current):
+            return False
         worth = self.options.worth * (float(base_losses.sum()) + float(current.losses.sum()))
         lucky = max((chance.get(e.id, 0.0) for e in self._new(j, current)), default=0.0)
         return j.lower > 0 and j.gain > 0 and j.total > worth and float(j.fit_gains.sum()) > lucky
+
+    def _told_apart(self, j: Judged, current: Fit) -> bool:
+        """Whether any of a candidate's parameters moves the motion in a way that the others could not imitate."""
+        new = {id(e) for e in self._new(j, current)}
+        of = np.concatenate(
+            [
+                np.zeros(int(j.fitted.plant.space.free.sum()), bool),
+                *(np.full(len(e.params), id(e) in new) for e in j.fitted.plant.effects),
+            ]
+        )
+        weight = loss_weight(j.fitted.white)
+        slopes = (weight[..., None] * j.fitted.jacobian).reshape(-1, len(of))
+        own, others = slopes[:, of], slopes[:, ~of]
+        size = np.linalg.norm(own, axis=0)
+        left = own - others @ np.linalg.lstsq(others, own, rcond=1e-6)[0] if others.shape[1] else own
+        return bool((np.linalg.norm(left, axis=0) > _ALIKE * np.maximum(size, 1e-12)).any())
 
     @staticmethod
     def _new(j: Judged, current: Fit) -> list[Effect]:
@@ -363,3 +420,11 @@ class Search:
                 self.say(f"dropped {effect.id}: the others explain what it did")
                 current = without
         return current
+
+
+def _contains(law: Effect, plain: Effect) -> bool:
+    """Whether a law has a plainer one as its special case: it can then do no worse, and is no alternative to it."""
+    same = set(plain.where) <= set(law.where)
+    if law.family == plain.family:
+        return same and isinstance(law, Each)
+    return same and (plain.family,) in law.simpler

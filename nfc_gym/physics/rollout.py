@@ -120,6 +120,16 @@ class Plant:
         """(size,) nominal psi and every effect at null."""
         return np.concatenate([self.space.nominal, *(e.null for e in self.effects)])
 
+    def chart(self, x: Array) -> Array:
+        """Full parameter vectors (..., size) -> the coordinates that a fit walks in (`Effect.chart`); psi stays."""
+        psi, thetas = self.split(x)
+        return np.concatenate([psi, *(e.chart(t) for e, t in zip(self.effects, thetas, strict=True))], -1)
+
+    def unchart(self, coordinates: Array) -> Array:
+        """The inverse of `chart`."""
+        psi, parts = self.split(coordinates)
+        return np.concatenate([psi, *(e.unchart(c) for e, c in zip(self.effects, parts, strict=True))], -1)
+
     def write(self, fields: ModelFields, x: Array) -> None:
         """Psi and the effects' model edits into one model, x (size,), or a batch, x (nsim, size)."""
         psi, thetas = self.split(x)

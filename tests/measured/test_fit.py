@@ -137,7 +137,7 @@ def test_the_jacobian_is_the_residuals_slope(fitted: tuple[RolloutProblem, Metri
     problem, under, result = fitted
     limits, x = box(result.plant), TRUTH.copy()
     base = under.whiten(problem.residual(result.plant, x[None]))[0]
-    found = jacobian(problem, under, result.plant, x, base, np.array([0, 1]), limits)
+    found = jacobian(problem, under, limits, x, base, np.array([0, 1]))
     for i in range(2):
         step = np.eye(2)[i] * 1e-5 * limits.scale
         pair = under.whiten(problem.residual(result.plant, np.stack([x + step, x - step])))

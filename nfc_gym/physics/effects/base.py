@@ -209,6 +209,19 @@ class Effect(ABC):
         """Measured start state -> true start state."""
         return q, v
 
+    # ---- coordinates of a fit -------------------------------------------------------------------------------------
+
+    def chart(self, theta: Array) -> Array:
+        """Parameters (..., k) -> coordinates (..., k) in which the motion depends on them nearly linearly.
+
+        Fits walk in these: a lump's mass times its place turns a crooked valley of mass and place into a straight one.
+        """
+        return theta
+
+    def unchart(self, coordinates: Array) -> Array:
+        """The inverse of `chart`."""
+        return coordinates
+
     # ---- words ----------------------------------------------------------------------------------------------------
 
     def say(self, theta: Array, sd: Array | None = None) -> str:

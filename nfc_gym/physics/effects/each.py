@@ -15,7 +15,7 @@ from nfc_gym.physics.fields import ModelFields
 if TYPE_CHECKING:
     from nfc_gym.physics.rollout import Plant
 
-_HOOKS = ("spec", "model", "action", "friction", "force", "demand", "sense", "unsense")
+_HOOKS = ("spec", "model", "action", "friction", "force", "demand", "sense", "unsense", "chart", "unchart")
 
 
 class Each(Effect):
@@ -89,12 +89,20 @@ class Each(Effect):
             force = m.demand(force, t, exogenous, dt)
         return force
 
+    def chart(self, theta: Array) -> Array:
+        """See `Effect`."""
+        return np.concatenate([m.chart(t) for m, t in zip(self.members, self._theta(theta), strict=True)], -1)
+
+    def unchart(self, coordinates: Array) -> Array:
+        """See `Effect`."""
+        return np.concatenate([m.unchart(t) for m, t in zip(self.members, self._theta(coordinates), strict=True)], -1)
+
 
 def each(members: Sequence[Effect]) -> Each:
     """An `Each` that implements just the hooks its members' family implements."""
     first = members[0]
     name = f"Each{type(first).__name__}"
-    body: dict[str, Any] = {"family": first.family, "summary": first.summary, "generic": first.generic}
+    body: dict[str, Any] = {k: getattr(first, k) for k in ("family", "summary", "generic", "simpler")}
     body |= {hook: getattr(Effect, hook) for hook in _HOOKS if not overrides(first, hook)}
     return type(name, (Each,), body)(members)
 

@@ -61,9 +61,8 @@ class _JointFriction(Effect):
 
 def level_size(force: float) -> dict[str, Any]:
     """Bounds and probing sizes of a friction level, from the joint's typical force."""
-    # The typical force comes from the measured motion, and a driven wheel on the ground needs hardly any for it: the
-    # bound is wide, so that friction far above it can be found.
-    return {"probes": (0.05 * force, 0.2 * force), "high": 30 * force, "resolution": 2e-3 * force}
+    # A joint that moves at all has less friction than what pushes it; the typical push is below the largest.
+    return {"probes": (0.05 * force, 0.2 * force), "high": 5 * force, "resolution": 2e-3 * force}
 
 
 class Coulomb(_JointFriction):

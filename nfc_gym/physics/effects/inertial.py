@@ -15,6 +15,7 @@ from nfc_gym.physics.effects.places import body_ids, gyration, moving_bodies, si
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.state import quat_multiply, rotate_back
 
+_NO_MASS = 1e-9  # kg: a lighter lump has no place
 _SWEEPS = 6  # cyclic Jacobi on 3 x 3 converges quadratically; six sweeps reach the last bit
 
 
@@ -121,6 +122,14 @@ class Payload(_Inertial):
         Param("y", "m", -1.0, 1.0, probes=(0.0, 0.1), shape=True),
         Param("z", "m", -1.0, 1.0, probes=(0.0, 0.1), shape=True),
     )
+
+    def chart(self, theta: Array) -> Array:
+        """Mass and first moments (m, m x, m y, m z): a body's motion shows these, and the place only through them."""
+        return np.concatenate([theta[..., :1], theta[..., :1] * theta[..., 1:]], -1)
+
+    def unchart(self, coordinates: Array) -> Array:
+        mass = coordinates[..., :1]
+        return np.concatenate([mass, coordinates[..., 1:] / np.where(np.abs(mass) > _NO_MASS, mass, _NO_MASS)], -1)
 
     def bind(self, model: mujoco.MjModel) -> None:
         super().bind(model)

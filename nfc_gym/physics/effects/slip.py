@@ -20,7 +20,6 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, groups
@@ -93,11 +92,13 @@ class Slip(Effect):
                     f"the model has no geom named {unknown[0]!r}; its wheels: {', '.join(names[g] for g in found)}"
                 )
             self.geoms = [names.index(n) for n in self.where]
-        self.radius = [_radius(model, g) for g in self.geoms]
-        self.trees = [_tree(model, g) for g in self.geoms]
-        self.sharing = [
-            sum(int(model.body_rootid[model.geom_bodyid[o]]) == int(t[0]) for o in found) for t in self.trees
-        ]
+        geoms = np.array(self.geoms, np.intp)
+        self.bodies = model.geom_bodyid[geoms].astype(np.intp)
+        self.joints, self.roots = model.body_jntadr[self.bodies].astype(np.intp), model.body_rootid[self.bodies]
+        self.radius = np.array([_radius(model, g) for g in self.geoms])
+        # (nbody, wheels): the share of each body's weight that a wheel of its vehicle carries.
+        carried = [model.body_rootid[model.geom_bodyid[o]] for o in found]
+        self.load = np.stack([(model.body_rootid == r) / carried.count(r) for r in self.roots], 1)
         ground = [g for g in range(model.ngeom) if int(model.body_weldid[model.geom_bodyid[g]]) == 0]
         self.ground = [g for g in ground if model.geom_contype[g] or model.geom_conaffinity[g]]
 
@@ -110,36 +111,30 @@ class Slip(Effect):
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         gravity = ctx.nominal("opt.gravity")
         weight = np.linalg.norm(gravity, axis=-1)
-        up = -gravity / np.maximum(weight, 1e-9)[..., None]
-        for geom, radius, tree, sharing in zip(self.geoms, self.radius, self.trees, self.sharing, strict=True):
-            model, body = ctx.model, int(ctx.model.geom_bodyid[geom])
-            normal = ctx.nominal("body_mass")[..., tree].sum(-1) * weight / sharing
-            across = ctx.data("xaxis")[..., int(model.body_jntadr[body]), :]
-            across = _unit(across - (across * up).sum(-1, keepdims=True) * up)
-            ahead = np.cross(across, up)
-            arm = ctx.data("geom_xpos")[..., geom, :] - ctx.data("xipos")[..., body, :] - radius * up
-            spatial = ctx.data("cvel")[..., body, :]
-            from_root = (
-                ctx.data("xipos")[..., body, :] + arm - ctx.data("subtree_com")[..., int(model.body_rootid[body]), :]
-            )
-            velocity = spatial[..., 3:] + np.cross(spatial[..., :3], from_root)
-            lateral, along = (velocity * across).sum(-1), (velocity * ahead).sum(-1)
-            grip = self._friction(ctx, geom) * normal / np.sqrt(lateral**2 + along**2 + _EPS**2)
-            push = (grip * theta[..., 0] * lateral)[..., None] * across + (grip * theta[..., 1] * along)[
-                ..., None
-            ] * ahead
-            out.xfrc[..., body, :3] += push
-            out.xfrc[..., body, 3:] += np.cross(arm, push)
+        up = (-gravity / np.maximum(weight, 1e-9)[..., None])[..., None, :]
+        com = ctx.data("xipos")[..., self.bodies, :]
+        across = ctx.data("xaxis")[..., self.joints, :]
+        across = _unit(across - (across * up).sum(-1, keepdims=True) * up)
+        ahead = _cross(across, up)
+        arm = ctx.data("geom_xpos")[..., self.geoms, :] - com - self.radius[:, None] * up
+        spatial = ctx.data("cvel")[..., self.bodies, :]
+        from_root = com + arm - ctx.data("subtree_com")[..., self.roots, :]
+        velocity = spatial[..., 3:] + _cross(spatial[..., :3], from_root)
+        lateral, along = (velocity * across).sum(-1), (velocity * ahead).sum(-1)
+        normal = weight[..., None] * (ctx.nominal("body_mass") @ self.load)
+        grip = self._friction(ctx) * normal / np.sqrt(lateral**2 + along**2 + _EPS**2)
+        push = (grip * theta[..., 0:1] * lateral)[..., None] * across
+        push += (grip * theta[..., 1:2] * along)[..., None] * ahead
+        out.xfrc[..., self.bodies, :3] += push
+        out.xfrc[..., self.bodies, 3:] += _cross(arm, push)
 
-    def _friction(self, ctx: Context, geom: int) -> Array:
-        """Sliding friction of the wheel's contact with the ground: the geom of higher priority, else the larger."""
-        friction, priority = ctx.nominal("geom_friction"), ctx.model.geom_priority
-        own = friction[..., geom, 0]
+    def _friction(self, ctx: Context) -> Array:
+        """Sliding friction of the wheels' contact with the ground: the geom of higher priority, else the larger."""
+        friction, priority = ctx.nominal("geom_friction")[..., 0], ctx.model.geom_priority
+        own = friction[..., self.geoms]
         for other in self.ground[:1]:
-            if priority[other] > priority[geom]:
-                return friction[..., other, 0]
-            if priority[other] == priority[geom]:
-                return np.maximum(own, friction[..., other, 0])
+            floor, above = friction[..., other, None], priority[other] - priority[self.geoms]
+            own = np.where(above > 0, floor, np.where(above == 0, np.maximum(own, floor), own))
         return own
 
     @classmethod
@@ -152,9 +147,11 @@ class Slip(Effect):
         return [cls(("ground",), cls.PARAMS), *(cls(where, cls.PARAMS[:2]) for where in places)]
 
 
-def _tree(model: mujoco.MjModel, geom: int) -> NDArray[np.intp]:
-    """Bodies of the vehicle that a geom belongs to, its root first."""
-    return np.flatnonzero(model.body_rootid == model.body_rootid[model.geom_bodyid[geom]])
+def _cross(a: Array, b: Array) -> Array:
+    """Cross product of (..., 3) arrays; `np.cross` takes several times as long on small ones."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
 
 
 def _unit(v: Array) -> Array:
