@@ -141,7 +141,7 @@ def not_worse(
     return bool(np.quantile(draws, 0.025) <= 0)
 
 
-def shortlist(screened: Sequence, size: int = 8, each: int = 3) -> list:
+def shortlist(screened: Sequence, size: int = 8, each: int = 2) -> list:
     """The best candidates, at most `each` of one family, so that one family's places do not crowd out the others."""
     out, count = [], {}
     for s in screened:

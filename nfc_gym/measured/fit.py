@@ -14,10 +14,10 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-# Steps of the differences, in scaled parameters. Contact makes residuals rough, and only a coarse step sees past that;
-# near the optimum a fine one is better. A rough fit goes from the first to the second, and what depends on the slopes
-# afterwards (what psi could also explain, intervals) takes them over the middle one.
-COARSE, MIDDLE, FINE = 1e-1, 1e-2, 2e-4
+# Steps of the differences, in scaled parameters. Where bodies touch, the motion of some blocks jumps at some parameter
+# values. A coarse step averages over the jumps and a tiny one nearly always misses them; any step between counts a jump
+# for a steep slope. A rough fit therefore goes from the first to the second.
+COARSE, FINE, TINY = 1e-1, 2e-4, 1e-5
 _SPREAD = 0.3  # of a polish's first draws, in scaled parameters
 
 
@@ -104,7 +104,7 @@ def fit(
 
     room = 1e-6 * (limits.roof - limits.floor)
     x = start.copy()
-    stages = ((COARSE, rounds // 2), (FINE, rounds - rounds // 2)) if problem.rough else ((FINE, rounds),)
+    stages = ((COARSE, rounds // 2), (TINY, rounds - rounds // 2)) if problem.rough else ((FINE, rounds),)
     for size, share in stages if len(limits.scale) else ():
         solved = least_squares(
             residual, np.clip(limits.at(x), limits.floor + room, limits.roof - room),
@@ -114,7 +114,7 @@ def fit(
         )  # fmt: skip
         x = limits.x(solved.x, start)
     if problem.rough and len(limits.scale):
-        last["jacobian"] = slopes(x, MIDDLE)
+        last["jacobian"] = slopes(x, COARSE)
     base = white(x)
     return Fit(plant, x, base, last.get("jacobian", np.zeros((*base.shape, 0))))
 

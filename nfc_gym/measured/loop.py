@@ -16,6 +16,7 @@ from rich.console import Console
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured import verdict as say
+from nfc_gym.measured.arena import Data
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.dataset import Dataset
@@ -26,14 +27,14 @@ from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.report import render, render_summary
-from nfc_gym.measured.search import Data, Found, Options, Round, Search
+from nfc_gym.measured.search import Found, Options, Round, Search
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
-_REPLICAS = 4
+_REPLICAS = 6
 
 
 @dataclass

@@ -247,11 +247,8 @@ class RolloutProblem(Problem):
 
     def _halved(self, plant: Plant, x: Array) -> Array:
         """Residual with the physics step halved."""
-        model = copy.copy(plant.model)
-        model.opt.timestep = plant.model.opt.timestep / 2
-        fine = Plant(model, plant.space, plant.effects, plant.nthread)
         segments = _refine(self.segments)
-        return self._compare(fine, x[None], segments, self._measured, self._where.step * 2, self.mask)[0]
+        return self._compare(_finer(plant), x[None], segments, self._measured, self._where.step * 2, self.mask)[0]
 
     def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
         """See `Problem`."""
@@ -267,10 +264,10 @@ class RolloutProblem(Problem):
         return out
 
     def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "RolloutProblem":
-        """The model's own motion from the measured starts, with fresh start and sensor noise."""
-        values, traj = self.predict(plant, x[None], self.segments, self._observers)
+        """The model's own motion from the measured starts at half the step, with fresh start and sensor noise."""
+        values, traj = self.predict(_finer(plant), x[None], _refine(self.segments), self._observers)
         out = self.take(np.flatnonzero(traj.stable[0]))
-        stable, step = traj.stable[0], self._where.step
+        stable, step = traj.stable[0], self._where.step * 2
         measured = []
         at = 0
         for o, v, m in zip(self._observers, values, self._measured, strict=True):
@@ -314,3 +311,10 @@ def _refine(segments: Segments) -> Segments:
     """The same segments on a grid of half the step; commands are held, as on the coarse grid."""
     fine = _map(segments, lambda a: np.repeat(a, 2, axis=1), segments.qpos, segments.qvel)
     return replace(fine, dt=segments.dt / 2, history=2 * segments.history, settle=2 * segments.settle)
+
+
+def _finer(plant: Plant) -> Plant:
+    """The same plant with half the physics step."""
+    model = copy.copy(plant.model)
+    model.opt.timestep = plant.model.opt.timestep / 2
+    return Plant(model, plant.space, plant.effects, plant.nthread)

@@ -5,18 +5,20 @@ test).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.measured.box import box
 from nfc_gym.measured.fit import Fit
-from nfc_gym.measured.metric import Metric, loss_weight
+from nfc_gym.measured.metric import Metric, loss, loss_weight
 from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.effects.base import Effect, overrides
 
 Array = NDArray[np.float64]
+_SCOUT = 0.7  # spread of a scout's draws, in scaled parameters
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,28 @@ class Screen:
                 ]
                 best = Screened(effect, gain, theta, self._shift(raw @ multiple), columns, sizes)
         return best
+
+    def scout(self, found: Screened, rng: np.random.Generator, draws: int = 16) -> Screened:
+        """Look around where a candidate's screening points, in all free parameters, and keep the best that was seen.
+
+        Where bodies touch, straight lines from two probes lead astray: slip, for one, helps only with more friction
+        than a model without slip can bear.
+        """
+        plant = self.current.plant.with_effects([*self.current.plant.effects, found.effect])
+        before, after = box(self.current.plant), box(plant)
+        here = before.at(self.current.x)
+        starts = [
+            np.concatenate([before.x(here + s, self.current.x), found.theta]) for s in (0 * found.shift, found.shift)
+        ]
+        z = np.stack([after.at(x) for x in starts])
+        around = z[rng.integers(2, size=draws)] + _SCOUT * rng.normal(size=(draws, z.shape[1]))
+        z = np.clip(np.concatenate([z, around]), after.floor, after.roof)
+        x = after.x(z, starts[0])
+        values = loss(self.metric.whiten(self.problem.residual(plant, x))).sum(-1)
+        best = int(values.argmin())
+        gain = float(self.current.losses.sum() - values[best])
+        theta = x[best, self.current.plant.size :]
+        return replace(found, gain=gain, theta=theta, shift=z[best, : len(here)] - here)
 
     def _shift(self, change: Array) -> Array:
         """Step of the fitted parameters that answers a change of the residual; directions that hardly show stay put."""

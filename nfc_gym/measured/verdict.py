@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from nfc_gym.measured.contest import bootstrap, clusters
 from nfc_gym.measured.fit import Fit, uncertainty
@@ -111,8 +112,11 @@ def null_bound(v: Verified) -> float:
     """95 % bound of chi-squared of a perfect model."""
     if len(v.null) == 0:
         return 1.0
-    spread = v.null.std(ddof=1) if len(v.null) > 1 else 0.05
-    return float(v.null.mean() + 1.645 * max(spread, 0.01))
+    count = len(v.null)
+    spread = max(float(v.null.std(ddof=1)), 0.01) if count > 1 else 0.05
+    # Of one more draw from a normal population of which few have been seen.
+    factor = float(student.ppf(0.95, count - 1)) * np.sqrt(1 + 1 / count) if count > 1 else 1.645
+    return float(v.null.mean()) + factor * spread
 
 
 def unexplained(v: Verified, found: Found) -> dict[str, Any] | None:

@@ -152,7 +152,7 @@ class DirectionalFriction(_JointFriction):
 
     family = "directional_friction"
     summary = "Dry friction that differs by direction of motion"
-    simpler = (("coulomb",), ("damping_poly",), ("coulomb", "damping_poly"))
+    simpler = (("coulomb",), ("damping_poly",), ("coulomb", "damping_poly"), ("coulomb", "external_force"))
     LEVELS = ("forward", "backward")
     PARAMS = (
         Param("forward", "N m", 0.0, 1e3, probes=(0.01, 0.1)),

@@ -57,7 +57,7 @@ class ExternalForce(Effect):
             size = {"probes": (0.05 * force,), "low": -2 * force, "high": 2 * force, "resolution": 1e-3 * force}
             out.append(cls((name,), sized(cls.PARAMS, x=size, y=size, z=size)))
         for where in joint_places(model):
-            if len(where) != 1 or where[0] in bodies:
+            if len(where) == 1 and where[0] in bodies:
                 continue  # two candidates of one id could not be told apart
             force, _ = joint_scales(model, scales, where)
             size = {"probes": (0.1 * force,), "low": -3 * force, "high": 3 * force, "resolution": 2e-3 * force}

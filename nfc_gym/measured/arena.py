@@ -1,0 +1,191 @@
+"""Where the candidates of one round meet: one model to beat, one common metric, one verdict on each."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured.box import box
+from nfc_gym.measured.contest import Judged, clusters, fold_of, judge, left_out_losses, losses, not_worse
+from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.screen import Screened
+from nfc_gym.measured.settle import slack
+from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.each import Each, split
+
+Array = NDArray[np.float64]
+_CHORD = 10  # free parameters beyond which a candidate's refit reuses psi's Jacobian
+_ALIKE = 0.1  # of a parameter's effect on the motion: what must remain when all others imitate it
+
+
+@dataclass
+class Data:
+    """A problem with its noise covariance at the calibrated model."""
+
+    problem: Problem
+    sigma: Array
+
+
+class Arena:
+    """One model to beat, under one metric.
+
+    Args:
+      fit_data, select: logs that candidates are fitted to, and logs that they are judged on besides.
+      current: the model to beat, fitted under `under`.
+      under: metric of the fit logs.
+      extra: (m,) its slack, which the selection logs' metric shares.
+      rng: of the bootstrap.
+      say: progress.
+    """
+
+    def __init__(
+        self,
+        fit_data: Data,
+        select: Data,
+        current: Fit,
+        under: Metric,
+        extra: Array,
+        rng: np.random.Generator,
+        say: Callable[[str], None],
+    ) -> None:
+        self.fit_data, self.select, self.current, self.under, self.rng, self.say = (
+            fit_data, select, current, under, rng, say,
+        )  # fmt: skip
+        self.on = metric(select.problem, select.sigma, extra)
+        self.blocks = clusters(fit_data.problem), clusters(select.problem)
+        self.folds = fold_of(fit_data.problem)
+        self.base = losses(select.problem, self.on, current)
+        self.left_out = left_out_losses(fit_data.problem, under, current, self.folds)
+
+    def facing(self, current: Fit) -> "Arena":
+        """The same arena with another model to beat."""
+        out = object.__new__(Arena)
+        out.__dict__.update(self.__dict__)
+        out.current, out.base = current, losses(self.select.problem, self.on, current)
+        out.left_out = left_out_losses(self.fit_data.problem, self.under, current, self.folds)
+        return out
+
+    def sharper(self, than: Fit) -> "Arena":
+        """The arena under what another, better model leaves unexplained."""
+        data = self.fit_data
+        extra = slack(data.problem, data.sigma, than.plant, than.x)
+        under = metric(data.problem, data.sigma, extra)
+        current = fit(data.problem, under, self.current.plant, self.current.x, 6)
+        return Arena(data, self.select, current, under, extra, self.rng, self.say)
+
+    # ---- entering ---------------------------------------------------------------------------------------------------
+
+    def enter(self, picks: Sequence[Screened]) -> Judged:
+        """Fit screened candidates with everything fitted so far, from where screening points or from where we are."""
+        self.say(f"refitting {' and '.join(s.effect.id for s in picks)}")
+        current = self.current
+        plant = current.plant.with_effects([*current.plant.effects, *(s.effect for s in picks)])
+        limits, thetas = box(current.plant), [s.theta for s in picks]
+        moved = limits.x(limits.at(current.x) + picks[0].shift, current.x)
+        starts = np.stack([np.concatenate([x, *thetas]) for x in (moved, current.x)])
+        white = self.under.whiten(self.fit_data.problem.residual(plant, starts))
+        start = starts[int(loss(white).sum(-1).argmin())]
+        # With few parameters a full Jacobian costs little; with many, psi keeps the one that it has (the chord method).
+        known = current.jacobian if len(limits.scale) > _CHORD else None
+        return self.judge(fit(self.fit_data.problem, self.under, plant, start, 10, known=known))
+
+    def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
+        """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""
+        parts = split(effect, start.plant)
+        if parts is None:
+            return None
+        each, copies = parts
+        psi, thetas = start.plant.split(start.x)
+        effects = [each if e is effect else e for e in start.plant.effects]
+        pieces = [t[copies] if e is effect else t for e, t in zip(start.plant.effects, thetas, strict=True)]
+        self.say(f"refitting {each.id} with values of its own at each place")
+        plant = self.current.plant.with_effects(effects)
+        return self.judge(fit(self.fit_data.problem, self.under, plant, np.concatenate([psi, *pieces]), 8))
+
+    def enter_again(self, other: Judged) -> Judged:
+        """Go on with the fit of a candidate that comes from another arena."""
+        self.say(f"judging {self.label(other)}")
+        return self.judge(fit(self.fit_data.problem, self.under, other.fitted.plant, other.fitted.x, 8))
+
+    def enter_both(self, one: Judged, other: Judged) -> Judged:
+        """Fit what two candidates add together, from where their own fits ended."""
+        self.say(f"refitting {self.label(one)} and {self.label(other)} together")
+        current = self.current
+        effects, thetas = [], []
+        for j in (one, other):
+            added = {id(e) for e in self.new(j)}
+            for e, theta in zip(j.fitted.plant.effects, j.fitted.plant.split(j.fitted.x)[1], strict=True):
+                if id(e) in added:
+                    effects.append(e)
+                    thetas.append(theta)
+        plant = current.plant.with_effects([*current.plant.effects, *effects])
+        return self.judge(fit(self.fit_data.problem, self.under, plant, np.concatenate([current.x, *thetas]), 10))
+
+    def judge(self, fitted: Fit) -> Judged:
+        """Compare a fitted model with the one to beat."""
+        return judge(
+            fitted, self.current, self.fit_data.problem, self.under, self.left_out, self.folds, self.blocks[0],
+            self.select.problem, self.on, self.base, self.rng,
+        )  # fmt: skip
+
+    # ---- verdicts ---------------------------------------------------------------------------------------------------
+
+    def worth(self, j: Judged, share: float) -> bool:
+        """Whether a gain holds on unseen logs and is a share of the misfit worth naming."""
+        least = share * (float(self.base.sum()) + float(self.current.losses.sum()))
+        return j.lower > 0 and j.gain > 0 and j.total > least
+
+    def ties(self, best: Judged, other: Judged) -> bool:
+        """Whether `other` is not significantly worse."""
+        return not_worse(best, other, *self.blocks, self.rng)
+
+    def told_apart(self, j: Judged) -> bool:
+        """Whether any of a candidate's parameters moves the motion in a way that the others could not imitate."""
+        new = {id(e) for e in self.new(j)}
+        plant = j.fitted.plant
+        of = np.concatenate(
+            [
+                np.zeros(int(plant.space.free.sum()), bool),
+                *(np.full(len(e.params), id(e) in new) for e in plant.effects),
+            ]
+        )
+        slopes = (loss_weight(j.fitted.white)[..., None] * j.fitted.jacobian).reshape(-1, len(of))
+        own, others = slopes[:, of], slopes[:, ~of]
+        left = own - others @ np.linalg.lstsq(others, own, rcond=1e-6)[0] if others.shape[1] else own
+        size = np.maximum(np.linalg.norm(own, axis=0), 1e-12)
+        return bool((np.linalg.norm(left, axis=0) > _ALIKE * size).any())
+
+    # ---- words ------------------------------------------------------------------------------------------------------
+
+    def new(self, j: Judged) -> list[Effect]:
+        """What a candidate adds to (or splits in) the model to beat."""
+        before = set(map(id, self.current.plant.effects))
+        return [e for e in j.fitted.plant.effects if id(e) not in before]
+
+    def label(self, j: Judged) -> str:
+        """Ids of what a candidate adds."""
+        return " + ".join(e.id for e in self.new(j))
+
+    def row(self, j: Judged) -> dict:
+        """A candidate as the report ranks it."""
+        thetas = dict(zip(map(id, j.fitted.plant.effects), j.fitted.plant.split(j.fitted.x)[1], strict=True))
+        new = self.new(j)
+        return {
+            "id": self.label(j),
+            "gain_fit": float(j.fit_gains.sum()),
+            "gain_select": j.gain,
+            "gain_select_low": j.lower,
+            "generic": new[0].generic,
+            "sentence": " ".join(e.say(thetas[id(e)]) for e in new),
+        }
+
+
+def contains(law: Effect, plain: Effect) -> bool:
+    """Whether a law has a plainer one as its special case: it can then do no worse, and is no alternative to it."""
+    same = set(plain.where) <= set(law.where)
+    if law.family == plain.family:
+        return same and isinstance(law, Each)
+    return same and (plain.family,) in law.simpler
