@@ -238,7 +238,7 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
         if done:
             out.append(fit(whole, metric(whole, sigma, slack(whole, sigma, plant, x)), plant, x, rounds=1))
         else:
-            out.append(settle(whole, sigma, plant, x, run.seed)[0])
+            out.append(settle(whole, sigma, plant, x)[0])
     run.stages.put("final", {"calibrated": pack(out[0]), "extended": pack(out[1])})
     return out[0], out[1]
 

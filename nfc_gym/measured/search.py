@@ -23,11 +23,12 @@ Say = Callable[[str], None]
 _NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
 _SHARED = 0.8  # the same for the same law at a wider place
 _FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block
+_ENOUGH = 12  # blocks that such a thinning must leave
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
 _SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
 _PAIRED = 4  # candidates that are tried in pairs where none is believed alone
-_FINALISTS = 5  # candidates that are judged again under the sharper metric
+_FINALISTS = 4  # candidates that are judged again under the sharper metric
 
 
 @dataclass(frozen=True)
@@ -88,10 +89,10 @@ class Search:
         self.options, self.say = options, say
         self.rng = np.random.default_rng(options.seed)
 
-    def settle(self, current: Fit) -> Arena:
+    def settle(self, current: Fit, polished: bool = False) -> Arena:
         """The arena of the round that starts from a model, which is refitted first."""
-        data = self.fit_data
-        fitted, under, extra = settle(data.problem, data.sigma, current.plant, current.x, self.options.seed)
+        data, seed = self.fit_data, None if polished else self.options.seed
+        fitted, under, extra = settle(data.problem, data.sigma, current.plant, current.x, seed)
         return Arena(data, self.select, fitted, under, extra, self.rng, self.say)
 
     def run(
@@ -108,10 +109,12 @@ class Search:
           keep: called with model and rounds after every round that accepted something.
         """
         current, rounds = begun or (calibrated, [])
-        arena = self.settle(current)
+        arena = self.settle(current, polished=True)
         while True:
             screen = Screen(self.fit_data.problem, arena.under, arena.current)
             screened = self._screen(screen, self.named)
+            if self.fit_data.problem.rough:
+                screened = self._scouted(screen, screened)
             outcome, best = self._round(arena, screen, screened)
             rounds.append(outcome)
             if best is None or len(arena.current.plant.effects) >= self.options.most:
@@ -119,7 +122,7 @@ class Search:
             arena = self.settle(best.fitted)
             current = self._prune(arena)
             if current is not arena.current:
-                arena = self.settle(current)
+                arena = self.settle(current, polished=True)
             keep(arena.current, rounds)
         generic = self._generic(arena, screen, outcome)
         current = arena.current
@@ -138,20 +141,24 @@ class Search:
         # Places that show nothing at all are not looked at again; sets of places stay, since they stand for many.
         floor = 1e-3 * float(screen.projected @ screen.projected)
         self.hopeless |= {f.effect.id for f in found[_KEEP:] if f.gain < floor}
-        return self._scouted(screen, found) if self.fit_data.problem.rough else found
+        return found
 
     def _thinned(self, screen: Screen) -> Screen:
-        """The same screen on every third block."""
-        index = np.arange(0, len(self.fit_data.problem), _THIN)
+        """The same screen on every third block, where there are enough of them."""
+        blocks = len(self.fit_data.problem)
+        if blocks < _THIN * _ENOUGH:
+            return screen
+        index = np.arange(0, blocks, _THIN)
         current = screen.current
         part = Fit(current.plant, current.x, current.white[index], current.jacobian[index])
         return Screen(self.fit_data.problem.take(index), screen.metric.take(index), part)
 
     def _promising(self, screen: Screen, pool: list[Effect]) -> list[Effect]:
         """Of a large pool, those that do best on every third block, and the best of each family."""
-        if len(pool) <= _FIELD or len(self.fit_data.problem) < _THIN * 20:
+        thin = self._thinned(screen)
+        if len(pool) <= _FIELD or thin is screen:
             return pool
-        rough = screen_all(self._thinned(screen), pool)
+        rough = screen_all(thin, pool)
         families = {r.effect.family: r.effect for r in reversed(rough)}
         best = [r.effect for r in rough[:_FIELD]]
         return best + [e for e in families.values() if e not in best]
@@ -160,7 +167,8 @@ class Search:
         """The leading families' best candidates by what they gain in truth, then the rest as screening has them."""
         leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
         self.say(f"looking around {len(leading)} of them")
-        looked = sorted((screen.scout(f, self.rng) for f in leading), key=lambda f: -f.gain)
+        thin = self._thinned(screen)
+        looked = sorted((thin.scout(f, self.rng) for f in leading), key=lambda f: -f.gain)
         chosen = {id(f.effect) for f in looked}
         return looked + [f for f in found if id(f.effect) not in chosen]
 

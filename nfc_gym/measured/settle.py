@@ -13,7 +13,7 @@ from nfc_gym.physics.rollout import Plant
 Array = NDArray[np.float64]
 TURNS = 4  # refreshments of the metric, at most
 _STEADY = 0.05  # relative change of standard deviations below which a metric has settled
-_POLISHED, _EVALUATIONS = 2, 100  # turns of a rough problem that go on without derivatives, and how far
+_EVALUATIONS = 80  # of the polish without derivatives that the first turn of a rough problem ends with
 
 
 def slack(problem: Problem, sigma: Array, plant: Plant, x: Array) -> Array:
@@ -26,7 +26,7 @@ def settle(
     sigma: Array,
     plant: Plant,
     x: Array,
-    seed: int,
+    seed: int | None = None,
     rounds: int = 12,
     tick: Callable[[int], None] = lambda turn: None,
 ) -> tuple[Fit, Metric, Array]:
@@ -35,7 +35,7 @@ def settle(
     Args:
       sigma: (S, m, m) covariance of the noise.
       x: (size,) where to start.
-      seed: of the polish that rough problems get.
+      seed: of the polish that rough problems get; None for a start that needs none.
       rounds: iterations of each refit, at most.
       tick: called with the number of each turn, from 1.
 
@@ -48,7 +48,7 @@ def settle(
         tick(turn)
         under = metric(problem, sigma, extra)
         found = fit(problem, under, plant, x, rounds)
-        if problem.rough and turn <= _POLISHED:
+        if problem.rough and seed is not None and turn == 1:
             found = polish(problem, under, found, _EVALUATIONS, seed)
         x, before, extra = found.x, extra, slack(problem, sigma, plant, found.x)
         if np.allclose(np.sqrt(extra + noise), np.sqrt(before + noise), rtol=_STEADY):
