@@ -26,6 +26,7 @@ _FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many
 _ENOUGH = 12  # blocks that such a thinning must leave
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
 _SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
+_PURSUED = 40  # candidates that a smooth problem takes a few steps further before it shortlists
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
 _PAIRED = 4  # candidates that are tried in pairs where none is believed alone
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
@@ -113,8 +114,7 @@ class Search:
         while True:
             screen = Screen(self.fit_data.problem, arena.under, arena.current)
             screened = self._screen(screen, self.named)
-            if self.fit_data.problem.rough:
-                screened = self._scouted(screen, screened)
+            screened = self._looked_at(screen, screened)
             outcome, best = self._round(arena, screen, screened)
             rounds.append(outcome)
             if best is None or len(arena.current.plant.effects) >= self.options.most:
@@ -163,12 +163,16 @@ class Search:
         best = [r.effect for r in rough[:_FIELD]]
         return best + [e for e in families.values() if e not in best]
 
-    def _scouted(self, screen: Screen, found: list[Screened]) -> list[Screened]:
-        """The leading families' best candidates by what they gain in truth, then the rest as screening has them."""
-        leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
-        self.say(f"looking around {len(leading)} of them")
-        thin = self._thinned(screen)
-        looked = sorted((thin.scout(f, self.rng) for f in leading), key=lambda f: -f.gain)
+    def _looked_at(self, screen: Screen, found: list[Screened]) -> list[Screened]:
+        """The leading candidates by what they gain in truth, then the rest as screening has them."""
+        if self.fit_data.problem.rough:
+            leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
+            thin = self._thinned(screen)
+            look = lambda f: thin.scout(f, self.rng)  # noqa: E731
+        else:
+            leading, look = [f for f in found[:_PURSUED] if f.gain > 0], screen.pursue
+        self.say(f"looking closer at {len(leading)} of them")
+        looked = sorted(map(look, leading), key=lambda f: -f.gain)
         chosen = {id(f.effect) for f in looked}
         return looked + [f for f in found if id(f.effect) not in chosen]
 
