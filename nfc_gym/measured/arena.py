@@ -188,4 +188,4 @@ def contains(law: Effect, plain: Effect) -> bool:
     same = set(plain.where) <= set(law.where)
     if law.family == plain.family:
         return same and isinstance(law, Each)
-    return same and (plain.family,) in law.simpler
+    return same and ((plain.family,) in law.simpler or plain.family in law.covers)

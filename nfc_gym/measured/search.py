@@ -212,13 +212,14 @@ class Search:
         chosen = arena.new(best)
         outcome.accepted = [e.id for e in chosen]
         outcome.share = best.gain / max(float(arena.base.sum()), 1e-9)
+        rivals = [j for j in judged if j.total > _NEARLY * best.total and arena.label(j) not in outcome.accepted]
+        rivals = [j for j in rivals if arena.ties(believed[0], j)]
+        # A law that has the chosen one, or another rival, as its special case is no further alternative.
+        plainer = [chosen, *(arena.new(j) for j in rivals)]
         outcome.equivalents = [
             arena.label(j)
-            for j in judged
-            if arena.label(j) not in outcome.accepted
-            and j.total > _NEARLY * best.total
-            and not any(contains(e, w) for e in arena.new(j) for w in chosen)
-            and arena.ties(believed[0], j)
+            for j in rivals
+            if not any(contains(e, w) for e in arena.new(j) for laws in plainer for w in laws if w is not e)
         ]
         self.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best

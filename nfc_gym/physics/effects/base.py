@@ -115,6 +115,8 @@ class Effect(ABC):
     generic: ClassVar[bool] = False
     # Families that together do the same at the same place unless this law's own feature shows; else claimed instead.
     simpler: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    # Families that are special cases of this law at the same place: beside them it is no further alternative.
+    covers: ClassVar[tuple[str, ...]] = ()
     # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
     PARAMS: ClassVar[tuple[Param, ...]] = ()
 

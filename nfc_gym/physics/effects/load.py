@@ -81,6 +81,7 @@ class Wind(Effect):
     """
 
     family = "wind"
+    covers = ("external_force",)  # a gale on hardly any drag
     summary = "Steady wind"
     PARAMS = (
         *(Param(f"push_{axis}", "N", -1e5, 1e5, probes=(0.1,)) for axis in "xyz"),
