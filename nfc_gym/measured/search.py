@@ -28,7 +28,8 @@ _KEEP = 60  # candidates that are screened again in every round, whatever they g
 _SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
 _PURSUED = 40  # candidates that a smooth problem takes a few steps further before it shortlists
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
-_PAIRED = 4  # candidates that are tried in pairs where none is believed alone
+_PAIRED = 4  # candidates that are tried in pairs
+_TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
 
 
@@ -201,10 +202,12 @@ class Search:
         beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in judged)]
         outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *(arena.judge(j.fitted) for j in beaten)]])
         believed = [j for j in judged if self._believed(arena, j)]
-        if not believed:
+        if not believed or not self.fit_data.problem.rough:
             pairs = self._pairs(arena, judged)
             outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
-            believed = [j for j in pairs if self._believed(arena, j)]
+            alone = max((j.total for j in believed), default=0.0)
+            both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(arena, j)]
+            believed = both or believed
         if not believed:
             outcome.reason = f"the best candidate, {arena.label(judged[0])}, gains no more on unseen logs than chance"
             return outcome, None
@@ -244,7 +247,10 @@ class Search:
         return arena.worth(j, self.options.worth) and arena.told_apart(j)
 
     def _pairs(self, arena: Arena, judged: Sequence[Judged]) -> list[Judged]:
-        """Two laws at once, where none is believed alone: one may show only when the other is there."""
+        """Two laws at once: one may show only when the other is there.
+
+        Where bodies touch a fit costs seconds, and pairs are tried only if none is believed alone.
+        """
         added = [j for j in judged if j.total > 0 and len(j.fitted.plant.effects) > len(arena.current.plant.effects)]
         pairs = [
             arena.enter_both(a, b)
