@@ -89,7 +89,10 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
 def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
     """Typical magnitudes along the logs: speeds and forces of the motion, and what its actuators push."""
     model = bench.plant.model
-    motion = _rolled(bench, logs) if bench.mode == "rollout" else _measured(bench, logs)
+    # The commands of a firmware servo are targets, from which no push can be told without its law.
+    served = any(c.servo is not None for c in bench.dataset.mapping.controls.values())
+    rolled = _rolled(bench, logs) if bench.mode == "rollout" and not served else None
+    motion = rolled or _measured(bench, logs)
     data = mujoco.MjData(model)
     count = len(motion.qpos)
     needed, pushed, acting = np.zeros((count, model.nv)), np.zeros((count, model.nv)), np.zeros((count, model.nu))
@@ -106,7 +109,7 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
     need, push = rms(needed), rms(pushed)
     # A driven wheel needs little for its own motion and pushes the vehicle: roll-outs show what it pushes. At measured
     # states one by one a stiff servo would seem to push thousands of newtons: there the need counts first.
-    force = np.maximum(need, push) if bench.mode == "rollout" else np.where(need > 1e-9, need, push)
+    force = np.maximum(need, push) if rolled else np.where(need > 1e-9, need, push)
     first = logs[0]
     exogenous = {k: float(np.median(np.concatenate([log.exogenous[k] for log in logs]))) for k in first.exogenous}
     channels = {
@@ -144,13 +147,18 @@ def _measured(bench: Bench, logs: Sequence[Log]) -> _Motion:
     return _Motion(*(np.concatenate(a) for a in zip(*parts, strict=True)))
 
 
-def _rolled(bench: Bench, logs: Sequence[Log]) -> _Motion:
-    """The nominal model's own motion from the logs' starts, under their commands: every joint moves as it would."""
+def _rolled(bench: Bench, logs: Sequence[Log]) -> _Motion | None:
+    """The nominal model's own motion from the logs' starts, under their commands: every joint moves as it would.
+
+    None where every start diverges.
+    """
     problem = bench.problem(logs, most=40)
     assert isinstance(problem, RolloutProblem)
     plant, seg = bench.plant, problem.segments
     traj = plant.shoot(plant.null[None], seg)
     stable = traj.stable[0]
+    if not stable.any():
+        return None
     each = max(1, int(stable.sum()) * seg.steps // _MOMENTS)
     at = np.arange(1, seg.steps, each)
     qpos, qvel = traj.qpos[0, stable], traj.qvel[0, stable]

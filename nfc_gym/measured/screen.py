@@ -28,7 +28,7 @@ class Screened:
     Attributes:
       effect: the candidate.
       gain: drop of the (weighted, squared) loss that its best linear combination reaches, psi and accepted effects
-        refitted.
+        refitted; after `scout` or `pursue` the drop of the loss itself that was seen.
       theta: (k,) parameters to start a fit from.
       shift: (j,) change of the fitted model's scaled free parameters that goes with it.
       columns: (n, k') projected whitened change at the probe that did best, for the identifiability table.
