@@ -186,12 +186,13 @@ class Search:
         first takes an error ten times the noise for one standard deviation, and all that mend most of it for equals.
         """
         chance = screen.chance(screened, arena.blocks[0], self.rng)
-        first = [arena.enter([s]) for s in shortlist(screened, self.options.short)]
-        first = [j for j in first if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
+        entered = sorted((arena.enter([s]) for s in shortlist(screened, self.options.short)), key=lambda j: -j.total)
+        first = [j for j in entered if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
         if not first:
-            return Round([], 0.0, reason="no candidate reduces the misfit more than chance does"), None
-        arena = arena.sharper(max(first, key=lambda j: j.total).fitted)
-        judged = [arena.enter_again(j) for j in sorted(first, key=lambda j: -j.total)[:_FINALISTS]]
+            ranking = [arena.row(j) for j in entered]  # the report names the nearest
+            return Round([], 0.0, ranking, reason="no candidate reduces the misfit more than chance does"), None
+        arena = arena.sharper(first[0].fitted)
+        judged = [arena.enter_again(j) for j in first[:_FINALISTS]]
         judged += self._apart(arena, judged)
         judged.sort(key=lambda j: -j.total)
         if (better := self._psi_alone(arena, judged[0])) is not None:
