@@ -18,6 +18,7 @@ from nfc_gym.physics.effects.each import Each, split
 
 Array = NDArray[np.float64]
 _CHORD = 10  # free parameters beyond which a candidate's refit reuses psi's Jacobian
+_EDGE = 1e-2  # of a parameter's range: nearer to a bound than this is at it
 _ALIKE = 0.1  # of a parameter's effect on the motion: what must remain when all others imitate it
 
 
@@ -131,6 +132,24 @@ class Arena:
             self.select.problem, self.on, self.base, self.rng,
         )  # fmt: skip
 
+    def likelier(self, j: Judged) -> bool:
+        """Whether a candidate is likelier than the model to beat by more than its price, each with its own slack."""
+        count = int(self.fit_data.problem.mask.sum()) + int(self.select.problem.mask.sum())
+        price = 0.5 * np.log(max(count, 2)) * (len(j.fitted.x) - len(self.current.x))
+        return self.unexplained(j.fitted) + price < self.unexplained(self.current)
+
+    def unexplained(self, fitted: Fit) -> float:
+        """What a model leaves, under a slack of its own: minus the log-likelihood with the slack at its best.
+
+        Under one common metric whoever set the metric is favoured: errors that it never mended count for little.
+        """
+        total = 0.0
+        for data in (self.fit_data, self.select):
+            noise = np.einsum("sii->i", data.sigma) / max(len(data.problem), 1)
+            variance = slack(data.problem, data.sigma, fitted.plant, fitted.x) + noise
+            total += 0.5 * float(data.problem.mask.sum(0) @ np.log(np.maximum(variance, 1e-30)))
+        return total
+
     # ---- verdicts ---------------------------------------------------------------------------------------------------
 
     def worth(self, j: Judged, share: float) -> bool:
@@ -141,6 +160,19 @@ class Arena:
     def ties(self, best: Judged, other: Judged) -> bool:
         """Whether `other` is not significantly worse."""
         return not_worse(best, other, *self.blocks, self.rng)
+
+    def plausible(self, j: Judged) -> bool:
+        """Whether no parameter that a candidate adds ended at the edge of what is plausible.
+
+        A law that wants to go beyond stands in for another: what fits where the logs were taken then fails elsewhere.
+        """
+        thetas = dict(zip(map(id, j.fitted.plant.effects), j.fitted.plant.split(j.fitted.x)[1], strict=True))
+        return all(
+            p.shape or p.natural or bound == p.null or abs(value - bound) > _EDGE * (p.high - p.low)
+            for e in self.new(j)
+            for p, value in zip(e.params, thetas[id(e)], strict=True)
+            for bound in (p.low, p.high)
+        )
 
     def told_apart(self, j: Judged) -> bool:
         """Whether any of a candidate's parameters moves the motion in a way that the others could not imitate."""

@@ -1,5 +1,6 @@
 """Which of several fitted candidates to believe: gains on logs not fitted to, under a moving-block bootstrap."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -142,12 +143,18 @@ def not_worse(
 
 
 def shortlist(screened: Sequence, size: int = 8, each: int = 2) -> list:
-    """The best candidates, at most `each` of one family, so that one family's places do not crowd out the others."""
-    out, count = [], {}
+    """The best candidates, at most `each` of one family, and as many that start from the same law at the same place.
+
+    Otherwise one family's places, or friction in four dresses, would crowd out all other mechanisms.
+    """
+    out, count = [], Counter()
     for s in screened:
-        if s.gain <= 0 or count.get(s.effect.family, 0) >= each:
+        effect = s.effect
+        plain = effect.simpler[0][0] if effect.simpler else effect.family
+        keys = (effect.family, (plain, frozenset(effect.where)))
+        if s.gain <= 0 or any(count[k] >= each for k in keys):
             continue
-        count[s.effect.family] = count.get(s.effect.family, 0) + 1
+        count.update(keys)
         out.append(s)
         if len(out) == size:
             break

@@ -28,7 +28,7 @@ _KEEP = 60  # candidates that are screened again in every round, whatever they g
 _SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
 _PURSUED = 40  # candidates that a smooth problem takes a few steps further before it shortlists
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
-_PAIRED = 4  # candidates that are tried in pairs
+_PAIRED, _PAIRED_ROUGH = 5, 3  # candidates that are tried in pairs
 _TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
 
@@ -191,8 +191,11 @@ class Search:
         if not first:
             ranking = [arena.row(j) for j in entered]  # the report names the nearest
             return Round([], 0.0, ranking, reason="no candidate reduces the misfit more than chance does"), None
-        arena = arena.sharper(first[0].fitted)
-        judged = [arena.enter_again(j) for j in first[:_FINALISTS]]
+        leaders = sorted(first, key=lambda j: arena.unexplained(j.fitted))
+        self.say(f"judging again under what {arena.label(leaders[0])} leaves unexplained")
+        finalists = list({id(j): j for j in (*first[: _FINALISTS // 2], *leaders)}.values())[:_FINALISTS]
+        arena = arena.sharper(leaders[0].fitted)
+        judged = [arena.enter_again(j) for j in finalists]
         judged += self._apart(arena, judged)
         judged.sort(key=lambda j: -j.total)
         if (better := self._psi_alone(arena, judged[0])) is not None:
@@ -204,7 +207,7 @@ class Search:
         outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *(arena.judge(j.fitted) for j in beaten)]])
         believed = [j for j in judged if self._believed(arena, j)]
         if not believed or not self.fit_data.problem.rough:
-            pairs = self._pairs(arena, judged)
+            pairs = self._pairs(arena, judged, entered)
             outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
             alone = max((j.total for j in believed), default=0.0)
             both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(arena, j)]
@@ -245,21 +248,29 @@ class Search:
         return [j for j in found if j is not None]
 
     def _believed(self, arena: Arena, j: Judged) -> bool:
-        return arena.worth(j, self.options.worth) and arena.told_apart(j)
+        return arena.worth(j, self.options.worth) and arena.plausible(j) and arena.told_apart(j)
 
-    def _pairs(self, arena: Arena, judged: Sequence[Judged]) -> list[Judged]:
+    def _pairs(self, arena: Arena, judged: Sequence[Judged], entered: Sequence[Judged]) -> list[Judged]:
         """Two laws at once: one may show only when the other is there.
 
         Where bodies touch a fit costs seconds, and pairs are tried only if none is believed alone.
+
+        Args:
+          arena: the sharper one.
+          judged: candidates judged in it.
+          entered: all of the shortlist as the first contest had them: who is lost alone may shine in company.
         """
-        added = [j for j in judged if j.total > 0 and len(j.fitted.plant.effects) > len(arena.current.plant.effects)]
+        added = [j for j in judged if len(j.fitted.plant.effects) > len(arena.current.plant.effects)]
+        names = {arena.label(j) for j in added}
+        added = [j for j in (*added, *(j for j in entered if arena.label(j) not in names)) if arena.plausible(j)]
+        added = added[: _PAIRED_ROUGH if self.fit_data.problem.rough else _PAIRED]
         pairs = [
             arena.enter_both(a, b)
-            for i, a in enumerate(added[:_PAIRED])
-            for b in added[i + 1 : _PAIRED]
+            for i, a in enumerate(added)
+            for b in added[i + 1 :]
             if arena.new(a)[0].family != arena.new(b)[0].family
         ]
-        gain = max((j.total for j in judged), default=0.0)
+        gain = max((j.total for j in judged if arena.plausible(j)), default=0.0)
         return sorted((p for p in pairs if p.total > gain), key=lambda j: -j.total)
 
     def _psi_alone(self, arena: Arena, best: Judged) -> Fit | None:
@@ -318,7 +329,8 @@ class Search:
             plant = current.plant.with_effects([e for e, _ in pairs])
             start = np.concatenate([psi, *(t for _, t in pairs)])
             without = arena.facing(fit(self.fit_data.problem, arena.under, plant, start, 8))
-            if not without.worth(without.judge(current), self.options.worth):
+            kept = without.judge(current)
+            if not without.worth(kept, self.options.worth) and not without.likelier(kept):
                 self.say(f"dropped {effect.id}: the others explain what it did")
                 current = without.current
         return current

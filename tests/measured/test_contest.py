@@ -188,10 +188,30 @@ def test_not_worse_tells_a_clear_difference_from_one_lucky_block() -> None:
     assert not_worse(judged(lucky, base), best, blocks, blocks, rng)
 
 
+def row(family: str, gain: float, where: str = "hub", simpler: tuple = ()) -> Any:
+    """A screened candidate at a place of its own, or at a shared one."""
+    place = (where,) if simpler or where != "hub" else (f"{family}_{gain}",)
+    return SimpleNamespace(effect=SimpleNamespace(family=family, where=place, simpler=simpler), gain=gain)
+
+
 def test_no_family_crowds_out_the_others() -> None:
-    row = lambda family, gain: SimpleNamespace(effect=SimpleNamespace(family=family), gain=gain)  # noqa: E731
     screened = [row("coulomb", 100 - k) for k in range(10)] + [row("lag", 50), row("gain", 40), row("offset", -1)]
     picked = shortlist(screened, size=8, each=3)
     assert [s.effect.family for s in picked] == ["coulomb"] * 3 + ["lag", "gain"]
     assert [s.gain for s in picked] == [100, 99, 98, 50, 40]
     assert len(shortlist(screened, size=2)) == 2
+
+
+def test_friction_in_four_dresses_counts_as_one_mechanism_at_one_place() -> None:
+    plain = (("coulomb",), ("coulomb", "damping_poly"))
+    screened = [
+        row("stribeck", 100, "all", plain),
+        row("coulomb", 90, "all"),
+        row("load_friction", 80, "all", plain),
+        row("load_friction", 70, "left", plain),
+        row("slip", 10, "ground"),
+    ]
+    picked = shortlist(screened, size=4)
+    assert [(s.effect.family, s.gain) for s in picked] == [
+        ("stribeck", 100), ("coulomb", 90), ("load_friction", 70), ("slip", 10),
+    ]  # fmt: skip

@@ -34,6 +34,8 @@ class Param:
       probes: realistic sizes to try first, in the parameter's own unit.
       shape: True where the parameter only shapes the effect (a Stribeck speed) and no value of it is null.
       resolution: a size below which nobody would speak of the effect.
+      natural: True where the bounds are nature's own (a share of one), and not merely beyond all that is plausible: a
+        fit may then rightly end there.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Param:
     probes: tuple[float, ...] = ()
     shape: bool = False
     resolution: float = 0.0
+    natural: bool = False
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ class Saturation(_OnCommand):
 
     family = "saturation"
     summary = "Saturation below the model's limits"
-    PARAMS = (Param("removed", "1", 0.0, 0.95, probes=(0.2, 0.5), resolution=0.005),)
+    PARAMS = (Param("removed", "1", 0.0, 0.95, probes=(0.2, 0.5), resolution=0.005, natural=True),)
     ON_FORCE = (Param("inverse_limit", "1/(N m)", 0.0, 1e6, probes=(1.0,)),)
 
     @classmethod

@@ -118,7 +118,7 @@ class Loss(Gain):
 
     family = "loss"
     summary = "Loss of actuator effectiveness"
-    PARAMS = (Param("fraction", "1", 0.0, 1.0, probes=(0.15, 0.5, 0.95), resolution=0.005),)
+    PARAMS = (Param("fraction", "1", 0.0, 1.0, probes=(0.15, 0.5, 0.95), resolution=0.005, natural=True),)
 
     def factor(self, theta: Array) -> Array:
         return 1.0 - theta[..., 0]

@@ -1,0 +1,98 @@
+"""What a round believes: likelihood with each model's own slack, and parameters within what is plausible."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nfc_gym.measured.arena import Arena, Data
+from nfc_gym.measured.contest import Judged
+from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.metric import metric
+from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.physics.effects.base import Param
+
+
+class Curve(Problem):
+    """Two quantities over t in blocks of four numbers each; one bends by `bend`, and models are polynomials of t."""
+
+    rough = False
+
+    def __init__(self, bend: float, seed: int, noise: float = 0.1, blocks: int = 60) -> None:
+        rng = np.random.default_rng(seed)
+        self.t, self.noise = rng.uniform(-1, 1, (blocks, 8)), noise
+        self.y = noise * rng.normal(size=self.t.shape)
+        self.y[:, :4] += bend * self.t[:, :4]
+        self.mask = np.ones(self.t.shape, bool)
+        self.log_of, self.time_of, self.names = np.repeat(np.arange(5), blocks // 5), np.arange(blocks) % 12.0, ("log",)
+        self.columns = Columns(("a",) * 4 + ("b",) * 4, ("1",) * 8, np.zeros(8), ("joint:a",) * 4 + ("joint:b",) * 4)
+
+    def residual(self, plant: Any, x: np.ndarray) -> np.ndarray:
+        basis = np.polynomial.legendre.legvander(self.t, x.shape[1] - 1)
+        basis[:, 4:, 1:] = 0
+        return self.y - np.einsum("smk,pk->psm", basis, x)
+
+    def covariance(self, plant: Any, x: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self.noise**2 * np.eye(8), (len(self), 8, 8))
+
+    def take(self, index): ...  # type: ignore[override]
+    def synthetic(self, plant, x, rng): ...  # type: ignore[override]
+
+
+def model(problem: Curve, x: list[float]) -> Fit:
+    wide = np.full(len(x), 1e9)
+    space = SimpleNamespace(low=-wide, high=wide, free=np.ones(len(x), bool))
+    same = lambda x: x  # noqa: E731
+    plant: Any = SimpleNamespace(space=space, effects=(), null=np.zeros(len(x)), chart=same, unchart=same)
+    white = problem.residual(plant, np.array([x]))[0]
+    return Fit(plant, np.array(x), white, np.zeros((*white.shape, len(x))))
+
+
+def arena(bend: float) -> tuple[Arena, Curve]:
+    one, other = Curve(bend, 0), Curve(bend, 1)
+    data = [Data(p, p.covariance(None, np.zeros(1))) for p in (one, other)]
+    under = metric(one, data[0].sigma)
+    rng = np.random.default_rng(0)
+    return Arena(data[0], data[1], model(one, [0.0]), under, np.zeros(8), rng, lambda text: None), one
+
+
+def judged(fitted: Fit) -> Judged:
+    return Judged(fitted, np.zeros(1), np.zeros(1), 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("bend", "likelier"), [(0.0, False), (0.01, False), (0.2, True), (5.0, True)])
+def test_a_slope_is_likelier_only_where_the_data_bend(bend: float, likelier: bool) -> None:
+    contest, problem = arena(bend)
+    assert contest.likelier(judged(model(problem, [0.0, bend]))) == likelier
+
+
+def test_own_slack_weighs_a_mended_quantity_however_large_the_error_was() -> None:
+    contest, problem = arena(5.0)
+    half, whole = (contest.unexplained(model(problem, [0.0, slope])) for slope in (2.5, 5.0))
+    bare = contest.unexplained(contest.current)
+    # Half the error of four of eight numbers: ln 2 for each of 4 x 120 numbers.
+    assert bare - half == pytest.approx(480 * np.log(2), rel=0.05)
+    assert half - whole > 3 * (bare - half)
+
+
+@pytest.mark.parametrize(
+    ("param", "value", "plausible"),
+    [
+        (Param("gain", "1", 0.2, 3.0, null=1.0), 0.2, False),
+        (Param("gain", "1", 0.2, 3.0, null=1.0), 2.99, False),
+        (Param("gain", "1", 0.2, 3.0, null=1.0), 0.3, True),
+        (Param("level", "N m", 0.0, 5.0), 0.0, True),
+        (Param("level", "N m", 0.0, 5.0), 5.0, False),
+        (Param("speed", "rad/s", 0.1, 5.0, shape=True), 5.0, True),
+        (Param("fraction", "1", 0.0, 1.0, natural=True), 1.0, True),
+    ],
+)
+def test_a_law_that_ends_at_the_edge_of_the_plausible_stands_in_for_another(
+    param: Param, value: float, plausible: bool
+) -> None:
+    contest, _ = arena(0.0)
+    effect: Any = SimpleNamespace(id="law:place", params=(param,))
+    plant: Any = SimpleNamespace(effects=(effect,), split=lambda x: (x[:0], [x]))
+    fitted = Fit(plant, np.array([value]), np.zeros((1, 1)), np.zeros((1, 1, 1)))
+    assert contest.plausible(judged(fitted)) == plausible
