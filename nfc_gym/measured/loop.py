@@ -27,7 +27,8 @@ from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.report import render, render_summary
-from nfc_gym.measured.search import Found, Options, Round, Search
+from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.search import Found, Options, Search
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole

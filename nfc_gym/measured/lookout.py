@@ -1,0 +1,74 @@
+"""Which candidates deserve a refit: linear screening of all, then a closer look at those that lead."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.screen import Screen, Screened, screen_all
+from nfc_gym.physics.effects.base import Effect
+
+_FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block
+_ENOUGH = 12  # blocks that such a thinning must leave
+_KEEP = 60  # candidates that are screened again in every round, whatever they gained
+_SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
+_PURSUED = 40  # candidates that a smooth problem takes a few steps further before it shortlists
+
+
+class Lookout:
+    """Screens pools of candidates round after round, and remembers which places show nothing.
+
+    Args:
+      problem: on the fit logs.
+      rng: of the draws with which rough problems look around.
+      say: progress.
+    """
+
+    def __init__(self, problem: Problem, rng: np.random.Generator, say: Callable[[str], None]) -> None:
+        self.problem, self.rng, self.say = problem, rng, say
+        self.hopeless: set[str] = set()
+
+    def screen(self, screen: Screen, pool: Sequence[Effect]) -> list[Screened]:
+        """Candidates that are not at work yet, by what they gain as far as straight lines tell, best first."""
+        taken = {e.id.removesuffix(":each") for e in screen.current.plant.effects}
+        left = [e for e in pool if e.id not in taken and (e.id not in self.hopeless or len(e.where) > 1)]
+        self.say(f"screening {len(left)} candidates")
+        found = screen_all(screen, self._promising(screen, left))
+        # Places that show nothing at all are not looked at again; sets of places stay, since they stand for many.
+        floor = 1e-3 * float(screen.projected @ screen.projected)
+        self.hopeless |= {f.effect.id for f in found[_KEEP:] if f.gain < floor}
+        return found
+
+    def closer(self, screen: Screen, found: list[Screened]) -> list[Screened]:
+        """The leading candidates by what they gain in truth, then the rest as screening has them."""
+        if self.problem.rough:
+            leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
+            thin = self._thinned(screen)
+            look = lambda f: thin.scout(f, self.rng)  # noqa: E731
+        else:
+            leading, look = [f for f in found[:_PURSUED] if f.gain > 0], screen.pursue
+        self.say(f"looking closer at {len(leading)} of them")
+        looked = sorted(map(look, leading), key=lambda f: -f.gain)
+        chosen = {id(f.effect) for f in looked}
+        return looked + [f for f in found if id(f.effect) not in chosen]
+
+    def _thinned(self, screen: Screen) -> Screen:
+        """The same screen on every third block, where there are enough of them."""
+        blocks = len(self.problem)
+        if blocks < _THIN * _ENOUGH:
+            return screen
+        index = np.arange(0, blocks, _THIN)
+        current = screen.current
+        part = Fit(current.plant, current.x, current.white[index], current.jacobian[index])
+        return Screen(self.problem.take(index), screen.metric.take(index), part)
+
+    def _promising(self, screen: Screen, pool: list[Effect]) -> list[Effect]:
+        """Of a large pool, those that do best on every third block, and the best of each family."""
+        thin = self._thinned(screen)
+        if len(pool) <= _FIELD or thin is screen:
+            return pool
+        rough = screen_all(thin, pool)
+        families = {r.effect.family: r.effect for r in reversed(rough)}
+        best = [r.effect for r in rough[:_FIELD]]
+        return best + [e for e in families.values() if e not in best]

@@ -1,0 +1,201 @@
+"""One round of the search: refit the shortlist, judge it on the selection logs, and decide which law is accepted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from nfc_gym.measured.arena import Arena, contains
+from nfc_gym.measured.contest import Judged, shortlist
+from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.screen import Screen, Screened
+from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.each import Each, split
+
+_NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
+_SHARED = 0.8  # the same for the same law at a wider place
+_LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
+_PAIRED, _PAIRED_ROUGH = 5, 3  # candidates that are tried in pairs
+_TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
+_FINALISTS = 4  # candidates that are judged again under the sharper metric
+
+
+@dataclass
+class Round:
+    """What one round of the search saw, for the report."""
+
+    accepted: list[str]
+    share: float
+    ranking: list[dict] = field(default_factory=list)
+    equivalents: list[str] = field(default_factory=list)
+    reason: str = ""
+
+
+class Contest:
+    """The candidates of one round.
+
+    Args:
+      arena: where they meet the model to beat.
+      screen, screened: their screening, the leading ones looked at closely.
+      short: how many are refitted.
+      worth: share of the misfit that an effect must explain to be named.
+    """
+
+    def __init__(self, arena: Arena, screen: Screen, screened: Sequence[Screened], short: int, worth: float) -> None:
+        self.arena, self.screen, self.screened, self.short, self.worth = arena, screen, screened, short, worth
+        self.rough = arena.fit_data.problem.rough
+
+    def hold(self) -> tuple[Round, Judged | None]:
+        """Judge twice, and decide.
+
+        First under the metric of the model so far, then the leading ones under the slack of the best of them. The first
+        takes an error ten times the noise for one standard deviation, and all that mend most of it for equals.
+        """
+        arena = self.arena
+        chance = self.screen.chance(self.screened, arena.blocks[0], arena.rng)
+        entered = sorted((arena.enter([s]) for s in shortlist(self.screened, self.short)), key=lambda j: -j.total)
+        first = [j for j in entered if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
+        if not first:
+            ranking = [arena.row(j) for j in entered]  # the report names the nearest
+            return Round([], 0.0, ranking, reason="no candidate reduces the misfit more than chance does"), None
+        judged = self._final(first)
+        arena = self.arena
+        beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in judged)]
+        outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *(arena.judge(j.fitted) for j in beaten)]])
+        believed = [j for j in judged if self._believed(j)]
+        if not believed or not self.rough:
+            pairs = self._pairs(judged, entered)
+            outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
+            alone = max((j.total for j in believed), default=0.0)
+            both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(j)]
+            believed = both or believed
+        if not believed:
+            outcome.reason = f"the best candidate, {arena.label(judged[0])}, gains no more on unseen logs than chance"
+            return outcome, None
+        best = self._simplest(believed)
+        outcome.accepted = [e.id for e in arena.new(best)]
+        outcome.share = best.gain / max(float(arena.base.sum()), 1e-9)
+        outcome.equivalents = self._equivalents(judged, best, believed[0])
+        arena.say(f"accepted {', '.join(outcome.accepted)}")
+        return outcome, best
+
+    def _final(self, first: list[Judged]) -> list[Judged]:
+        """The leading candidates, judged again in a sharper arena, which takes the place of the first; best first."""
+        arena = self.arena
+        leaders = sorted(first, key=lambda j: arena.unexplained(j.fitted))
+        arena.say(f"judging again under what {arena.label(leaders[0])} leaves unexplained")
+        finalists = list({id(j): j for j in (*first[: _FINALISTS // 2], *leaders)}.values())[:_FINALISTS]
+        self.arena = arena = arena.sharper(leaders[0].fitted)
+        judged = [arena.enter_again(j) for j in finalists]
+        judged += self._apart(judged)
+        judged.sort(key=lambda j: -j.total)
+        if (better := self._psi_alone(judged[0])) is not None:
+            # What psi can do by itself is not the candidate's to claim.
+            arena.say("the candidate's psi alone does better than the model before it: judging against that")
+            self.arena = arena = arena.facing(better)
+            judged = sorted((arena.judge(j.fitted) for j in judged), key=lambda j: -j.total)
+        return judged
+
+    def _equivalents(self, judged: Sequence[Judged], best: Judged, leading: Judged) -> list[str]:
+        """Ids of what explains the data as well as the law that is accepted."""
+        arena, chosen = self.arena, self.arena.new(best)
+        ids = [e.id for e in chosen]
+        rivals = [j for j in judged if j.total > _NEARLY * best.total and arena.label(j) not in ids]
+        rivals = [j for j in rivals if arena.ties(leading, j)]
+        # A law that has the chosen one, or another rival, as its special case is no further alternative.
+        plainer = [chosen, *(arena.new(j) for j in rivals)]
+        return [
+            arena.label(j)
+            for j in rivals
+            if not any(contains(e, w) for e in arena.new(j) for laws in plainer for w in laws if w is not e)
+        ]
+
+    def _apart(self, judged: Sequence[Judged]) -> list[Judged]:
+        """Values of their own at each place: for what was accepted before, and for the leading laws at several places.
+
+        Asked in the same round, lest a law that suits all places alike with more parameters of its own wins first.
+        """
+        arena = self.arena
+        best = max(j.total for j in judged)
+        pairs = [(arena.current, e) for e in arena.current.plant.effects]
+        families: set[str] = set()
+        for j in sorted(judged, key=lambda j: -j.total):
+            new = arena.new(j)
+            if len(new) == 1 and len(new[0].where) > 1 and j.total > _LEADING * best and new[0].family not in families:
+                families.add(new[0].family)
+                pairs.append((j.fitted, new[0]))
+        found = [arena.enter_apart(start, effect) for start, effect in pairs]
+        return [j for j in found if j is not None]
+
+    def _believed(self, j: Judged) -> bool:
+        arena = self.arena
+        return arena.worth(j, self.worth) and arena.plausible(j) and arena.told_apart(j)
+
+    def _pairs(self, judged: Sequence[Judged], entered: Sequence[Judged]) -> list[Judged]:
+        """Two laws at once: one may show only when the other is there.
+
+        Where bodies touch a fit costs seconds, and pairs are tried only if none is believed alone.
+
+        Args:
+          judged: candidates judged in the sharper arena.
+          entered: all of the shortlist as the first contest had them: who is lost alone may shine in company.
+        """
+        arena = self.arena
+        added = [j for j in judged if len(j.fitted.plant.effects) > len(arena.current.plant.effects)]
+        names = {arena.label(j) for j in added}
+        added = [j for j in (*added, *(j for j in entered if arena.label(j) not in names)) if arena.plausible(j)]
+        added = added[: _PAIRED_ROUGH if self.rough else _PAIRED]
+        pairs = [
+            arena.enter_both(a, b)
+            for i, a in enumerate(added)
+            for b in added[i + 1 :]
+            if arena.new(a)[0].family != arena.new(b)[0].family
+        ]
+        gain = max((j.total for j in judged if arena.plausible(j)), default=0.0)
+        return sorted((p for p in pairs if p.total > gain), key=lambda j: -j.total)
+
+    def _psi_alone(self, best: Judged) -> Fit | None:
+        """The model to beat, fitted from where the candidate's fit took the rest, if it is clearly better so.
+
+        Fits of robots in contact end in one of many hollows; leading to another is no merit of a candidate.
+        """
+        arena = self.arena
+        current, plant = arena.current, best.fitted.plant
+        if not self.rough or plant.effects[: len(current.plant.effects)] != current.plant.effects:
+            return None
+        other = fit(arena.fit_data.problem, arena.under, current.plant, best.fitted.x[: len(current.x)], 10)
+        gained = float(current.losses.sum() - other.losses.sum())
+        return other if gained > 0.1 * float(best.fit_gains.sum()) > 0 else None
+
+    def _simplest(self, believed: list[Judged]) -> Judged:
+        """Of the candidates that explain the data as well as the best: fewest parameters, then widest place.
+
+        A law whose own feature does not show gives way to the plainer laws that it contains; and a cause that like
+        parts share is likelier than the same cause in just one of them, unless the data tell them apart.
+        """
+        arena, best = self.arena, believed[0]
+        winner = arena.new(best)[0]
+        added = len(best.fitted.plant.effects) > len(arena.current.plant.effects)
+
+        def enough(j: Judged) -> float:
+            rival = arena.new(j)[0]
+            wider = rival.family == winner.family and set(winner.where) < set(rival.where)
+            return _SHARED if wider else _NEARLY
+
+        rivals = [j for j in believed if j.total > enough(j) * best.total and arena.ties(best, j)]
+        for parts in self._plainer(winner) if added else []:
+            plain = arena.enter(parts)
+            if self._believed(plain) and plain.total > _NEARLY * best.total and arena.ties(best, plain):
+                rivals.append(plain)
+        return min(rivals, key=lambda j: (len(j.fitted.x), -len(arena.new(j)[0].where), -j.total))
+
+    def _plainer(self, law: Effect) -> list[list[Screened]]:
+        """The sets of plainer laws that a law contains, screened at its place."""
+        by_id = {s.effect.id: s for s in self.screened}
+        out = []
+        for families in law.simpler:
+            parts = [by_id[i] for f in families if (i := f"{f}:{law.place}") in by_id]
+            if isinstance(law, Each):
+                apart = [split(p.effect, self.screen.current.plant) for p in parts]
+                parts = [self.screen.try_one(a[0]) for a in apart if a is not None]
+            if len(parts) == len(families):
+                out.append(parts)
+        return out
