@@ -10,7 +10,8 @@ from nfc_gym import assets
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.dataset import Dataset
-from nfc_gym.measured.instant import ForwardProblem, InverseProblem
+from nfc_gym.measured.forward import ForwardProblem
+from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.model import compile_model, read_spec, registered
 from nfc_gym.measured.problem import Problem, RolloutProblem
 from nfc_gym.measured.segments import Layout, servos

@@ -12,7 +12,8 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench, make_bench
 from nfc_gym.measured.dataset import Dataset, load
 from nfc_gym.measured.export import unpack
-from nfc_gym.measured.instant import ForwardProblem, InverseProblem
+from nfc_gym.measured.forward import ForwardProblem
+from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.problem import RolloutProblem, interpolate
 from nfc_gym.measured.segments import Layout, servos
 from nfc_gym.physics.rollout import Plant

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, InputError, Log
-from nfc_gym.measured.instant import ForwardProblem, InverseProblem
+from nfc_gym.measured.forward import ForwardProblem
+from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.problem import RolloutProblem, interpolate
 from nfc_gym.measured.segments import Layout
