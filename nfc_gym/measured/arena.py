@@ -15,9 +15,10 @@ from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each, split
+from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-_CHORD = 10  # free parameters beyond which a candidate's refit reuses psi's Jacobian
+_CHORD = 10  # free parameters beyond which a candidate's refit reuses the Jacobian of the model to beat
 _EDGE = 1e-2  # of a parameter's range: nearer to a bound than this is at it
 _ALIKE = 0.1  # of a parameter's effect on the motion: what must remain when all others imitate it
 
@@ -89,9 +90,15 @@ class Arena:
         starts = np.stack([np.concatenate([x, *thetas]) for x in (moved, current.x)])
         white = self.under.whiten(self.fit_data.problem.residual(plant, starts))
         start = starts[int(loss(white).sum(-1).argmin())]
-        # With few parameters a full Jacobian costs little; with many, psi keeps the one that it has (the chord method).
-        known = current.jacobian if len(limits.scale) > _CHORD else None
-        return self.judge(fit(self.fit_data.problem, self.under, plant, start, 10, known=known))
+        return self._refit(plant, start, 10, self.current.jacobian)
+
+    def _refit(self, plant: Plant, start: Array, rounds: int, known: Array) -> Judged:
+        """Fit and judge; `known` (S, m, j) is the Jacobian of the first j free parameters.
+
+        With few of them a full Jacobian costs little; with many they keep the one that they have (the chord method).
+        """
+        chord = known if known.shape[-1] > _CHORD else None
+        return self.judge(fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord))
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
         """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""
@@ -100,16 +107,29 @@ class Arena:
             return None
         each, copies = parts
         psi, thetas = start.plant.split(start.x)
-        effects = [each if e is effect else e for e in start.plant.effects]
-        pieces = [t[copies] if e is effect else t for e, t in zip(start.plant.effects, thetas, strict=True)]
+        of = {id(e): t for e, t in zip(start.plant.effects, thetas, strict=True)}
+        others = [e for e in start.plant.effects if e is not effect]
         self.say(f"refitting {each.id} with values of its own at each place")
-        plant = self.current.plant.with_effects(effects)
-        return self.judge(fit(self.fit_data.problem, self.under, plant, np.concatenate([psi, *pieces]), 8))
+        plant = self.current.plant.with_effects([*others, each])
+        x = np.concatenate([psi, *(of[id(e)] for e in others), of[id(effect)][copies]])
+        return self._refit(plant, x, 8, _slopes_of_others(start, effect))
+
+    def without(self, effect: Effect) -> "Arena":
+        """The same arena with the model to beat less one of its effects, refitted."""
+        current = self.current
+        psi, thetas = current.plant.split(current.x)
+        pairs = [(e, t) for e, t in zip(current.plant.effects, thetas, strict=True) if e is not effect]
+        plant = current.plant.with_effects([e for e, _ in pairs])
+        x = np.concatenate([psi, *(t for _, t in pairs)])
+        return self.facing(fit(self.fit_data.problem, self.under, plant, x, 8))
 
     def enter_again(self, other: Judged) -> Judged:
         """Go on with the fit of a candidate that comes from another arena."""
         self.say(f"judging {self.label(other)}")
-        return self.judge(fit(self.fit_data.problem, self.under, other.fitted.plant, other.fitted.x, 8))
+        plant, before = other.fitted.plant, self.current.plant.effects
+        added = plant.effects[: len(before)] == before
+        known = self.current.jacobian if added else np.zeros((*self.current.white.shape, 0))
+        return self._refit(plant, other.fitted.x, 8, known)
 
     def enter_both(self, one: Judged, other: Judged) -> Judged:
         """Fit what two candidates add together, from where their own fits ended."""
@@ -123,7 +143,7 @@ class Arena:
                     effects.append(e)
                     thetas.append(theta)
         plant = current.plant.with_effects([*current.plant.effects, *effects])
-        return self.judge(fit(self.fit_data.problem, self.under, plant, np.concatenate([current.x, *thetas]), 10))
+        return self._refit(plant, np.concatenate([current.x, *thetas]), 10, current.jacobian)
 
     def judge(self, fitted: Fit) -> Judged:
         """Compare a fitted model with the one to beat."""
@@ -213,6 +233,13 @@ class Arena:
             "generic": new[0].generic,
             "sentence": " ".join(e.say(thetas[id(e)]) for e in new),
         }
+
+
+def _slopes_of_others(fitted: Fit, effect: Effect) -> Array:
+    """(S, m, j) Jacobian of a fit by all free parameters but those of one effect."""
+    psi = np.ones(int(fitted.plant.space.free.sum()), bool)
+    keep = np.concatenate([psi, *(np.full(len(e.params), e is not effect) for e in fitted.plant.effects)])
+    return fitted.jacobian[..., keep]
 
 
 def contains(law: Effect, plain: Effect) -> bool:

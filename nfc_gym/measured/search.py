@@ -110,18 +110,13 @@ class Search:
 
     def _prune(self, arena: Arena) -> Fit:
         """Drop earlier effects that the later ones have made superfluous."""
-        current = arena.current
-        for effect in list(current.plant.effects[:-1]):
-            psi, thetas = current.plant.split(current.x)
-            pairs = [(e, t) for e, t in zip(current.plant.effects, thetas, strict=True) if e is not effect]
-            plant = current.plant.with_effects([e for e, _ in pairs])
-            start = np.concatenate([psi, *(t for _, t in pairs)])
-            without = arena.facing(fit(self.fit_data.problem, arena.under, plant, start, 8))
-            kept = without.judge(current)
+        for effect in arena.current.plant.effects[:-1]:
+            without = arena.without(effect)
+            kept = without.judge(arena.current)
             if not without.worth(kept, self.options.worth) and not without.likelier(kept):
                 self.say(f"dropped {effect.id}: the others explain what it did")
-                current = without.current
-        return current
+                arena = without
+        return arena.current
 
     # ---- generic alternatives ---------------------------------------------------------------------------------------
 
