@@ -11,6 +11,7 @@ from nfc_gym.measured.box import box
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import Metric, loss, loss_weight
 from nfc_gym.measured.problem import Problem
+from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
 _DAMPING = 0.03
@@ -142,6 +143,11 @@ def not_worse(
     return bool(np.quantile(draws, 0.025) <= 0)
 
 
+def mechanism(effect: Effect) -> tuple[str, frozenset[str]]:
+    """The plainest law that an effect starts from, and its place: what friction in all its dresses has in common."""
+    return (effect.simpler[0][0] if effect.simpler else effect.family), frozenset(effect.where)
+
+
 def shortlist(screened: Sequence, size: int = 8, each: int = 2) -> list:
     """The best candidates, at most `each` of one family, and as many that start from the same law at the same place.
 
@@ -150,8 +156,7 @@ def shortlist(screened: Sequence, size: int = 8, each: int = 2) -> list:
     out, count = [], Counter()
     for s in screened:
         effect = s.effect
-        plain = effect.simpler[0][0] if effect.simpler else effect.family
-        keys = (effect.family, (plain, frozenset(effect.where)))
+        keys = (effect.family, mechanism(effect))
         if s.gain <= 0 or any(count[k] >= each for k in keys):
             continue
         count.update(keys)

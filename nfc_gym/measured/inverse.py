@@ -117,13 +117,15 @@ class _Motion:
         """(T, nv) generalised forces; `friction` (T, nv) overrides the dry friction sample by sample."""
         m, d, t = self.model, self._data, self._track
         out, bias, passive = (np.empty((len(t.time), m.nv)) for _ in range(3))
-        qpos, qvel, qacc = d.qpos, d.qvel, d.qacc
-        for k in range(len(t.time)):
-            qpos[:], qvel[:], qacc[:] = t.qpos[k], t.qvel[k], t.qacc[k]
+        # Each look at a field of `MjData` makes a new view, which costs as much as the dynamics of a small machine.
+        qpos, qvel, qacc, level = d.qpos, d.qvel, d.qacc, m.dof_frictionloss
+        needed, its_bias, its_passive = d.qfrc_inverse, d.qfrc_bias, d.qfrc_passive
+        for k, state in enumerate(zip(t.qpos, t.qvel, t.qacc, strict=True)):
+            qpos[:], qvel[:], qacc[:] = state
             if friction is not None:
-                m.dof_frictionloss[:] = friction[k]
+                level[:] = friction[k]
             mujoco.mj_inverse(m, d)
-            out[k], bias[k], passive[k] = d.qfrc_inverse, d.qfrc_bias, d.qfrc_passive
+            out[k], bias[k], passive[k] = needed, its_bias, its_passive
         self.fields |= {"qfrc_bias": bias, "qfrc_passive": passive}
         return out
 

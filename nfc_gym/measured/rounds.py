@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from nfc_gym.measured.arena import Arena, contains
-from nfc_gym.measured.contest import Judged, shortlist
+from nfc_gym.measured.contest import Judged, mechanism, shortlist
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.screen import Screen, Screened
 from nfc_gym.physics.effects.base import Effect
@@ -13,7 +13,7 @@ from nfc_gym.physics.effects.each import Each, split
 _NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
 _SHARED = 0.8  # the same for the same law at a wider place
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
-_PAIRED, _PAIRED_ROUGH = 5, 3  # candidates that are tried in pairs
+_PAIRED, _PAIRED_ROUGH = 5, 3  # mechanisms that are tried in pairs; where bodies touch a fit costs seconds
 _TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
 
@@ -61,12 +61,11 @@ class Contest:
         beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in judged)]
         outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *(arena.judge(j.fitted) for j in beaten)]])
         believed = [j for j in judged if self._believed(j)]
-        if not believed or not self.rough:
-            pairs = self._pairs(judged, entered)
-            outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
-            alone = max((j.total for j in believed), default=0.0)
-            both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(j)]
-            believed = both or believed
+        pairs = self._pairs(judged, entered)
+        outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
+        alone = max((j.total for j in believed), default=0.0)
+        both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(j)]
+        believed = both or believed
         if not believed:
             outcome.reason = f"the best candidate, {arena.label(judged[0])}, gains no more on unseen logs than chance"
             return outcome, None
@@ -132,21 +131,20 @@ class Contest:
     def _pairs(self, judged: Sequence[Judged], entered: Sequence[Judged]) -> list[Judged]:
         """Two laws at once: one may show only when the other is there.
 
-        Where bodies touch a fit costs seconds, and pairs are tried only if none is believed alone.
-
         Args:
           judged: candidates judged in the sharper arena.
           entered: all of the shortlist as the first contest had them: who is lost alone may shine in company.
         """
         arena = self.arena
-        added = [j for j in judged if len(j.fitted.plant.effects) > len(arena.current.plant.effects)]
-        names = {arena.label(j) for j in added}
-        added = [j for j in (*added, *(j for j in entered if arena.label(j) not in names)) if arena.plausible(j)]
-        added = added[: _PAIRED_ROUGH if self.rough else _PAIRED]
+        pool: dict[tuple, Judged] = {}
+        for j in (*judged, *entered):
+            if len(j.fitted.plant.effects) > len(arena.current.plant.effects) and arena.plausible(j):
+                pool.setdefault(mechanism(arena.new(j)[0]), j)
+        best = list(pool.values())[: _PAIRED_ROUGH if self.rough else _PAIRED]
         pairs = [
             arena.enter_both(a, b)
-            for i, a in enumerate(added)
-            for b in added[i + 1 :]
+            for i, a in enumerate(best)
+            for b in best[i + 1 :]
             if arena.new(a)[0].family != arena.new(b)[0].family
         ]
         gain = max((j.total for j in judged if arena.plausible(j)), default=0.0)
