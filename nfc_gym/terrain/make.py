@@ -89,11 +89,22 @@ def pool(
     if size < 1:
         raise InputError(f"size {size!r}: a pool has at least one map")
     levels = np.broadcast_to(difficulty, size) if np.ndim(difficulty) == 0 else np.linspace(*difficulty, size)
-    seeds = [int(np.random.SeedSequence([_seed(seed), k]).generate_state(1)[0]) for k in range(size)]
-    return [
-        make(kind, float(level), each, shape, resolution, spawn, scale)
-        for level, each in zip(levels, seeds, strict=True)
-    ]
+    return [member(k, seed, float(level), kind, shape, resolution, spawn, scale) for k, level in enumerate(levels)]
+
+
+def member(
+    index: int,
+    seed: int,
+    difficulty: float,
+    kind: str = "mixed",
+    shape: tuple[int, int] = SHAPE,
+    resolution: float = RESOLUTION,
+    spawn: float = SPAWN,
+    scale: float = 1.0,
+) -> Heightfield:
+    """Map `index` of `pool(size, seed, difficulty, ...)`, alone."""
+    own = int(np.random.SeedSequence([_seed(seed), index]).generate_state(1)[0])
+    return make(kind, difficulty, own, shape, resolution, spawn, scale)
 
 
 def _prepare(
