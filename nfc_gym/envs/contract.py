@@ -1,4 +1,4 @@
-"""What an environment promises, the same for both engines: spaces, observations, what a step reports, what a reset takes."""
+"""What an environment promises, whichever engine runs it: spaces, observations, what a step reports and a reset takes."""
 
 import importlib
 from collections.abc import Mapping, Sequence
@@ -118,7 +118,7 @@ def outcome(
 
     Args:
       robot, view, action: the step's.
-      unstable: (*B,) simulations that came apart and were put back to rest: their reward is 0, and they end. None: none.
+      unstable: (*B,) simulations that came apart and were put back to rest: they end, with reward 0. None: none did.
     """
     view.task.update(robot.advance(view, action))
     view.before, view.now = view.now, robot.derive(view)

@@ -1,4 +1,4 @@
-"""`Robot`: one robot's task as pure functions over a `View`; the engines (`single`, `vector`) know nothing else of it."""
+"""`Robot`: a robot's task as pure functions over a `View`; the engines (`single`, `vector`) know nothing else of it."""
 
 import tomllib
 from abc import ABC, abstractmethod

@@ -49,7 +49,8 @@ class RobotEnv(gymnasium.Env):
       context: which of `psi` and `elevation` the observation holds; () gives a plain `Box`.
       elevation_hz: how often the elevation map is renewed; None is every control step (50 Hz).
       difficulty: of the terrain, in [0, 1].
-      terrain_seed, terrain_pool, terrain_kind: the pool of maps that episodes draw from; the kind's default is the robot's.
+      terrain_seed, terrain_pool, terrain_kind: the pool of maps that episodes draw from; the default kind is the
+        robot's.
       render_mode: None, `rgb_array` or `human`.
       width, height: of pictures.
       camera: name of a camera of the robot's file, or a free one (`render.camera_of`).
@@ -148,8 +149,8 @@ class RobotEnv(gymnasium.Env):
         Args:
           seed: of the environment's own generator, from which start, goal and terrain are drawn.
           options: `psi` and `psi_belief`: (d,) in physical units or a dict of names, the rest nominal (what the agent
-            believes is by default the truth). On rough ground `heightfield`: (256, 256) m, or `terrain_id`: a map of the
-            pool; `perceived`: (256, 256) m, what `elevation` shows, by default the simulated terrain.
+            believes is by default the truth). On rough ground `heightfield`: (256, 256) m, or `terrain_id`: a map of
+            the pool; `perceived`: (256, 256) m, what `elevation` shows, by default the simulated terrain.
 
         Raises:
           InputError: an unknown option or name, another shape, values that are not finite or physically impossible.
