@@ -1,4 +1,4 @@
-"""What an environment promises, whichever engine runs it: spaces, observations, what a step reports and a reset takes."""
+"""What an environment promises, whichever engine runs it: spaces, observations, what steps report and resets take."""
 
 import importlib
 from collections.abc import Mapping, Sequence
@@ -12,11 +12,13 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.envs.robot import DT, FASTEST, Array, Robot
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import ParameterSpace
-from nfc_gym.terrain.elevation import SIZE
+from nfc_gym.terrain import SHAPE, Heightfield
+from nfc_gym.terrain.egocentric import SIZE
 
 CONTEXT = ("psi", "elevation")
 OPTIONS = ("psi", "psi_belief", "heightfield", "perceived", "terrain_id")
 FPS = round(1 / DT)
+FLAT = Heightfield(np.zeros(SHAPE, np.float32))
 
 
 def robot_class(robot: str | type[Robot]) -> type[Robot]:

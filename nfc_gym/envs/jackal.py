@@ -52,6 +52,7 @@ class Jackal(Robot):
 
     name = "jackal"
     tasks = ("goal", "figure8")
+    terrain_scale = 0.3  # steps of difficulty 0.5 are then 0.03 m, a third of a wheel's radius: what it can climb
     action_size, proprio_size, goal_size, place_size, draws = 2, 15, 2, 2, 5
 
     def __init__(self, model: mujoco.MjModel, task: str) -> None:

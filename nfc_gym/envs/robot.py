@@ -52,7 +52,7 @@ class Robot(ABC):
       tasks: what it can be asked to do; the first is the default.
       goal_size: size of the `goal` observation, 0 where `proprio` holds the command.
       place_size: size of a goal as a place in the world (`achieved`, `desired`), 0 where the tasks have none.
-      terrain_kind: of the rough ground, one of `nfc_gym.terrain.KINDS`.
+      terrain_kind, terrain_scale: of the rough ground: one of `nfc_gym.terrain.KINDS`, and what multiplies its heights.
       draws: how many uniform numbers in [0, 1) an episode's start is made of.
       reads: derived `MjData` fields that the laws read (`sensordata`, `xpos`, ...).
       terms: names of the reward terms of this task, set by the constructor.
@@ -66,6 +66,7 @@ class Robot(ABC):
     goal_size: ClassVar[int] = 0
     place_size: ClassVar[int] = 0
     terrain_kind: ClassVar[str] = "mixed"
+    terrain_scale: ClassVar[float] = 1.0
     draws: ClassVar[int]
     reads: ClassVar[tuple[str, ...]] = ()
     terms: tuple[str, ...]

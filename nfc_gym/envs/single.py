@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from nfc_gym import assets
 from nfc_gym.core.errors import InputError
-from nfc_gym.envs import scene, terrains
+from nfc_gym.envs import scene
 from nfc_gym.envs.contract import (
+    FLAT,
     FPS,
     Observer,
     box,
@@ -30,13 +31,11 @@ from nfc_gym.envs.contract import (
 from nfc_gym.envs.render import Camera, Pictures, Window
 from nfc_gym.envs.robot import FRAME_SKIP, TIMESTEP, Robot
 from nfc_gym.envs.rotations import yaw
+from nfc_gym.envs.terrains import Pool
 from nfc_gym.envs.view import View
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.terrain import Heightfield, elevation
-from nfc_gym.terrain.elevation import SIZE
-from nfc_gym.terrain.heightfield import SHAPE, surface
-
-_FLAT = Heightfield(np.zeros(SHAPE, np.float32))
+from nfc_gym.terrain import Heightfield, elevation, surface
+from nfc_gym.terrain.egocentric import SIZE
 
 
 class RobotEnv(gymnasium.Env):
@@ -100,10 +99,8 @@ class RobotEnv(gymnasium.Env):
         self._pictures: Pictures | None = None
         self._window: Window | None = None
 
-        self._pool = (terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind)
-        self._terrain = self._perceived = _FLAT
-        if rough:
-            terrains.check(*self._pool)
+        self._pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
+        self._terrain = self._perceived = FLAT
         self._observe = Observer(self.robot, len(self.psi_space), checked_context(context), self.goal_conditioned)
         self._period = refresh_period(elevation_hz)
         self._map: NDArray[np.float32] | None = None
@@ -237,7 +234,7 @@ class RobotEnv(gymnasium.Env):
         if "heightfield" in given:
             self._terrain = scene.checked(given["heightfield"])
         else:
-            self._terrain = terrains.member(given.get("terrain_id", int(u * self._pool[0])), *self._pool)
+            self._terrain = self._pool.map(given.get("terrain_id", self._pool.draw(u)))
         self._perceived = scene.checked(given["perceived"], "perceived") if "perceived" in given else self._terrain
         scene.write(self.model, 0, self._terrain.heights)
 
