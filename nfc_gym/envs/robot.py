@@ -22,6 +22,20 @@ TIMESTEP = 0.005  # s, physics 200 Hz
 FRAME_SKIP = 4  # control 50 Hz
 DT = TIMESTEP * FRAME_SKIP  # s
 FASTEST = 1e4  # m/s or rad/s: beyond it (or NaN) a simulation has come apart
+GOAL_REWARDS = ("sparse", "dense")
+
+
+def goal_reward(achieved: NDArray, desired: NDArray, arrived: float, kind: str) -> Array:
+    """Reward of a goal-conditioned environment, (...).
+
+    Args:
+      achieved, desired: (..., k) places [m], taken as float32 as observations have them.
+      arrived: distance that counts as there [m].
+      kind: `sparse`, 0 there and -1 elsewhere, or `dense`, minus the distance.
+    """
+    gap = np.asarray(achieved, np.float32).astype(float) - np.asarray(desired, np.float32)
+    distance = np.sqrt(sum(part * part for part in gap.T)).T
+    return -distance if kind == "dense" else -1.0 * (distance >= arrived)
 
 
 @dataclass(frozen=True)
@@ -46,6 +60,7 @@ class Robot(ABC):
     Args:
       model: the compiled scene, from which names are resolved once.
       task: one of `tasks`.
+      goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward.
 
     Attributes:
       name: folder of its MJCF under `nfc_gym/assets`.
@@ -55,7 +70,8 @@ class Robot(ABC):
       terrain_kind, terrain_scale: of the rough ground: one of `nfc_gym.terrain.KINDS`, and what multiplies its heights.
       draws: how many uniform numbers in [0, 1) an episode's start is made of.
       reads: derived `MjData` fields that the laws read (`sensordata`, `xpos`, ...).
-      terms: names of the reward terms of this task, set by the constructor.
+      arrived: distance from a goal that counts as there [m].
+      terms: names of the robot's own reward terms of this task, set by the constructor.
       home: (nq,) position of the keyframe `home`.
     """
 
@@ -69,10 +85,11 @@ class Robot(ABC):
     terrain_scale: ClassVar[float] = 1.0
     draws: ClassVar[int]
     reads: ClassVar[tuple[str, ...]] = ()
+    arrived: ClassVar[float] = 0.3
     terms: tuple[str, ...]
 
-    def __init__(self, model: mujoco.MjModel, task: str) -> None:
-        self.task = task
+    def __init__(self, model: mujoco.MjModel, task: str, goal_conditioned: str | None = None) -> None:
+        self.task, self.goal_conditioned = task, goal_conditioned
         self.home = model.key("home").qpos.copy()
 
     @classmethod
@@ -94,6 +111,15 @@ class Robot(ABC):
         if task not in cls.tasks:
             raise InputError(f"{cls.name} has no task {task!r}; it has: {', '.join(cls.tasks)}")
         return task
+
+    @classmethod
+    def goals(cls, goal_conditioned: bool, reward_type: str) -> str | None:
+        """The kind of goal reward, or None; `InputError` where the robot has no goals or the kind does not exist."""
+        if reward_type not in GOAL_REWARDS:
+            raise InputError(f"reward_type is {reward_type!r}, want one of: {', '.join(GOAL_REWARDS)}")
+        if goal_conditioned and not cls.place_size:
+            raise InputError(f"goal_conditioned: the {cls.name} has no goals to reach")
+        return reward_type if goal_conditioned else None
 
     # ---- the laws -------------------------------------------------------------------------------------------------
 
@@ -135,6 +161,12 @@ class Robot(ABC):
     def facts(self, view: View) -> dict[str, NDArray]:
         """What `info` reports besides the reward terms, (*B,) each; goal tasks: `success`, `distance`."""
         return {}
+
+    def scored(self, view: View, action: Array) -> dict[str, Array]:
+        """The reward terms that count: the robot's own, or that of the goal alone."""
+        if self.goal_conditioned is None:
+            return self.reward(view, action)
+        return {"goal": goal_reward(self.achieved(view), self.desired(view), self.arrived, self.goal_conditioned)}
 
     # ---- goal-conditioned robots ----------------------------------------------------------------------------------
 
