@@ -322,7 +322,8 @@ class RobotVectorEnv(VectorEnv):
         self._view.now = self.robot.derive(self._view)
         new = nothing_yet(self.robot, self._view)
         info.update({key: np.where(done, new[key], value) for key, value in before.items()})
-        info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": _masked(before, done.copy())}
+        ended = {key: value * done for key, value in before.items()}  # zero where no episode ended
+        info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": _masked(ended, done.copy())}
         info["_final_info"] = done.copy()
         return self._observation()
 
