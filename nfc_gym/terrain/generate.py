@@ -122,19 +122,15 @@ def _mixed(rng: np.random.Generator, grid: Grid, difficulty: float) -> Array:
 
     Each tile is levelled by its median, so that no seam becomes a wall between a kind's high and another's low ground.
     """
-    layers = [
-        generate(each, grid, difficulty) for generate, each in zip(SINGLE.values(), rng.spawn(len(SINGLE)), strict=True)
-    ]
+    parts = zip(SINGLE.values(), rng.spawn(len(SINGLE)), strict=True)
+    layers = [generate(each, grid, difficulty) for generate, each in parts]
     along, across = (_windows(n, grid.resolution) for n in grid.shape)
-    tiles = len(along) * len(across)
-    kinds = rng.permutation(np.resize(np.arange(len(layers)), tiles)).reshape(len(along), len(across))
-    rows, cols = (np.array_split(np.arange(n), len(w)) for n, w in zip(grid.shape, (along, across), strict=True))
-    levels = np.array(
-        [
-            [np.median(layers[k][np.ix_(r, c)]) for k, c in zip(line, cols, strict=True)]
-            for line, r in zip(kinds, rows, strict=True)
-        ]
-    )
+    rows = np.array_split(np.arange(grid.shape[0]), len(along))
+    cols = np.array_split(np.arange(grid.shape[1]), len(across))
+    kinds = rng.permutation(np.resize(np.arange(len(layers)), len(rows) * len(cols))).reshape(len(rows), len(cols))
+    levels = np.zeros(kinds.shape)
+    for (i, j), kind in np.ndenumerate(kinds):
+        levels[i, j] = np.median(layers[kind][np.ix_(rows[i], cols[j])])
     heights = 0.3 * layers[0] - along.T @ levels @ across
     for k, layer in enumerate(layers):
         heights += layer * (along.T @ (kinds == k) @ across)

@@ -1,4 +1,4 @@
-"""Generated terrains: reproducible, flat at difficulty 0 and where robots start, and only ever harder with difficulty."""
+"""Generated terrains: reproducible, flat at difficulty 0 and where robots start, only ever harder with difficulty."""
 
 import cv2
 import numpy as np
@@ -53,7 +53,7 @@ def test_amplitudes_are_those_of_the_table() -> None:
     far = (slice(0, 80), slice(None))  # away from the spawn patch
     assert make("rough", 0.5, 0).heights.std() == pytest.approx(0.5 * AMPLITUDES["roughness"][0], rel=0.02)
     slopes = make("slopes", 1.0, 0).heights[far]
-    assert np.abs(np.diff(slopes, axis=0)).max() / 0.1 == pytest.approx(AMPLITUDES["grade"][0], rel=0.05)
+    assert 0.9 < np.abs(np.diff(slopes, axis=0)).max() / 0.1 / AMPLITUDES["grade"][0] < 1.00001
     risers = np.abs(np.diff(make("steps", 0.5, 0).heights[far], axis=0))
     np.testing.assert_allclose(risers[risers > 1e-6], 0.5 * AMPLITUDES["riser"][0], rtol=1e-5)
     assert make("gaps", 0.5, 0).heights.min() == pytest.approx(-0.5 * AMPLITUDES["gap_depth"][0])
@@ -113,12 +113,13 @@ def test_goal_and_corridor_stay_free() -> None:
     for seed in range(8):
         way = np.linspace(0, 1, 200)[:, None] * goal
         side = np.array([6.0, 8.0]) / 10 * 0.65
+        passage = np.concatenate([way - side, way, way + side])
         heightfield = obstacles(1.0, seed, goal=(8.0, -6.0), corridor=1.5)
-        assert heightfield.height(np.concatenate([way - side, way, way + side])).max() == 0.0
+        assert heightfield.height(passage).max() == 0.0
         turn = np.linspace(0, 2 * np.pi, 50)
         assert heightfield.height(goal + 0.85 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)).max() == 0.0
-        blocked += obstacles(1.0, seed).height(way).max() > 0
-    assert blocked > 4  # without a corridor most ways are not free, so the above says something
+        blocked += obstacles(1.0, seed).height(passage).max() > 0
+    assert blocked > 4  # without a corridor most passages are not free, so the above says something
 
 
 @pytest.mark.parametrize(
@@ -143,7 +144,7 @@ def test_arguments_out_of_range_are_refused(arguments: tuple, message: str) -> N
 def test_other_refusals() -> None:
     with pytest.raises(InputError, match="size 0"):
         pool(0, 0, 0.5)
-    with pytest.raises(InputError, match="corridor 1.0"):
+    with pytest.raises(InputError, match="corridor"):
         obstacles(0.5, 0, corridor=1.0)
 
 
