@@ -94,7 +94,7 @@ def test_psi_is_alike_on_both_sides(robot: str) -> None:
 @pytest.mark.parametrize("robot", ["ant", "humanoid"])
 @pytest.mark.parametrize(("height", "tilt"), list(itertools.product((0.05, 0.5), (0.0, 0.7, 2.0))))
 def test_a_drop_gains_no_energy_and_comes_to_rest(robot: str, height: float, tilt: float) -> None:
-    """Unpowered, from any attitude: no bounce carries more energy than the fall, nothing sinks in or keeps jittering."""
+    """Unpowered, from any attitude: no bounce carries more energy than the fall, nothing sinks in or jitters."""
     model, data = load(robot)
     model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     data.ctrl[:] = 0
@@ -128,7 +128,7 @@ def test_the_ant_rests_on_its_feet_alone_over_the_prior() -> None:
 
 
 def test_the_humanoid_stands_under_position_control() -> None:
-    """Springs of 400 N m/rad in every joint around home hold it for five seconds, also over the prior's heaviest torso."""
+    """Springs of 400 N m/rad around home hold it for five seconds, with the prior's heaviest torso."""
     model, data = load("humanoid")
     model.body("torso").mass[0] = 14.0
     mujoco.mj_setConst(model, data)
