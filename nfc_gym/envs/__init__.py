@@ -1,1 +1,1 @@
-"""The robots' environments: one robot a file, and two engines, a single simulation and a batch, that run the same laws."""
+"""The robots' environments: one robot a file, and two engines, one simulation or a batch, that run the same laws."""

@@ -21,7 +21,7 @@ FULL_TURN = 4.0  # rad/s, the data sheet's; action 1
 
 ARRIVED = 0.3  # m, as all goal tasks
 NEAREST, FARTHEST = 3.0, 8.0  # m to a goal: 4 s of driving at most, so that 20 s leave room for detours
-START = 1.0  # m, half the side of the square that episodes start in
+START = 0.5  # m, half the side of the square that episodes start in: the terrain is level within 1 m
 EDGE = 12.4  # m from the middle: there the map of 25.5 m ends within a robot's length
 TIPPED = 0.3  # z of the robot's up axis: 72 degrees, from where the hull rests on its side
 
@@ -41,7 +41,7 @@ class Now(NamedTuple):
     """Where the rover is with respect to its goal."""
 
     frame: Axes
-    goal: Array  # (*B, 3) m, world
+    goal: Array  # (*B, 2) m, world
     ahead: Array  # (*B,) m, of the goal, along the horizontal heading
     left: Array  # (*B,) m
     distance: Array  # (*B,) m, in the plane
@@ -52,7 +52,8 @@ class Jackal(Robot):
 
     name = "jackal"
     tasks = ("goal", "figure8")
-    action_size, proprio_size, goal_size, draws = 2, 15, 2, 5
+    terrain_scale = 0.3  # steps of difficulty 0.5 are then 0.03 m, a third of a wheel's radius: what it can climb
+    action_size, proprio_size, goal_size, place_size, draws = 2, 15, 2, 2, 5
 
     def __init__(self, model: mujoco.MjModel, task: str) -> None:
         super().__init__(model, task)
@@ -140,3 +141,11 @@ class Jackal(Robot):
     def facts(self, view: View) -> dict[str, NDArray]:
         """Distance to the goal in the plane (m), and whether that counts as reached."""
         return {"success": view.now.distance < ARRIVED, "distance": view.now.distance}
+
+    def achieved(self, view: View) -> NDArray:
+        """World x and y (m)."""
+        return view.qpos.T[:2].T
+
+    def desired(self, view: View) -> NDArray:
+        """World x and y of the goal (m)."""
+        return view.now.goal

@@ -1,4 +1,4 @@
-"""`Robot`: one robot's task as pure functions over a `View`; the engines (`single`, `vector`) know nothing else of it."""
+"""`Robot`: a robot's task as pure functions over a `View`; the engines (`single`, `vector`) know nothing else of it."""
 
 import tomllib
 from abc import ABC, abstractmethod
@@ -51,6 +51,8 @@ class Robot(ABC):
       name: folder of its MJCF under `nfc_gym/assets`.
       tasks: what it can be asked to do; the first is the default.
       goal_size: size of the `goal` observation, 0 where `proprio` holds the command.
+      place_size: size of a goal as a place in the world (`achieved`, `desired`), 0 where the tasks have none.
+      terrain_kind, terrain_scale: of the rough ground: one of `nfc_gym.terrain.KINDS`, and what multiplies its heights.
       draws: how many uniform numbers in [0, 1) an episode's start is made of.
       reads: derived `MjData` fields that the laws read (`sensordata`, `xpos`, ...).
       terms: names of the reward terms of this task, set by the constructor.
@@ -62,6 +64,9 @@ class Robot(ABC):
     action_size: ClassVar[int]
     proprio_size: ClassVar[int]
     goal_size: ClassVar[int] = 0
+    place_size: ClassVar[int] = 0
+    terrain_kind: ClassVar[str] = "mixed"
+    terrain_scale: ClassVar[float] = 1.0
     draws: ClassVar[int]
     reads: ClassVar[tuple[str, ...]] = ()
     terms: tuple[str, ...]
@@ -138,9 +143,9 @@ class Robot(ABC):
         return self.proprio(view)
 
     def achieved(self, view: View) -> NDArray:
-        """(*B, 3) where the robot is, as a goal."""
+        """(*B, place_size) where the robot is, as a goal."""
         raise NotImplementedError
 
     def desired(self, view: View) -> NDArray:
-        """(*B, 3) the goal."""
+        """(*B, place_size) the goal."""
         raise NotImplementedError

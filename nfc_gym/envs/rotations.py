@@ -1,7 +1,7 @@
 """Rotations by components: unit quaternions (w, x, y, z), any leading batch shape () or (n,).
 
-Written out in multiplications and additions, without matrix products: those round differently for one robot and for many,
-and one robot must give the same bits as a row of a batch.
+Written out in multiplications and additions, without matrix products: those round differently for one robot and for
+many, and one robot must give the same bits as a row of a batch.
 """
 
 from typing import NamedTuple

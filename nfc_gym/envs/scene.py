@@ -1,4 +1,4 @@
-"""The scene around a robot: ground (a plane, or heightfields to choose from), light and sky; and heights in and out of it.
+"""The scene around a robot: ground (a plane, or heightfields to choose from), light and sky; heights written into it.
 
 All heightfields of a scene have one size and one place, and that size leaves room for any map between `LOWEST` and
 `HIGHEST`. So a map is changed by its data alone and chosen by `geom_dataid` alone, with nothing to recompute.

@@ -22,8 +22,8 @@ class View:
 
     Attributes:
       qpos, qvel, ctrl: (*B, nq), (*B, nv), (*B, nu) float64, live.
-      sensordata, xpos, ...: what `reads` names, (*B, ...), of the state before the last physics step, as `mj_step` leaves
-        them (after a reset: of the state itself).
+      sensordata, xpos, ...: what `reads` names, (*B, ...), of the state before the last physics step, as `mj_step`
+        leaves them (after a reset: of the state itself).
       task: the episode's memory (goal, clock, last action, ...), name -> (*B, ...). Never write into these arrays.
       now: what `Robot.derive` computed of the present state.
       before: the same, one control step earlier.

@@ -3,9 +3,9 @@
 Needs numpy and OpenCV; trimesh where meshes are read or written. MuJoCo's models are only ever handed in.
 """
 
-from nfc_gym.terrain.elevation import elevation
+from nfc_gym.terrain.egocentric import elevation
 from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield, surface
-from nfc_gym.terrain.make import KINDS, make, obstacles, pool
+from nfc_gym.terrain.generate import KINDS, make, obstacles, pool
 from nfc_gym.terrain.model import HfieldAsset, asset, bounds, write, write_pool
 
 __all__ = [

@@ -1,7 +1,7 @@
 """A terrain as heights over a grid, and the surface that MuJoCo collides with between the grid's points.
 
-MuJoCo splits each cell along the diagonal from `heights[r, c]` to `heights[r + 1, c + 1]`, for contacts and rays alike, so
-the surface between grid points is piecewise linear over triangles, not bilinear. `height` and `normal` follow that split.
+MuJoCo splits each cell along the diagonal from `heights[r, c]` to `heights[r + 1, c + 1]`, for contacts and rays alike,
+so the surface between grid points is piecewise linear over triangles, not bilinear. `height` and `normal` follow that.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,9 @@
 """Heightfields written into MuJoCo models, one map or a pool from which each simulation takes its own.
 
 A model compiled with other heights needs more than new `hfield_data`: the geom's position and its bounding volumes hold
-the old vertical extent, and contacts outside that are lost without a word. `write` mends them all, so that the model equals
-one compiled with the map. What it cannot reach: a renderer shows the new heights once `update_hfield` of the passive viewer or
-`mjr_uploadHField` sent them, and a running `mujoco.batch.Batch` holds its own copy of the model.
+the old vertical extent, and contacts outside that are lost without a word. `write` mends them all, so that the model
+equals one compiled with the map. What it cannot reach: a renderer shows the new heights once the passive viewer's
+`update_hfield` or `mjr_uploadHField` has sent them, and a running `mujoco.batch.Batch` holds its own copy of the model.
 """
 
 from collections.abc import Sequence

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.terrain import obstacles as towers
-from nfc_gym.terrain.generators import BLEND, SINGLE, TILE, Array, Grid
+from nfc_gym.terrain.kinds import BLEND, SINGLE, TILE, Array, Grid
 from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield
+from nfc_gym.terrain.towers import towers
 
 KINDS = (*SINGLE, "mixed", "obstacles")
 SPAWN = 1.0  # m, radius of the flat patch: an Ant's span is 1.6 m, and a robot needs a step's room around it
@@ -22,7 +22,7 @@ def make(
     spawn: float = SPAWN,
     scale: float = 1.0,
 ) -> Heightfield:
-    """A terrain around a flat patch at height 0 in the middle, where robots start; the same arguments give the same bits.
+    """A terrain around a flat patch at height 0, where robots start; the same arguments give the same bits.
 
     Args:
       kind: one of `KINDS`.
@@ -31,7 +31,7 @@ def make(
       shape: (nrow, ncol).
       resolution: m a cell.
       spawn: radius of the flat patch [m]; beyond it a rim of `RIM` passes smoothly into the terrain.
-      scale: multiplies all heights, for robots much smaller or larger than a quadruped (see `generators`).
+      scale: multiplies all heights, for robots much smaller or larger than a quadruped (see `kinds`).
 
     Raises:
       InputError: an argument outside the above.
@@ -40,7 +40,7 @@ def make(
         raise InputError(f"no terrain is called {kind!r}; the kinds are {', '.join(KINDS)}")
     rng, grid = _prepare(difficulty, seed, shape, resolution, spawn, scale)
     if kind == "obstacles":
-        return Heightfield(towers.field(rng, grid, difficulty), resolution)
+        return Heightfield(towers(rng, grid, difficulty), resolution)
     heights = _mixed(rng, grid, difficulty) if kind == "mixed" else SINGLE[kind](rng, grid, difficulty)
     x, y = grid.xy
     rise = np.clip((np.hypot(x, y) - spawn) / RIM, 0.0, 1.0)
@@ -65,7 +65,7 @@ def obstacles(
       corridor: width of the free passage from the middle to the goal [m]; 0 is none.
     """
     rng, grid = _prepare(difficulty, seed, shape, resolution, spawn, scale)
-    return Heightfield(towers.field(rng, grid, difficulty, goal, corridor), resolution)
+    return Heightfield(towers(rng, grid, difficulty, goal, corridor), resolution)
 
 
 def pool(
@@ -88,7 +88,8 @@ def pool(
     """
     if size < 1:
         raise InputError(f"size {size!r}: a pool has at least one map")
-    levels = np.broadcast_to(difficulty, size) if np.ndim(difficulty) == 0 else np.linspace(*difficulty, size)
+    low, high = difficulty if isinstance(difficulty, tuple | list) else (difficulty, difficulty)
+    levels = np.linspace(low, high, size)
     seeds = [int(np.random.SeedSequence([_seed(seed), k]).generate_state(1)[0]) for k in range(size)]
     return [
         make(kind, float(level), each, shape, resolution, spawn, scale)
@@ -119,7 +120,9 @@ def _seed(seed: int) -> int:
 
 def _mixed(rng: np.random.Generator, grid: Grid, difficulty: float) -> Array:
     """Tiles of single kinds with soft seams, over a little roughness everywhere."""
-    layers = [generate(each, grid, difficulty) for generate, each in zip(SINGLE.values(), rng.spawn(len(SINGLE)))]
+    layers = [
+        generate(each, grid, difficulty) for generate, each in zip(SINGLE.values(), rng.spawn(len(SINGLE)), strict=True)
+    ]
     rows, cols = (int(np.ceil(n * grid.resolution / TILE)) for n in grid.shape)
     kinds = rng.permutation(np.resize(np.arange(len(layers)), rows * cols)).reshape(rows, cols)
     row, col = ((np.arange(n) * grid.resolution / TILE).astype(int) for n in grid.shape)

@@ -1,13 +1,13 @@
-"""Seeded terrains of one kind each: fractal roughness, slopes, steps, stepping stones, gaps, and a mixture of them.
+"""Seeded terrains of one kind each: fractal roughness, slopes, steps, stepping stones, gaps.
 
-Each generator is a function (rng, grid, difficulty) -> heights. All random choices are drawn before the difficulty comes
-in, and each amplitude grows with it, so that one seed gives one landscape that a difficulty only makes harder.
+Each generator is a function (rng, grid, difficulty) -> heights. Random choices never depend on the difficulty, and each
+amplitude grows with it, so that one seed gives one landscape that a higher difficulty makes harder.
 
-Amplitudes at difficulty 1 (0 is flat). They are set so that about 0.5 is the hardest that a quadruped of the 12 kg class (hip
-height 0.3 m) or an Ant (legs 0.57 m) learns to cross well, and 1 lies just beyond: legged robots of 0.5 m height are trained up to slopes
-of 25 degrees, steps of 0.2 m and roughness of 0.1 m (Rudin et al. 2022, "Learning to Walk in Minutes Using Massively Parallel Deep
-Reinforcement Learning", CoRL). `scale` multiplies heights for other sizes: a wheel climbs a step of
-about a third of its radius, so for a Jackal (wheels of 0.098 m, climbs slopes of 30 to 45 degrees) 0.3 puts difficulty 0.5 at 0.03 m steps.
+The amplitudes are those at difficulty 1; at 0 all is flat. Legged robots with legs of about 0.5 m have been trained on
+slopes up to 25 degrees, steps of 0.2 m and roughness of 0.1 m (Rudin et al. 2022, "Learning to Walk in Minutes Using
+Massively Parallel Deep Reinforcement Learning", CoRL), so 1 lies at the edge of what an Ant (legs of 0.57 m) can learn and
+beyond what a quadruped with hips at 0.3 m can. `Grid.scale` multiplies heights for other machines: a driven wheel climbs a
+step of about a third of its radius, so with 0.3 the steps of difficulty 0.5 are a Jackal's limit (0.03 m, wheels of 0.098 m).
 """
 
 from collections.abc import Callable
@@ -61,7 +61,8 @@ class Grid:
     @cached_property
     def xy(self) -> tuple[Array, Array]:
         """x (1, ncol) and y (nrow, 1) from the middle [m]."""
-        y, x = (np.arange(n) * self.resolution - 0.5 * (n - 1) * self.resolution for n in self.shape)
+        nrow, ncol = self.shape
+        y, x = ((np.arange(n) - 0.5 * (n - 1)) * self.resolution for n in (nrow, ncol))
         return x[None, :], y[:, None]
 
     @cached_property

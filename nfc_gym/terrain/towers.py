@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.terrain.generators import Grid
+from nfc_gym.terrain.kinds import Grid
 
 Array = NDArray[np.float64]
 
@@ -15,7 +15,7 @@ RADII = (0.15, 0.6)  # m; half the side of a tower
 CLEARANCE = 1.2  # m between any two obstacles: twice the span, so that every free place can be reached
 
 
-def field(
+def towers(
     rng: np.random.Generator,
     grid: Grid,
     difficulty: float,
