@@ -54,8 +54,8 @@ class Jackal(Robot):
     terrain_scale = 0.3  # steps of difficulty 0.5 are then 0.03 m, a third of a wheel's radius: what it can climb
     action_size, proprio_size, goal_size, place_size, draws = 2, 15, 2, 2, 5
 
-    def __init__(self, model: mujoco.MjModel, task: str, goal_conditioned: str | None = None) -> None:
-        super().__init__(model, task, goal_conditioned)
+    def __init__(self, model: mujoco.MjModel, task: str) -> None:
+        super().__init__(model, task)
         self.terms = ("progress" if task == "goal" else "tracking", "arrival", "jerk", "tilt")
 
     def begin(self, u: Array, ground: Ground) -> Start:

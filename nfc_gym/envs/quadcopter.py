@@ -48,8 +48,8 @@ class Quadcopter(Robot):
     reads = ("sensordata",)
     terms = ("nearness", "upright", "rates", "arrival")
 
-    def __init__(self, model: mujoco.MjModel, task: str, goal_conditioned: str | None = None) -> None:
-        super().__init__(model, task, goal_conditioned)
+    def __init__(self, model: mujoco.MjModel, task: str) -> None:
+        super().__init__(model, task)
         self._half = model.actuator_ctrlrange[:, 1] / 2  # N
         self._touch = int(model.sensor("collision").adr[0])
 

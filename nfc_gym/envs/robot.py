@@ -4,7 +4,7 @@ import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import mujoco
 import numpy as np
@@ -60,7 +60,6 @@ class Robot(ABC):
     Args:
       model: the compiled scene, from which names are resolved once.
       task: one of `tasks`.
-      goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward.
 
     Attributes:
       name: folder of its MJCF under `nfc_gym/assets`.
@@ -71,6 +70,7 @@ class Robot(ABC):
       draws: how many uniform numbers in [0, 1) an episode's start is made of.
       reads: derived `MjData` fields that the laws read (`sensordata`, `xpos`, ...).
       arrived: distance from a goal that counts as there [m].
+      goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward; set by `of`.
       terms: names of the robot's own reward terms of this task, set by the constructor.
       home: (nq,) position of the keyframe `home`.
     """
@@ -88,8 +88,10 @@ class Robot(ABC):
     arrived: ClassVar[float] = 0.3
     terms: tuple[str, ...]
 
-    def __init__(self, model: mujoco.MjModel, task: str, goal_conditioned: str | None = None) -> None:
-        self.task, self.goal_conditioned = task, goal_conditioned
+    goal_conditioned: str | None = None
+
+    def __init__(self, model: mujoco.MjModel, task: str) -> None:
+        self.task = task
         self.home = model.key("home").qpos.copy()
 
     @classmethod
@@ -104,22 +106,17 @@ class Robot(ABC):
         return ParameterSpace(model, cls.parameters())
 
     @classmethod
-    def choose(cls, task: str | None) -> str:
-        """The task of that name, the default one for None; another raises `InputError`."""
-        if task is None:
-            return cls.tasks[0]
-        if task not in cls.tasks:
+    def of(cls, model: mujoco.MjModel, task: str | None, goal_conditioned: bool, reward_type: str) -> Self:
+        """The robot with a task: None is the default one; `InputError` where it has none of that name, or no goals."""
+        if task is not None and task not in cls.tasks:
             raise InputError(f"{cls.name} has no task {task!r}; it has: {', '.join(cls.tasks)}")
-        return task
-
-    @classmethod
-    def goals(cls, goal_conditioned: bool, reward_type: str) -> str | None:
-        """The kind of goal reward, or None; `InputError` where the robot has no goals or the kind does not exist."""
         if reward_type not in GOAL_REWARDS:
             raise InputError(f"reward_type is {reward_type!r}, want one of: {', '.join(GOAL_REWARDS)}")
         if goal_conditioned and not cls.place_size:
             raise InputError(f"goal_conditioned: the {cls.name} has no goals to reach")
-        return reward_type if goal_conditioned else None
+        robot = cls(model, task or cls.tasks[0])
+        robot.goal_conditioned = reward_type if goal_conditioned else None
+        return robot
 
     # ---- the laws -------------------------------------------------------------------------------------------------
 

@@ -93,7 +93,7 @@ class RobotEnv(gymnasium.Env):
         self.rough = bool(rough)
         self.model = scene.build(assets.path(kind.name), maps=1 if rough else 0)
         self.data = mujoco.MjData(self.model)
-        self.robot = kind(self.model, kind.choose(task), kind.goals(goal_conditioned, reward_type))
+        self.robot = kind.of(self.model, task, goal_conditioned, reward_type)
         self.psi_space = kind.space(self.model)
         self.fields = ModelFields(self.model)
         self.frame_skip = FRAME_SKIP

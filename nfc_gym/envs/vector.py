@@ -100,7 +100,7 @@ class RobotVectorEnv(VectorEnv):
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
         self._kind, self._nthread = kind, nthread
-        self._task = kind.choose(task), kind.goals(goal_conditioned, reward_type)
+        self._task = task, goal_conditioned, reward_type
         self._horizon = np.iinfo(np.int64).max if max_episode_steps is None else int(max_episode_steps)
         self._period = refresh_period(elevation_hz)
         context = checked_context(context)
@@ -123,7 +123,7 @@ class RobotVectorEnv(VectorEnv):
             scene.write(self.model, k, heightfield.heights)
         self._maps, self._perceived = list(maps), list(maps if perceived is None else perceived)
         self._stack = np.stack([m.heights for m in maps]) if maps else np.zeros((0, 2, 2), np.float32)
-        self.robot = self._kind(self.model, *self._task)
+        self.robot = self._kind.of(self.model, *self._task)
         self.psi_space = self._kind.space(self.model)
         self.batch = Batch(self.model, n, self._nthread)
         self.fields = ModelFields(self.batch)
