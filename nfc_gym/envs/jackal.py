@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, components, to_robot, turned
+from nfc_gym.envs.rotations import Axes, axes, components, root, to_robot, turned
 from nfc_gym.envs.view import View
 
 # Public dimensions of the machine, as in its MJCF.
@@ -40,7 +40,8 @@ class Now(NamedTuple):
     """Where the rover is with respect to its goal."""
 
     frame: Axes
-    goal: Array  # (*B, 2) m, world
+    x: Array  # (*B,) m, of the goal, world
+    y: Array
     ahead: Array  # (*B,) m, of the goal, along the horizontal heading
     left: Array  # (*B,) m
     distance: Array  # (*B,) m, in the plane
@@ -103,10 +104,10 @@ class Jackal(Robot):
         else:
             gx, gy = components(view.task["goal"])
         dx, dy = gx - x, gy - y
-        distance = np.sqrt(dx * dx + dy * dy)
+        distance = root(dx * dx + dy * dy)
         cos, sin = frame.xx, frame.yx  # horizontal part of the forward axis, to be scaled to unit length
-        scale = 1 / np.maximum(np.sqrt(cos * cos + sin * sin), 1e-6)
-        return Now(frame, np.array((gx, gy)).T, (cos * dx + sin * dy) * scale, (cos * dy - sin * dx) * scale, distance)
+        scale = 1 / root(cos * cos + sin * sin + 1e-12)  # upright on its nose it has no heading
+        return Now(frame, gx, gy, (cos * dx + sin * dy) * scale, (cos * dy - sin * dx) * scale, distance)
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See the table of weights above."""
@@ -147,4 +148,4 @@ class Jackal(Robot):
 
     def desired(self, view: View) -> NDArray:
         """World x and y of the goal (m)."""
-        return view.now.goal
+        return np.array((view.now.x, view.now.y)).T

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, components, turned
+from nfc_gym.envs.rotations import Axes, axes, components, root, turned
 from nfc_gym.envs.view import View
 
 REACH = 0.35  # m, from the chassis' centre to a propeller's tip, with room
@@ -94,7 +94,7 @@ class Quadcopter(Robot):
             goal = view.task["goal"]
         offset = goal - view.qpos[..., :3]
         dx, dy, dz = components(offset)
-        return Now(axes(view.qpos[..., 3:7]), goal, offset, np.sqrt(dx * dx + dy * dy + dz * dz))
+        return Now(axes(view.qpos[..., 3:7]), goal, offset, root(dx * dx + dy * dy + dz * dz))
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See the table of weights above."""
@@ -120,7 +120,7 @@ class Quadcopter(Robot):
         share = (ax * dx + ay * dy + az * dz) / (ax * ax + ay * ay + az * az)
         share = np.minimum(np.maximum(share, 0.0), 1.0)  # of the way that is left
         ex, ey, ez = dx - share * ax, dy - share * ay, dz - share * az
-        return np.sqrt(ex * ex + ey * ey + ez * ez)
+        return root(ex * ex + ey * ey + ez * ez)
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Goal offset (world), then `_motion`."""

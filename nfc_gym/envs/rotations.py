@@ -4,6 +4,7 @@ Written out in multiplications and additions, without matrix products: those rou
 many, and one robot must give the same bits as a row of a batch.
 """
 
+from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,11 @@ def components(array: Array) -> Any:
     where arrays give infinity (division by zero), and that `x ** 2` rounds differently for the two: write `x * x`.
     """
     return array.tolist() if array.ndim == 1 else array.T
+
+
+def root(x: Any) -> Any:
+    """Square root of a float or of arrays: rounded correctly by both libraries, so the same to the bit."""
+    return sqrt(x) if isinstance(x, float) else np.sqrt(x)
 
 
 class Axes(NamedTuple):

@@ -38,6 +38,8 @@ from nfc_gym.physics.fields import ModelFields
 from nfc_gym.terrain import Heightfield, elevation, surface
 from nfc_gym.terrain.egocentric import SIZE
 
+_FLAG = (bool, np.bool_)
+
 
 class RobotEnv(gymnasium.Env):
     """A robot on flat ground or rough terrain.
@@ -112,6 +114,7 @@ class RobotEnv(gymnasium.Env):
         self.observation_space = self._observe.space
         self.action_space: spaces.Box = box(kind.action_size, bound=1.0)
 
+        self._shape = (kind.action_size,)
         self._home = self.model.key("home").id
         self._psi = self.psi_space.nominal.copy()
         self._seen = seen_psi(self.psi_space, self._psi)
@@ -184,8 +187,8 @@ class RobotEnv(gymnasium.Env):
         """
         action = np.array(action, np.float64)
         values = action.tolist()  # a handful of numbers: looked at faster one by one than by numpy
-        if action.shape != self.action_space.shape or not all(map(isfinite, values)):
-            raise wrong_action(action, self.action_space.shape)
+        if action.shape != self._shape or not all(map(isfinite, values)):
+            raise wrong_action(action, self._shape)
         if max(values) > 1 or min(values) < -1:
             action = np.clip(action, -1, 1)
         view, data = self._view, self.data
@@ -303,7 +306,7 @@ class RobotEnv(gymnasium.Env):
 
 def _leaves(info: dict[str, Any]) -> dict[str, NDArray]:
     """Numpy leaves: float64 scalars, and flags as arrays of shape (), as Gymnasium makes objects of numpy's own bools."""
-    return {k: np.asarray(v) if isinstance(v, bool | np.bool_) else np.float64(v) for k, v in info.items()}
+    return {k: np.asarray(v) if isinstance(v, _FLAG) else np.float64(v) for k, v in info.items()}
 
 
 def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotEnv:
