@@ -10,12 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from nfc_gym import assets
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
 from nfc_gym.envs.contract import (
     FLAT,
-    FPS,
     Observer,
     box,
     broken,
@@ -25,12 +23,13 @@ from nfc_gym.envs.contract import (
     outcome,
     psi_of,
     refresh_period,
+    rest_key,
     robot_class,
     seen_psi,
     wrong_action,
 )
 from nfc_gym.envs.render import Camera, Pictures, Window
-from nfc_gym.envs.robot import FRAME_SKIP, TIMESTEP, Robot
+from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.rotations import yaw
 from nfc_gym.envs.terrains import Pool
 from nfc_gym.envs.view import View
@@ -67,7 +66,7 @@ class RobotEnv(gymnasium.Env):
       camera: as above; may be changed between pictures.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": FPS}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
 
     def __init__(
         self,
@@ -94,12 +93,13 @@ class RobotEnv(gymnasium.Env):
             raise InputError(f"render_mode is {render_mode!r}, want None or one of: {modes}")
         kind = robot_class(robot)
         self.rough = bool(rough)
-        self.model = scene.build(assets.path(kind.name), maps=1 if rough else 0)
+        self.model = kind.compile(maps=1 if rough else 0)
         self.data = mujoco.MjData(self.model)
         self.robot = kind.of(self.model, task, goal_conditioned, reward_type)
         self.psi_space = kind.space(self.model)
         self.fields = ModelFields(self.model)
-        self.frame_skip = FRAME_SKIP
+        self.frame_skip = kind.frame_skip
+        self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         self.substep_hooks: list[Callable[[RobotEnv], None]] = []
         self.camera, self.render_mode, self._size = camera, render_mode, (width, height)
         self._pictures: Pictures | None = None
@@ -108,14 +108,14 @@ class RobotEnv(gymnasium.Env):
         self._pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
         self._terrain = self._perceived = FLAT
         self._observe = Observer(self.robot, len(self.psi_space), checked_context(context))
-        self._period = refresh_period(elevation_hz)
+        self._period = refresh_period(elevation_hz, self.metadata["render_fps"])
         self._map: NDArray[np.float32] | None = None
         self._age = 0
         self.observation_space = self._observe.space
         self.action_space: spaces.Box = box(kind.action_size, bound=1.0)
 
         self._shape = (kind.action_size,)
-        self._home = self.model.key("home").id
+        self._home = rest_key(self.model)
         self._psi = self.psi_space.nominal.copy()
         self._seen = seen_psi(self.psi_space, self._psi)
         self._view = View(self.model, lambda name: getattr(self.data, name), kind.reads, self._ground)
@@ -125,7 +125,7 @@ class RobotEnv(gymnasium.Env):
     @property
     def dt(self) -> float:
         """Control step, s."""
-        return TIMESTEP * self.frame_skip
+        return self.model.opt.timestep * self.frame_skip
 
     @property
     def psi(self) -> NDArray[np.float64]:
@@ -164,9 +164,9 @@ class RobotEnv(gymnasium.Env):
         self._set_psi(given)
         if self.rough:
             self._set_terrain(given, u[0])
-        mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
+        self._still()
         start = self.robot.begin(u[1:], self._ground)
-        self.data.qpos[:] = start.qpos
+        self.data.qpos[:], self.data.qvel[:] = start.qpos, start.qvel
         mujoco.mj_forward(self.model, self.data)
         view = self._view
         view.task = dict(start.task)
@@ -260,8 +260,14 @@ class RobotEnv(gymnasium.Env):
 
     def _rest(self) -> None:
         """A simulation that came apart goes back to its keyframe, so that nothing that is returned holds NaN."""
-        mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
+        self._still()
         mujoco.mj_forward(self.model, self.data)
+
+    def _still(self) -> None:
+        if self._home < 0:
+            mujoco.mj_resetData(self.model, self.data)
+        else:
+            mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
 
     def _observation(self) -> Any:
         return self._observe(self._view, self._seen, self._elevation() if self._observe.elevation else None)
