@@ -14,10 +14,10 @@ Array = NDArray[np.float64]
 
 
 def components(array: Array) -> Any:
-    """Components (...) of an array (..., k), to be unpacked: plain floats for one robot, as their arithmetic is fastest.
+    """Components (...) of an array (..., k), to be unpacked: floats for one robot, as their arithmetic is fastest.
 
-    Float and array arithmetic round alike, so that one robot and a row of many agree to the bit. Beware that floats raise
-    where arrays give infinity (division by zero), and that `x ** 2` rounds differently for the two: write `x * x`.
+    Float and array arithmetic round alike, so that one robot and a row of many agree to the bit. Beware that floats
+    raise where arrays give infinity (division by zero), and that `x ** 2` rounds differently for the two: `x * x`.
     """
     return array.tolist() if array.ndim == 1 else array.T
 

@@ -311,7 +311,7 @@ class RobotEnv(gymnasium.Env):
 
 
 def _leaves(info: dict[str, Any]) -> dict[str, NDArray]:
-    """Numpy leaves: float64 scalars, and flags as arrays of shape (), as Gymnasium makes objects of numpy's own bools."""
+    """Numpy leaves: float64 scalars, and flags as arrays of shape (), as Gymnasium's vectors want them."""
     return {k: np.asarray(v) if isinstance(v, _FLAG) else np.float64(v) for k, v in info.items()}
 
 

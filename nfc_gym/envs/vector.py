@@ -162,7 +162,7 @@ class RobotVectorEnv(VectorEnv):
         return tuple(self._maps)
 
     def set_terrains(self, maps: Sequence[Any], perceived: Sequence[Any] | None = None) -> None:
-        """Other maps for the simulations to choose from; the batch is built anew, and must be reset before it is stepped.
+        """Other maps for the simulations to choose from; the batch is built anew, and must be reset before a step.
 
         Args:
           maps: `Heightfield`s or heights (256, 256) m; with n of them, `reset(options={"terrain_id": range(n)})` gives
