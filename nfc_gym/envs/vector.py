@@ -92,7 +92,7 @@ class RobotVectorEnv(VectorEnv):
             raise InputError(f"render_mode is {render_mode!r}; a vector environment has None and 'rgb_array'")
         kind = robot_class(robot)
         self.num_envs, self.rough, self.frame_skip = int(num_envs), bool(rough), kind.frame_skip
-        self.mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.render_mode, self.camera, self._size = render_mode, camera, (width, height)
         self._pictures: Pictures | None = None
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
@@ -105,7 +105,7 @@ class RobotVectorEnv(VectorEnv):
         pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
         self._build([pool.map(k) for k in range(pool.size)] if rough else [])
         fps = round(1 / self.dt)
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps, "autoreset_mode": self.mode}
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._period = refresh_period(elevation_hz, fps)
         self._observe = Observer(self.robot, len(self.psi_space), context)
         self.single_observation_space = self._observe.space
@@ -236,7 +236,7 @@ class RobotVectorEnv(VectorEnv):
         if actions.shape != self._limit.shape or not np.isfinite(actions.sum()):
             raise wrong_action(actions, self._limit.shape)
         resetting = self._waiting.copy() if self._waiting.any() else None
-        if resetting is not None and (self._fresh or self.mode is not AutoresetMode.NEXT_STEP):
+        if resetting is not None and (self._fresh or self.autoreset_mode is not AutoresetMode.NEXT_STEP):
             raise gymnasium.error.ResetNeeded(f"environments {np.flatnonzero(resetting).tolist()} must be reset first")
         actions = np.minimum(np.maximum(actions, -self._limit), self._limit)
         view = self._view
@@ -254,7 +254,7 @@ class RobotVectorEnv(VectorEnv):
         done = ended | truncated
         info = _masked(info, np.ones(self.num_envs, bool))
         self._waiting = done.copy()
-        again = self.mode is AutoresetMode.SAME_STEP and done.any()
+        again = self.autoreset_mode is AutoresetMode.SAME_STEP and done.any()
         obs = self._restart(done, info) if again else self._observation()
         return obs, rewards, ended, truncated, info
 
