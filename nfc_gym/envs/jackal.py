@@ -105,9 +105,7 @@ class Jackal(Robot):
         distance = np.sqrt(dx * dx + dy * dy)
         cos, sin = frame.xx, frame.yx  # horizontal part of the forward axis, to be scaled to unit length
         scale = 1 / np.maximum(np.sqrt(cos * cos + sin * sin), 1e-6)
-        return Now(
-            frame, np.array((gx, gy)).T, (cos * dx + sin * dy) * scale, (cos * dy - sin * dx) * scale, distance
-        )
+        return Now(frame, np.array((gx, gy)).T, (cos * dx + sin * dy) * scale, (cos * dy - sin * dx) * scale, distance)
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See the table of weights above."""
