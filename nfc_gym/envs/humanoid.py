@@ -26,7 +26,7 @@ class Humanoid(Runner):
     )
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
-        """Torso 12, joint positions, velocities, torques 21 each (rad, rad/s, N m), feet 12 (N, N m), last action 21."""
+        """Torso 12, joint positions, velocities, torques 21 each (rad, rad/s, N m), feet 12 (N, N m), action 21."""
         return (
             self.torso(view),
             view.qpos[..., 7:],

@@ -18,7 +18,7 @@ from nfc_gym.envs.spawn import place, underside
 def test_starts_just_above_the_harshest_ground(kind: type[Robot], ground: str) -> None:
     """No level patch to start on; thirty starts a map, each checked against MuJoCo's own collisions."""
     model = scene.build(assets.path(kind.name), maps=1)
-    robot = kind(model, kind.choose(None))
+    robot = kind(model, kind.tasks[0])
     field = terrain.make(ground, 1.0, seed=3, spawn=0.0)
     scene.write(model, 0, field.heights)
     data = mujoco.MjData(model)
@@ -39,7 +39,7 @@ def test_starts_just_above_the_harshest_ground(kind: type[Robot], ground: str) -
 @pytest.mark.parametrize("kind", [Ant, Humanoid, Quadruped])
 def test_one_start_is_a_row_of_many_to_the_bit(kind: type[Robot]) -> None:
     model = mujoco.MjModel.from_xml_path(str(assets.path(kind.name)))
-    robot = kind(model, kind.choose(None))
+    robot = kind(model, kind.tasks[0])
     field = terrain.make("rough", 1.0, seed=0)
     u = np.random.default_rng(0).random((9, kind.draws))
     many = robot.begin(u, field.height)

@@ -15,7 +15,7 @@ from nfc_gym.envs.view import View
 def robot_of(kind: type[Robot]) -> tuple[Robot, mujoco.MjModel]:
     """A robot with its first task, and its model on a plane."""
     model = mujoco.MjModel.from_xml_path(str(assets.path(kind.name)))
-    return kind(model, kind.choose(None)), model
+    return kind(model, kind.tasks[0]), model
 
 
 def level(height: float) -> Any:
