@@ -21,7 +21,7 @@ Ground = Callable[[NDArray], Array]
 TIMESTEP = 0.005  # s, physics 200 Hz
 FRAME_SKIP = 4  # control 50 Hz
 DT = TIMESTEP * FRAME_SKIP  # s
-FASTEST = 1e4  # m/s or rad/s: beyond it (or NaN) a simulation has come apart
+FASTEST = 1e4  # root sum of squares of all speeds, m/s and rad/s: beyond it (or NaN) a simulation has come apart
 GOAL_REWARDS = ("sparse", "dense")
 
 
