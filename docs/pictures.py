@@ -1,4 +1,4 @@
-"""Pictures of the ten environments for the README, rendered by the environments themselves: `python docs/pictures.py`."""
+"""Pictures of the ten environments for the README, rendered by the environments: `python docs/pictures.py`."""
 
 import os
 from pathlib import Path

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.robot import Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, to_robot
+from nfc_gym.envs.rotations import Axes, axes, components, to_robot
 from nfc_gym.envs.spawn import place, spread, underside
 from nfc_gym.envs.view import View
 
@@ -91,11 +91,11 @@ class Quadruped(Robot):
         """The last action and how much it changed; a command that leads off the map is turned round."""
         change = action - view.task["action"]
         task = {"action": action, "rate": np.add.reduce(change * change, -1)}
-        x, y = view.qpos.T[:2]
-        far = np.maximum(np.abs(x), np.abs(y)) > EDGE
-        if far.any():
+        x, y = components(view.qpos[..., :2])
+        far = (x * x > EDGE * EDGE) | (y * y > EDGE * EDGE)
+        if np.count_nonzero(far):
             frame = view.now.frame
-            forward, sideways, turning = view.task["command"].T
+            forward, sideways, turning = components(view.task["command"])
             vx, vy = frame.xx * forward + frame.xy * sideways, frame.yx * forward + frame.yy * sideways
             turn = np.where(far & (vx * x + vy * y > 0), -1.0, 1.0)
             task["command"] = np.array((turn * forward, turn * sideways, turning)).T
@@ -103,14 +103,14 @@ class Quadruped(Robot):
 
     def derive(self, view: View) -> Now:
         """Velocity in the trunk's frame."""
-        frame = axes(view.qpos.T[3:7].T)
-        return Now(frame, to_robot(frame, view.qvel.T[:3].T))
+        frame = axes(view.qpos[..., 3:7])
+        return Now(frame, to_robot(frame, view.qvel[..., :3]))
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See the table of weights above."""
-        vx, vy, vz = view.now.linear.T
-        wx, wy, wz = view.qvel.T[3:6]
-        forward, sideways, turning = view.task["command"].T
+        vx, vy, vz = components(view.now.linear)
+        wx, wy, wz = components(view.qvel[..., 3:6])
+        forward, sideways, turning = components(view.task["command"])
         sensors, torque = view.sensordata, view.field("actuator_force")
         along, across = sensors[..., self.along], sensors[..., self.across]
         slip = (sensors[..., self.feet] > TOUCHED) * (along * along + across * across)
@@ -128,7 +128,7 @@ class Quadruped(Robot):
     def terminated(self, view: View) -> NDArray[np.bool_]:
         """Trunk or a thigh touches the ground, the trunk leans too far, or the robot has fallen off the map."""
         touched = np.maximum.reduce(view.sensordata[..., self.hull], -1) > TOUCHED
-        return touched | (view.now.frame.zz < TILTED) | (view.qpos.T[2] < FALLEN)
+        return touched | (view.now.frame.zz < TILTED) | (view.qpos[..., 2] < FALLEN)
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Linear and angular velocity, down (own frame), command, joint positions and velocities, last action."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, to_robot
+from nfc_gym.envs.rotations import Axes, axes, components, root, to_robot
 from nfc_gym.envs.spawn import place, spread, underside
 from nfc_gym.envs.view import View
 
@@ -101,10 +101,10 @@ class Runner(Robot):
 
     def advance(self, view: View, action: Array) -> dict[str, NDArray]:
         """The last action; the next target for whoever has reached the present one."""
-        (x, y), (tx, ty) = view.qpos.T[:2], view.task["target"].T
+        (x, y), (tx, ty) = components(view.qpos[..., :2]), components(view.task["target"])
         dx, dy = tx - x, ty - y
         reached = dx * dx + dy * dy < REACHED**2
-        if not reached.any():
+        if not np.count_nonzero(reached):
             return {"action": action}
         cos, sin = np.cos(ONWARD), np.sin(ONWARD)
         target = np.where(reached, (cos * tx - sin * ty, sin * tx + cos * ty), (tx, ty)).T
@@ -112,18 +112,17 @@ class Runner(Robot):
 
     def derive(self, view: View) -> Now:
         """Torso with respect to ground and target."""
-        q = view.qpos.T
-        frame = axes(q[3:7].T)
-        x, y, z = q[:3] + 0.0  # copies: the state is live
-        tx, ty = view.task["target"].T
+        frame = axes(view.qpos[..., 3:7])
+        x, y, z = components(view.qpos[..., :3])
+        tx, ty = components(view.task["target"])
         dx, dy = tx - x, ty - y
-        scale = 1 / np.maximum(np.sqrt(dx * dx + dy * dy), 1e-6)
+        scale = 1 / (root(dx * dx + dy * dy) + 1e-9)  # never a division by zero
         ux, uy = dx * scale, dy * scale
         facing = frame.xx * ux + frame.yx * uy
         return Now(
             frame,
-            x,
-            y,
+            x + 0.0,  # a copy: the state is live
+            y + 0.0,
             z - view.ground(view.qpos[..., :2]),
             ux,
             uy,
@@ -160,6 +159,7 @@ class Runner(Robot):
         Height above the ground, velocity and rates in the torso's frame, yaw, roll, angle to the target, projection of
         up on the vertical and of forward on the target's direction.
         """
-        now, v = view.now, view.qvel.T
-        velocity = to_robot(now.frame, v[:3].T).T
-        return np.array((now.height, *velocity, *v[3:6], now.yaw, now.roll, now.angle, now.frame.zz, now.facing)).T
+        now = view.now
+        velocity = components(to_robot(now.frame, view.qvel[..., :3]))
+        rates = components(view.qvel[..., 3:6])
+        return np.array((now.height, *velocity, *rates, now.yaw, now.roll, now.angle, now.frame.zz, now.facing)).T
