@@ -138,15 +138,16 @@ class Runner(Robot):
         moved = (now.x - was.x) * was.towards_x + (now.y - was.y) * was.towards_y
         power = np.abs(self.gear * view.ctrl * view.qvel[..., 6:])
         reach = np.abs(self.stretch * view.qpos[..., 7:] - self.middle)
-        near = np.minimum(np.maximum(reach - NEAR_LIMIT / (1 - NEAR_LIMIT), 0), 1)
+        near = np.maximum(reach - NEAR_LIMIT / (1 - NEAR_LIMIT), 0)
+        squared, power, near = np.add.reduce(np.array((action * action, power, near)), -1)
         return {
             "progress": w.progress / DT * moved,
             "alive": w.alive + 0 * moved,
             "upright": w.upright * now.frame.zz,
             "heading": w.heading * np.minimum(now.facing / FACING, 1),
-            "action": -w.action * np.add.reduce(action * action, -1),
-            "energy": -w.energy * np.add.reduce(power, -1),
-            "limits": -w.limits * np.add.reduce(near, -1),
+            "action": -w.action * squared,
+            "energy": -w.energy * power,
+            "limits": -w.limits * near,
         }
 
     def terminated(self, view: View) -> NDArray[np.bool_]:
