@@ -22,9 +22,7 @@ MIDDLE = (
     0.05  # m, half the side of the square that episodes start in: the level middle of a rough map has 1 m of radius
 )
 ASIDE = 0.5  # rad, the most by which the first target lies off the robot's heading
-NEAR_LIMIT = (
-    0.95  # of half a joint's range: from there on a joint counts as near its limit, fully so at the limit itself
-)
+NEAR_LIMIT = 0.95  # of half a joint's range: from there nearness to the limit counts, up to 1 at the limit itself
 FACING = 0.8  # cosine of 37 degrees: who heads closer to the target than that has the heading reward in full
 
 
