@@ -18,9 +18,7 @@ from nfc_gym.envs.view import View
 RING = 9.0  # m; the map ends 12.75 m from its middle
 REACHED = 1.0  # m
 ONWARD = np.pi * (3 - np.sqrt(5))  # rad, the golden angle: 16.8 m from one target to the next, in ever new directions
-MIDDLE = (
-    0.05  # m, half the side of the square that episodes start in: the level middle of a rough map has 1 m of radius
-)
+MIDDLE = 0.05  # m, half the side of the square of starts: the level middle of a rough map has a radius of 1 m
 ASIDE = 0.5  # rad, the most by which the first target lies off the robot's heading
 NEAR_LIMIT = 0.95  # of half a joint's range: from there nearness to the limit counts, up to 1 at the limit itself
 FACING = 0.8  # cosine of 37 degrees: who heads closer to the target than that has the heading reward in full
