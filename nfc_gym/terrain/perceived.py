@@ -163,7 +163,7 @@ class _Robot:
         flat = cells[:, 1] * SIDE + cells[:, 0]
         gain = 1 / (sd * sd + FLOOR**2)
         total = np.bincount(flat, gain, SIDE * SIDE)
-        hit = np.flatnonzero(total)
+        hit = np.flatnonzero(total > 0)
         mean = np.bincount(flat, gain * believed[:, 2], SIDE * SIDE)[hit] / total[hit]
         height, weight, seen = (grid.reshape(-1) for grid in (self.height, self.weight, self.seen))
         age = now - seen[hit]

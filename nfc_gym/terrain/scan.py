@@ -55,27 +55,31 @@ def scan(camera: DepthCamera, heightfield: Heightfield, eye: Array, axes: Array,
     before = np.concatenate([np.full_like(horizon[:, :1], -np.inf), horizon[:, :-1]], axis=1)
     visible = slope >= horizon
     sample = np.flatnonzero(visible)  # flat indices: several times faster than pairs
-    r, h = distances[sample % len(distances)], ground.ravel()[sample]
+    line = sample // len(distances)
+    r, h = distances[sample - line * len(distances)], ground.ravel()[sample]
     on_face, between = _on_faces(sample, r, ground, rng)
     if on_face.size:  # the faces' own heights, as between two samples of a sharp edge a chord would cut the corner
         ahead = directions[on_face // len(distances)] * between[..., None]
         height = _sample(heightfield, eye, ahead[..., 0], ahead[..., 1])
         shown = height >= before.ravel()[on_face] * between
         sample = np.concatenate([sample, on_face[shown]])
+        line = np.concatenate([line, on_face[shown] // len(distances)])
         r, h = np.concatenate([r, between[shown]]), np.concatenate([h, height[shown]])
-    line = sample // len(distances)
     x, y = directions[line, 0] * r, directions[line, 1] * r
     # Depth is measured along the optical axis; the image's sides are planes through the eye.
     depth, left, up = (x * axis[0] + y * axis[1] + h * axis[2] for axis in axes.T.astype(np.float32))
     wide, high = np.tan(np.array(camera.fov, np.float32) / 2)
     seen = (depth > camera.near) & (depth < camera.far) & (np.abs(left) < wide * depth) & (np.abs(up) < high * depth)
-    sample, points, r, depth = sample[seen], np.stack([x[seen], y[seen], h[seen]], axis=1), r[seen], depth[seen]
+    chosen = np.flatnonzero(seen)
+    sample = sample[chosen]
     # Far ground is seen so flat that the image's rows skip samples, each as many rows high as it adds to the horizon.
     rising = slope.ravel()[sample]
     rows = camera.focal * (rising - before.ravel()[sample]) / (1 + rising * rising)
     kept = rng.random(len(sample), np.float32) < np.minimum(rows, 1) * (1 - camera.dropout)
     kept &= ~_blotches(camera, angles, distances, rng).ravel()[sample]
-    sample, points, r, depth = sample[kept], points[kept], r[kept], depth[kept]
+    kept = np.flatnonzero(kept)
+    sample, chosen = sample[kept], chosen[kept]
+    r, depth, points = r[chosen], depth[chosen], np.stack([x[chosen], y[chosen], h[chosen]], axis=1)
     sd = camera.noise(depth).astype(np.float32)
     stretch = 1 + sd * rng.standard_normal(len(depth), np.float32) / depth
     flying = _flying(camera, visible, sample, distances, rng)
@@ -138,10 +142,12 @@ def _flying(
     A depth edge is where a seen point borders on a hidden one, before it or beside it. There a matching window holds
     both the point and what hides its neighbour, and the depth comes out anywhere between the two.
     """
-    front = np.maximum.accumulate(np.where(visible, distances, 0), axis=1).ravel()
-    shown, width, last = visible.ravel(), visible.shape[1], visible.size - 1
     taken = np.full(len(sample), np.inf, np.float32)
     mixed = np.flatnonzero(rng.random(len(sample), np.float32) < camera.flying)
+    if not mixed.size:
+        return taken
+    front = np.maximum.accumulate(visible * distances, axis=1).ravel()
+    shown, width, last = visible.ravel(), visible.shape[1], visible.size - 1
     for offset in (-1, -width, width):
         beside = np.clip(sample[mixed] + offset, 0, last)
         edge = ~shown[beside] & (sample[mixed] % width > 0)

@@ -77,13 +77,15 @@ def test_the_view_on_level_ground_is_the_images_outline(pitch: float) -> None:
 
 def test_a_quiet_camera_sees_the_true_map() -> None:
     ramp = Heightfield(np.broadcast_to(0.2 * (np.arange(256) * 0.1 - 12.75), (256, 256)))
-    for heightfield, error in ((FLAT, 1e-5), (ramp, 0.2 * 0.1), (make("rough", 0.5, 1), 0.02)):
+    for heightfield in (FLAT, ramp, make("rough", 0.5, 1)):
         height = float(heightfield.height([0, 0])) + 0.6
         perceived = standing(QUIET, heightfield, height)
         difference = last_map(perceived, heightfield, height) - elevation(heightfield, (0, 0, height), 0.0)
+        # At the rim a cell's points lie up to half a cell off its middle, and the map reaches half a cell beyond that.
+        steepest = sum(np.abs(np.diff(heightfield.heights, axis=axis)).max() for axis in (0, 1))
         assert perceived.valid.sum() > 500
-        assert np.abs(difference[perceived.valid]).max() < error  # half a cell off the cell's middle, and half beyond it
-        assert abs(np.median(difference[perceived.valid])) < 0.1 * error
+        assert np.abs(difference[perceived.valid]).max() < steepest + 1e-5
+        assert abs(np.median(difference[perceived.valid])) < 0.05 * steepest + 1e-5
 
 
 def test_behind_a_wall_nothing_is_seen() -> None:
