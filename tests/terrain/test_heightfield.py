@@ -1,5 +1,9 @@
 """The surface between grid points against MuJoCo's rays and contacts, and heightfields written into models."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,6 +11,8 @@ from mujoco.batch import Batch
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.terrain import Heightfield, asset, make, surface, write, write_pool
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def compiled(*maps: Heightfield) -> mujoco.MjModel:
@@ -178,3 +184,9 @@ def test_simulations_of_a_batch_stand_on_maps_of_their_own() -> None:
     assert np.ptp(grounds) > 0.05
     for rest, heightfield, ground in zip(batch.bind("qpos")[:, 0], maps, grounds, strict=True):
         assert rest - ground == pytest.approx(radius / heightfield.normal([x, y])[2], abs=0.004)
+
+
+def test_importing_needs_neither_mujoco_nor_trimesh() -> None:
+    code = "import nfc_gym.terrain, sys; print({'mujoco', 'trimesh', 'scipy', 'torch', 'gymnasium'} & set(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert out.stdout.strip() == "set()"
