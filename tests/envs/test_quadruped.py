@@ -77,7 +77,7 @@ def test_every_term_of_the_reward() -> None:
         "linear": np.exp(-(0.3**2 + 0.1**2) / 0.25),
         "yaw": 0.5 * np.exp(-(0.2**2) / 0.25),
         "vertical": -2 * 0.05**2,
-        "rolling": -0.05 * 0.25,
+        "rolling": -0.02 * 0.25,
         "torque": -1e-5 * 25,
         "rate": -0.02,
         "slip": -0.1 * 0.25,
