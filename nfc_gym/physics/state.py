@@ -81,23 +81,56 @@ def _blocks(model: mujoco.MjModel) -> tuple[NDArray[np.intp], NDArray[np.intp], 
     return np.array(plain_q, np.intp), np.array(plain_v, np.intp), rotations
 
 
+class Tangent:
+    """Differences and sums of a model's configurations, with its joints sorted once."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.nq, self.nv = int(model.nq), int(model.nv)
+        self.plain_q, self.plain_v, self.rotations = _blocks(model)
+
+    def difference(self, start: Array, end: Array) -> Array:
+        """Tangent vector (..., nv) that takes configuration `start` (..., nq) to `end` (..., nq) in unit time."""
+        shape = np.broadcast_shapes(start.shape[:-1], end.shape[:-1])
+        out = np.zeros((*shape, self.nv))
+        out[..., self.plain_v] = end[..., self.plain_q] - start[..., self.plain_q]
+        for q, v in self.rotations:
+            out[..., v : v + 3] = quat_difference(start[..., q : q + 4], end[..., q : q + 4])
+        return out
+
+    def integrate(self, start: Array, step: Array) -> Array:
+        """Configuration (..., nq) reached from `start` (..., nq) by the tangent vector `step` (..., nv)."""
+        shape = np.broadcast_shapes(start.shape[:-1], step.shape[:-1])
+        out = np.broadcast_to(start, (*shape, self.nq)).copy()
+        out[..., self.plain_q] += step[..., self.plain_v]
+        for q, v in self.rotations:
+            out[..., q : q + 4] = quat_multiply(out[..., q : q + 4], vector_to_quat(step[..., v : v + 3]))
+        return out
+
+
 def difference(model: mujoco.MjModel, start: Array, end: Array) -> Array:
-    """Tangent vector (..., nv) that takes configuration `start` (..., nq) to `end` (..., nq) in unit time."""
-    plain_q, plain_v, rotations = _blocks(model)
-    shape = np.broadcast_shapes(start.shape[:-1], end.shape[:-1])
-    out = np.zeros((*shape, model.nv))
-    out[..., plain_v] = end[..., plain_q] - start[..., plain_q]
-    for q, v in rotations:
-        out[..., v : v + 3] = quat_difference(start[..., q : q + 4], end[..., q : q + 4])
-    return out
+    """`Tangent.difference` for a model seen once."""
+    return Tangent(model).difference(start, end)
 
 
 def integrate(model: mujoco.MjModel, start: Array, step: Array) -> Array:
-    """Configuration (..., nq) reached from `start` (..., nq) by the tangent vector `step` (..., nv)."""
-    plain_q, plain_v, rotations = _blocks(model)
-    shape = np.broadcast_shapes(start.shape[:-1], step.shape[:-1])
-    out = np.broadcast_to(start, (*shape, model.nq)).copy()
-    out[..., plain_q] += step[..., plain_v]
-    for q, v in rotations:
-        out[..., q : q + 4] = quat_multiply(out[..., q : q + 4], vector_to_quat(step[..., v : v + 3]))
-    return out
+    """`Tangent.integrate` for a model seen once."""
+    return Tangent(model).integrate(start, step)
+
+
+class Inertia:
+    """The joint-space inertia matrix, from MuJoCo's packed lower triangle, times a velocity."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.nv = int(model.nv)
+        self.rows = np.repeat(np.arange(self.nv), model.M_rownnz)
+        self.cols = np.array(model.M_colind[: len(self.rows)], np.intp)
+
+    def times(self, packed: Array, velocity: Array) -> Array:
+        """Momentum M v (..., nv) from `MjData.M` (..., nC) and a velocity (..., nv).
+
+        Summed without BLAS, so that a row of a batch and a single state give the same bits.
+        """
+        full = np.zeros((*packed.shape[:-1], self.nv, self.nv))
+        full[..., self.rows, self.cols] = packed
+        full[..., self.cols, self.rows] = packed
+        return (full * velocity[..., None, :]).sum(-1)
