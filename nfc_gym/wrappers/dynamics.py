@@ -1,0 +1,183 @@
+"""`ResidualDynamics`: what the simulator's motion lacks, s' = f_psi(s, a) + delta_s, put into its physics.
+
+delta_s is a bias that holds for an episode, plus noise that is drawn each control step. Velocity residuals dv act as the
+generalised force M dv / T over the control step T, so that contacts answer and positions follow; `mode="state"` adds the
+residual to the state outright after the step, positions included. Entries that are no physical state perturb what is
+observed.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.residual import Components
+from nfc_gym.physics.state import Inertia, Tangent
+from nfc_gym.wrappers.base import EnvWrapper
+from nfc_gym.wrappers.simulation import Simulation, simulation_of
+from nfc_gym.wrappers.source import Draws, Source
+
+Array = NDArray[np.float64]
+Mode = Literal["force", "state"]
+
+
+class Injection:
+    """delta_s at work in a simulation; arrays have its leading batch shape.
+
+    Attributes:
+      bias: (..., s), set anew for each episode.
+      noise: (s, k) times k standard normal numbers a control step is the noise of that step; k 0 is none.
+      delta: (..., s) what acts in the running control step.
+    """
+
+    def __init__(self, sim: Simulation, components: Components, mode: Mode, noise: Array) -> None:
+        self.sim, self.components, self.mode, self.noise = sim, components, mode, noise
+        self.bias = self.delta = np.zeros((*sim.shape, components.size))
+        self.rng: np.random.Generator = np.random.default_rng(0)
+        self.duration = sim.duration()
+        self.inertia, self.tangent = Inertia(sim.model), Tangent(sim.model)
+        sim.on_control.append(self.begin)
+        if mode == "state":
+            sim.on_after.append(self.add)
+
+    def begin(self) -> None:
+        """Draw the step's noise, and push."""
+        self.delta = self.bias
+        if self.noise.shape[1]:
+            self.delta = self.bias + self.rng.standard_normal((*self.sim.shape, self.noise.shape[1])) @ self.noise.T
+        if self.mode == "force":
+            velocity = self.components.tangent(self.sim.qpos, self.delta)[..., self.components.nv :]
+            self.sim.qfrc_applied[...] += self.inertia.times(self.sim.bind("M"), velocity) / self.duration
+
+    def add(self) -> None:
+        """Add positions and velocities outright."""
+        step, nv = self.components.tangent(self.sim.qpos, self.delta), self.components.nv
+        self.sim.qpos[...] = self.tangent.integrate(self.sim.qpos, step[..., :nv])
+        self.sim.qvel[...] += step[..., nv:]
+
+    def observe(self, values: Array) -> Array:
+        """An observation (..., s) with those entries of delta_s that are no physical state."""
+        out = np.array(values)
+        out[..., self.components.observed] += self.delta[..., self.components.observed]
+        return out
+
+
+def noise_root(covariance: ArrayLike | None, size: int) -> Array:
+    """(size, k) root of a noise's covariance, given as (size, size), as variances (size,), or None for no noise.
+
+    Raises:
+      InputError: another shape, or no covariance.
+    """
+    if covariance is None:
+        return np.zeros((size, 0))
+    matrix = np.asarray(covariance, float)
+    matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise InputError(
+            f"ResidualDynamics: covariance must be finite, ({size}, {size}) or ({size},) variances, got {matrix.shape}"
+        )
+    values, vectors = np.linalg.eigh(matrix)
+    if not np.allclose(matrix, matrix.T) or values.min() < -1e-9 * max(abs(values).max(), 1e-300):
+        raise InputError(f"ResidualDynamics: covariance has the eigenvalue {values.min():g}; want symmetric, none below 0")
+    keep = values > 0
+    return vectors[:, keep] * np.sqrt(values[keep])
+
+
+def box_key(space: gym.Space, key: str | None, size: int) -> str | None:
+    """The key of a Dict observation that entries of delta_s perturb, None for a plain Box.
+
+    Raises:
+      InputError: the key does not exist or is not as wide as delta_s.
+    """
+    if isinstance(space, spaces.Dict):
+        boxes = [k for k, s in space.items() if s.shape == (size,)]
+        key = key or next(iter(boxes), None)
+        if key not in boxes:
+            raise InputError(f"ResidualDynamics: no key {key!r} of width {size} in the observation: {list(space.items())}")
+        return key
+    if space.shape != (size,):
+        raise InputError(f"ResidualDynamics: delta_s has {size} entries where the observation has shape {space.shape}")
+    return None
+
+
+class ResidualDynamics(EnvWrapper):
+    """Puts residual dynamics into the physics of any MuJoCo environment.
+
+    Args:
+      env: the environment.
+      source: where an episode's delta_s comes from: a posterior, an array (s,) or (n, s) of samples, a path.
+      mode: `force` (M dv / T) or `state` (added to positions and velocities after the step).
+      covariance: (s, s), or variances (s,), of noise drawn each control step; None is none.
+      components: what each entry of delta_s is, see `nfc_gym.physics.residual.Components`; default the environment's own
+        `proprio_components` where they fit, else the nv velocities, or 2 nv tangent positions and velocities. In `force`
+        mode positions follow from the velocities, and residuals of them are not added.
+      key: of a Dict observation, what entries named `obs` perturb.
+
+    A residual of zero leaves every bit as it is.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        source: Source,
+        mode: Mode = "force",
+        covariance: ArrayLike | None = None,
+        components: Sequence[str] | None = None,
+        key: str | None = None,
+    ) -> None:
+        super().__init__(env, source=source, mode=mode, covariance=covariance, components=components, key=key)
+        sim = simulation_of(env, "ResidualDynamics")
+        self.draws, bound, root = prepare(env, sim, source, mode, covariance, components)
+        sim.attach("ResidualDynamics")
+        self.key = box_key(env.observation_space, key, bound.size) if bound.observed.size else None
+        self.injection = Injection(sim, bound, mode, root)
+
+    @property
+    def delta_s(self) -> Array:
+        """(s,) bias of the running episode."""
+        return self.injection.bias.copy()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Draw the episode's bias, then reset."""
+        self.injection.rng = self.stream(seed)
+        self.injection.bias = self.draws.draw(1, self.injection.rng)[0]
+        self.injection.delta = self.injection.bias
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._observed(observation), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step, and perturb what is observed."""
+        observation, *rest = self.env.step(action)
+        return self._observed(observation), *rest
+
+    def _observed(self, observation: Any) -> Any:
+        if not self.injection.components.observed.size:
+            return observation
+        if self.key is None:
+            return self.injection.observe(observation)
+        return {**observation, self.key: self.injection.observe(observation[self.key])}
+
+
+def prepare(
+    env: Any,
+    sim: Simulation,
+    source: Source,
+    mode: str,
+    covariance: ArrayLike | None,
+    names: Sequence[str] | None,
+) -> tuple[Draws, Components, Array]:
+    """The draws, the components bound to the model and the noise's root, checked against each other."""
+    if mode not in get_args(Mode):
+        raise InputError(f"ResidualDynamics: no mode {mode!r}; there are: {', '.join(get_args(Mode))}")
+    draws = Draws(source, "delta_s", "ResidualDynamics")
+    if len(draws.shape) != 1:
+        raise InputError(f"ResidualDynamics: a sample of delta_s is a vector, got shape {draws.shape}")
+    size = draws.shape[0]
+    own = getattr(env.unwrapped, "proprio_components", None)
+    if names is None and own is not None and len(own) == size:
+        names = own
+    return draws, Components(sim.model, names, size), noise_root(covariance, size)

@@ -1,0 +1,164 @@
+"""`ApplyEffects`: the effects that a model lacks, put into the simulation of any MuJoCo environment.
+
+The objects are those of the calibrator, and act through the same class at every physics step: an effect found in logs is
+the effect that a policy trains under, bit for bit.
+"""
+
+import copy
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.acting import Acting
+from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.saved import from_row, to_row
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.wrappers.base import EnvWrapper
+from nfc_gym.wrappers.effects_file import check_model, read_effects
+from nfc_gym.wrappers.simulation import simulation_of
+
+Array = NDArray[np.float64]
+Given = Sequence[tuple[Effect, Array] | Mapping[str, Any]] | str | os.PathLike[str]
+Signal = float | Callable[[float], float]
+
+
+def recorded(effects: Given) -> list[dict[str, Any]] | str:
+    """Effects as a spec keeps them: rows of plain data, or a path."""
+    if isinstance(effects, str | os.PathLike):
+        return os.fspath(effects)
+    return [to_row(*e) if isinstance(e, tuple) else dict(e) for e in effects]
+
+
+def bound(effects: Given, model: mujoco.MjModel) -> tuple[list[Effect], list[Array]]:
+    """Effects of their own, bound to a model, and their values.
+
+    Raises:
+      InputError: a row, a family, a place or a parameter that does not exist, or values of another number.
+    """
+    given = read_effects(effects)["effects"] if isinstance(effects, str | os.PathLike) else effects
+    pairs = [copy.deepcopy(e) if isinstance(e, tuple) else from_row(e) for e in given]
+    for effect, theta in pairs:
+        if np.shape(theta) != (len(effect.params),) or not np.isfinite(theta).all():
+            names = ", ".join(p.name for p in effect.params)
+            raise InputError(f"ApplyEffects: {effect.id} takes finite values of {names}, got {theta}")
+        effect.bind(model)
+    return [e for e, _ in pairs], [np.asarray(t, float) for _, t in pairs]
+
+
+def check_signals(effects: Sequence[Effect], exogenous: Mapping[str, Signal]) -> None:
+    """Refuse effects that read a signal which nobody gives."""
+    for effect in effects:
+        for name in effect.signals:
+            if name not in exogenous and name != "exo:time":
+                given = ", ".join(exogenous) or "none"
+                raise InputError(f"ApplyEffects: {effect.id} reads {name!r}: give it in `exogenous`; given: {given}")
+
+
+class ApplyEffects(EnvWrapper):
+    """Effects at work in an environment.
+
+    Args:
+      env: any MuJoCo environment.
+      effects: (effect, values) pairs, rows `{"family": ..., "where": ..., "parameters": {name: value}}`, or the path of an
+        `effects.yaml`. They act in this order.
+      exogenous: signals that effects read: name -> a number, or a function of the episode's time in s (`exo:time` is given).
+
+    Commands are changed, dry friction and forces written before every physics step; model edits are made at each reset,
+    on top of psi; hidden states (delays, lags, heat) begin settled at an episode's first command. Effects on sensors change
+    what `RecordLog` records, not the observation, whose entries have no channel names.
+
+    Raises:
+      InputError: an unknown family, place or parameter, a signal that is missing, an environment that cannot be stepped so.
+    """
+
+    def __init__(self, env: gym.Env, effects: Given, exogenous: Mapping[str, Signal] | None = None) -> None:
+        super().__init__(env, effects=effects, exogenous=exogenous)
+        sim = simulation_of(env, "ApplyEffects")
+        self.effects, self.thetas = bound(effects, sim.nominal)
+        self.exogenous = dict(exogenous or {})
+        self.reads = any(e.signals for e in self.effects)
+        check_signals(self.effects, self.exogenous)
+        self.sim = sim
+        self._wire()
+
+    @classmethod
+    def from_file(
+        cls,
+        env: gym.Env,
+        path: str | os.PathLike[str],
+        exogenous: Mapping[str, Signal] | None = None,
+        any_model: bool = False,
+    ) -> "ApplyEffects":
+        """The effects of an `effects.yaml`, for an environment whose model is the `model.xml` beside it.
+
+        Args:
+          env: the environment.
+          path: an `effects.yaml`.
+          exogenous: as for the constructor.
+          any_model: put them into another model too.
+
+        Raises:
+          InputError: the file is no `effects.yaml`, or was made for another model than the environment's.
+          MissingExtra: YAML cannot be read for want of the extra `measured`.
+        """
+        if not any_model:
+            check_model(env, os.fspath(path))
+        return cls(env, os.fspath(path), exogenous)
+
+    def recorded(self, name: str, value: Any) -> Any:
+        """See `EnvWrapper`."""
+        return recorded(value) if name == "effects" else super().recorded(name, value)
+
+    def _wire(self) -> None:
+        sim, model = self.sim, self.sim.nominal
+        dt = float(model.opt.timestep)
+        self.acting = Acting(model, self.effects, self.thetas, sim.fields, sim, dt)
+        if any(overrides(e, "model") for e in self.effects):
+            sim.edits.append((1, self._edit))
+        if self.acting.commanding or self.acting.rubbing or self.acting.pushing:
+            sim.attach("ApplyEffects")
+            sim.on_control.append(self._begin)
+            sim.on_substep.append(self._act)
+        sim.senses += [
+            lambda channel, values, step, e=e, t=t: e.sense(channel, values, t, step)
+            for e, t in zip(self.effects, self.thetas, strict=True)
+            if overrides(e, "sense")
+        ]
+
+    def _edit(self, fields: ModelFields) -> None:
+        for effect, theta in zip(self.effects, self.thetas, strict=True):
+            effect.model(fields, theta)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Edit the model from nominal, forget hidden states, reset."""
+        self.sim.rewrite()
+        self.sim.begin_episode()
+        return self.env.reset(seed=seed, options=options)
+
+    def _begin(self) -> None:
+        """Before a control step: forget hidden states where it is an episode's first."""
+        if self.sim.started:
+            self.acting.memories.clear()
+            self.acting.derived.clear()
+            self.acting.note_friction()
+
+    def _act(self) -> None:
+        """One physics step's command, friction and forces."""
+        sim = self.sim
+        signals = self._exogenous() if self.reads else {}
+        if self.acting.commanding:
+            sim.ctrl[...] = self.acting.command(sim.commanded, signals)
+        if self.acting.pushing:
+            sim.restore_forces()
+        self.acting.push(sim.ctrl, signals)
+
+    def _exogenous(self) -> dict[str, Any]:
+        time = float(self.sim.data.time)
+        given = {n: np.asarray(s(time) if callable(s) else s, float) for n, s in self.exogenous.items()}
+        return {"exo:time": np.asarray(time), **given}

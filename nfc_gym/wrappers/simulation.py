@@ -1,0 +1,287 @@
+"""The physics beneath an environment, as the wrappers around it share it.
+
+All wrappers of one environment meet in one `Simulation`: model edits start from the same nominal model, forces add up, and
+whoever acts at each physics step is called there in the order in which the wrappers were put on, innermost first.
+
+What the hooks need is a place between two physics steps. An environment that keeps lists called `substep_hooks` and
+`after_hooks` offers it itself; Gymnasium's `MujocoEnv` (and whatever holds one, as the mazes of gymnasium-robotics do)
+is stepped here in place of its own `_step_mujoco_simulation`, and gymnasium-robotics' robots in place of `_mujoco_step`.
+"""
+
+import copy
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.fields import ModelFields
+
+Array = NDArray[np.float64]
+Hook = Callable[[], None]
+_ATTRIBUTE = "_nfc_simulation"
+
+
+def _nothing() -> None:
+    """What a simulation is pickled as: its wrappers make it anew."""
+
+
+class Simulation:
+    """State, model fields and hooks of one `MjData`, or of a batch of simulations.
+
+    Attributes:
+      env: the unwrapped environment.
+      shape: leading batch shape, () or (n,).
+      commanded: (..., nu) what the environment sent to the actuators in this control step, before any effect.
+      started: which simulations are in the first control step of an episode: a bool, or (n,) bool.
+      on_control: called once a control step, before its first physics step.
+      on_substep: called before every physics step.
+      on_after: called after the last physics step of a control step, before anything is observed.
+    """
+
+    shape: tuple[int, ...] = ()
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+    qfrc_applied: Array
+    xfrc_applied: Array
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        self.on_control: list[Hook] = []
+        self.on_substep: list[Hook] = []
+        self.on_after: list[Hook] = []
+        self.edits: list[tuple[int, Callable[[ModelFields], None]]] = []
+        self.senses: list[Callable[[str, Array, float], Array]] = []
+        self.commanded = np.zeros(0)
+
+    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
+        return _nothing, ()
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model that is simulated."""
+        return self.env.model
+
+    def bind(self, name: str) -> Array:
+        """A live field of `MjData`, (..., *shape)."""
+        raise NotImplementedError
+
+    def forward(self) -> None:
+        """Recompute the derived fields for the state as it is."""
+        raise NotImplementedError
+
+    def duration(self) -> float:
+        """Length of a control step, s."""
+        env = self.env
+        skip = getattr(env, "frame_skip", None) or getattr(self.owner, "frame_skip", None)
+        skip = skip or getattr(env, "n_substeps", None)
+        if not skip:
+            raise InputError(
+                f"{type(env).__name__} says neither `frame_skip` nor `n_substeps`: its control step is unknown"
+            )
+        return float(self.model.opt.timestep) * int(skip)
+
+    @property
+    def owner(self) -> Any:
+        """The object that steps the model: the environment, or the `MujocoEnv` that it holds."""
+        return self.env
+
+
+class SingleSimulation(Simulation):
+    """One environment with `model` and `data`."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.nominal = copy.copy(env.model)
+        self.fields = ModelFields(env.model, self.nominal)
+        self._steps: tuple[Any, str] | None = _stepper(env)
+        self._attached = False
+        self._time = np.inf
+        self.started = True
+        self._look()
+
+    @property
+    def owner(self) -> Any:
+        return self._steps[0] if self._steps else self.env
+
+    def _look(self) -> None:
+        """Views of the state; an environment may make itself another `MjData`."""
+        data = self.env.data
+        self.data = data
+        self.qpos, self.qvel, self.ctrl = data.qpos, data.qvel, data.ctrl
+        self.qfrc_applied, self.xfrc_applied = data.qfrc_applied, data.xfrc_applied
+        self._base = (self.qfrc_applied.copy(), self.xfrc_applied.copy())
+        self._held = (self.qfrc_applied.copy(), self.xfrc_applied.copy())
+
+    def bind(self, name: str) -> Array:
+        """See `Simulation`."""
+        return getattr(self.data, name)
+
+    def forward(self) -> None:
+        """See `Simulation`."""
+        mujoco.mj_forward(self.env.model, self.data)
+
+    # ---- model edits ----------------------------------------------------------------------------------------------
+
+    def rewrite(self) -> None:
+        """The nominal model with every wrapper's edits, lower ranks first; derived constants follow."""
+        self.fields.restore()
+        for _, edit in sorted(self.edits, key=lambda e: e[0]):
+            edit(self.fields)
+        self.fields.commit()
+
+    # ---- stepping -------------------------------------------------------------------------------------------------
+
+    def attach(self, who: str) -> None:
+        """Make sure that the hooks are called.
+
+        Raises:
+          InputError: the environment steps its model where no hook can be put.
+        """
+        if self._attached:
+            return
+        if self._steps is None:
+            raise InputError(
+                f"{who} acts between physics steps, and {type(self.env).__name__} has no place for that: it needs "
+                "`substep_hooks` and `after_hooks`, lists of callables that it calls before every mj_step and after the "
+                "last one, or to be stepped by gymnasium's MujocoEnv"
+            )
+        owner, how = self._steps
+        if how == "substep_hooks":
+            owner.substep_hooks.append(self._called)
+            owner.after_hooks.append(lambda _: self._end())
+        else:
+            setattr(owner, how, _Patched(owner, how, self))
+        self._attached = True
+
+    def begin_episode(self) -> None:
+        """The next control step is the first of an episode."""
+        self.started = True
+        self._time = np.inf
+
+    def _begin(self) -> None:
+        """Before the first physics step of a control step; `ctrl` is set."""
+        data = self.env.data
+        if data is not self.data:
+            self._look()
+        if data.time < self._time:  # the clock of an episode that was begun by whomever went back
+            self.started = True
+        self.commanded = self.ctrl.copy()
+        self._base[0][:] = self.qfrc_applied
+        self._base[1][:] = self.xfrc_applied
+        for hook in self.on_control:
+            hook()
+        self.started = False
+        self._held[0][:] = self.qfrc_applied
+        self._held[1][:] = self.xfrc_applied
+
+    def restore_forces(self) -> None:
+        """Applied forces as they were after the last `on_control`: what a substep's own forces are added to."""
+        self.qfrc_applied[:], self.xfrc_applied[:] = self._held
+
+    def _substep(self) -> None:
+        for hook in self.on_substep:
+            hook()
+
+    def _end(self) -> None:
+        self.qfrc_applied[:] = self._base[0]
+        self.xfrc_applied[:] = self._base[1]
+        for hook in self.on_after:
+            hook()
+        self._time = self.data.time
+        self._inside = False
+
+    _inside = False
+
+    def _called(self, _: Any) -> None:
+        """A hook of an environment that has some: before every physics step."""
+        if not self._inside:
+            self._begin()
+            self._inside = True
+        self._substep()
+
+    def run(self, original: Callable[..., None], plain: bool, ctrl: Array, frames: int) -> None:
+        """A control step in place of `MujocoEnv._step_mujoco_simulation`."""
+        self.env.data.ctrl[:] = ctrl
+        self._begin()
+        if not self.on_substep:
+            original(self.commanded, frames)
+        else:
+            model, data = self.env.model, self.data
+            for _ in range(frames):
+                self._substep()
+                if plain:
+                    mujoco.mj_step(model, data)
+                else:
+                    original(self.ctrl.copy(), 1)
+            if plain:  # as the original does after its steps
+                mujoco.mj_rnePostConstraint(model, data)
+        self._end()
+
+    def run_robot(self, original: Callable[..., None], action: Any, frames: int) -> None:
+        """A control step in place of gymnasium-robotics' `_mujoco_step`."""
+        self._begin()
+        if not self.on_substep:
+            original(action)
+        else:
+            for _ in range(frames):
+                self._substep()
+                mujoco.mj_step(self.env.model, self.data)
+        self._end()
+
+
+class _Patched:
+    """Takes the place of a method of one environment, and is pickled as that method."""
+
+    def __init__(self, owner: Any, name: str, simulation: SingleSimulation) -> None:
+        self.owner, self.name, self.simulation = owner, name, simulation
+        self.original = getattr(owner, name)
+        # A subclass may do more in its own version: that is then called once a physics step.
+        self.plain = getattr(type(owner), name).__module__ == "gymnasium.envs.mujoco.mujoco_env"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return getattr, (self.owner, self.name)
+
+    def __call__(self, *args: Any) -> None:
+        if self.name == "_mujoco_step":
+            self.simulation.run_robot(self.original, args[0], int(self.owner.n_substeps))
+        else:
+            self.simulation.run(self.original, self.plain, *args)
+
+
+def _stepper(env: Any) -> tuple[Any, str] | None:
+    """Who steps the model of an environment, and through what; None where nothing is known to."""
+    if hasattr(env, "substep_hooks") and hasattr(env, "after_hooks"):
+        return env, "substep_hooks"
+    held: Iterable[Any] = (env, *vars(env).values())
+    for thing in held:
+        if getattr(thing, "data", None) is not env.data:
+            continue
+        for name in ("_step_mujoco_simulation", "_mujoco_step"):
+            if callable(getattr(thing, name, None)):
+                return thing, name
+    return None
+
+
+def simulation_of(env: Any, who: str) -> SingleSimulation:
+    """The simulation beneath an environment, the same one for all its wrappers.
+
+    Raises:
+      InputError: the environment has no MuJoCo model and data.
+    """
+    base = env.unwrapped
+    known = vars(base).get(_ATTRIBUTE)
+    if isinstance(known, SingleSimulation):
+        return known
+    model, data = getattr(base, "model", None), getattr(base, "data", None)
+    if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
+        raise InputError(
+            f"{who} needs a MuJoCo environment: {type(base).__name__} has no `unwrapped.model` (mujoco.MjModel) and "
+            "`unwrapped.data` (mujoco.MjData)"
+        )
+    made = SingleSimulation(base)
+    setattr(base, _ATTRIBUTE, made)
+    return made
