@@ -5,7 +5,7 @@ class NfcError(Exception):
     """Root of every error that this package raises on purpose."""
 
 
-class InputError(NfcError):
+class InputError(NfcError, ValueError):
     """What the user gave cannot be used: the message names the value and says what would be valid."""
 
 

@@ -1,0 +1,202 @@
+"""What an environment promises, whichever engine runs it: spaces, observations, what steps report and resets take."""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.envs.robot import DT, FASTEST, Array, Robot
+from nfc_gym.envs.view import View
+from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.terrain import SHAPE, Heightfield
+from nfc_gym.terrain.egocentric import SIZE
+
+CONTEXT = ("psi", "elevation")
+OPTIONS = ("psi", "psi_belief", "heightfield", "perceived", "terrain_id")
+FPS = round(1 / DT)
+FLAT = Heightfield(np.zeros(SHAPE, np.float32))
+
+
+def robot_class(robot: str | type[Robot]) -> type[Robot]:
+    """A robot's class, or the one that `module:Class` names."""
+    if isinstance(robot, type) and issubclass(robot, Robot):
+        return robot
+    module, _, name = str(robot).partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"robot {robot!r}: want a class of nfc_gym.envs.robot.Robot as 'module:Class'") from error
+    return found
+
+
+def checked_context(context: Sequence[str]) -> tuple[str, ...]:
+    """A subset of `CONTEXT` in its order; another name raises `InputError`."""
+    if isinstance(context, str) or any(c not in CONTEXT for c in context):
+        raise InputError(f"context is {context!r}, want a sequence of: {', '.join(CONTEXT)}")
+    return tuple(c for c in CONTEXT if c in context)
+
+
+def refresh_period(elevation_hz: float | None) -> int:
+    """Control steps between two elevation maps."""
+    if elevation_hz is None:
+        return 1
+    if not 0 < elevation_hz <= FPS or not float(FPS / elevation_hz).is_integer():
+        rates = ", ".join(f"{FPS / k:g}" for k in (1, 2, 5, 10, 25, 50))
+        raise InputError(f"elevation_hz is {elevation_hz!r}, want {FPS} divided by a whole number, such as {rates}")
+    return round(FPS / elevation_hz)
+
+
+def box(*shape: int, bound: float = np.inf) -> spaces.Box:
+    """A float32 `Box` with the same bound everywhere."""
+    return spaces.Box(-bound, bound, shape, np.float32)
+
+
+class Observer:
+    """Observations of a robot under a context.
+
+    Args:
+      robot: whose.
+      psi_size: d.
+      context: a checked context.
+      goal_conditioned: `observation`, `achieved_goal`, `desired_goal` in place of `proprio` and `goal`.
+    """
+
+    def __init__(self, robot: Robot, psi_size: int, context: tuple[str, ...], goal_conditioned: bool) -> None:
+        self._robot = robot
+        self._goal_conditioned = goal_conditioned
+        self.psi, self.elevation = "psi" in context, "elevation" in context
+        self.plain = not context and not goal_conditioned
+        parts: dict[str, spaces.Space] = {}
+        if goal_conditioned:
+            parts["observation"] = box(robot.proprio_size)
+            parts["achieved_goal"] = parts["desired_goal"] = box(robot.place_size)
+        else:
+            parts["proprio"] = box(robot.proprio_size)
+            if robot.goal_size:
+                parts["goal"] = box(robot.goal_size)
+        if self.psi:
+            parts["psi"] = box(psi_size, bound=1.0)
+        if self.elevation:
+            parts["elevation"] = box(SIZE, SIZE)
+        self.space = box(robot.proprio_size + robot.goal_size) if self.plain else spaces.Dict(parts)
+
+    def __call__(self, view: View, psi: NDArray[np.float32], elevation: NDArray[np.float32] | None) -> Any:
+        """Fresh arrays; `psi` is copied, `elevation` handed on."""
+        robot = self._robot
+        if self.plain:
+            parts = robot.proprio(view)
+            parts = (*parts, robot.goal(view)) if robot.goal_size else parts
+            return np.concatenate(parts, -1, dtype=np.float32)
+        if self._goal_conditioned:
+            obs = {
+                "observation": np.concatenate(robot.state(view), -1, dtype=np.float32),
+                "achieved_goal": robot.achieved(view).astype(np.float32),
+                "desired_goal": robot.desired(view).astype(np.float32),
+            }
+        else:
+            obs = {"proprio": np.concatenate(robot.proprio(view), -1, dtype=np.float32)}
+            if robot.goal_size:
+                obs["goal"] = robot.goal(view).astype(np.float32)
+        if self.psi:
+            obs["psi"] = psi.copy()
+        if elevation is not None:
+            obs["elevation"] = elevation
+        return obs
+
+
+def broken(view: View) -> NDArray[np.bool_]:
+    """(*B,) whether a simulation has come apart: NaN or an absurd speed."""
+    return ~(np.abs(view.qvel).max(-1) < FASTEST)
+
+
+def outcome(
+    robot: Robot, view: View, action: Array, unstable: NDArray[np.bool_] | None
+) -> tuple[Array, NDArray[np.bool_], dict[str, NDArray]]:
+    """Reward (*B,), termination (*B,) and `info` of a control step whose physics is done.
+
+    Args:
+      robot, view, action: the step's.
+      unstable: (*B,) simulations that came apart and were put back to rest: they end, with reward 0. None: none did.
+    """
+    view.task.update(robot.advance(view, action))
+    view.before, view.now = view.now, robot.derive(view)
+    terms = robot.reward(view, action)
+    ended = robot.terminated(view)
+    info = {}
+    reward: Any = 0.0
+    for name, term in terms.items():
+        if unstable is not None:
+            term = np.where(unstable, 0.0, term)[()]
+        info["reward/" + name] = term
+        reward = reward + term
+    info.update(robot.facts(view))
+    if unstable is None:
+        info["unstable"] = ended & False
+    else:
+        info["unstable"] = unstable
+        ended = ended | unstable
+    return reward, ended, info
+
+
+def nothing_yet(robot: Robot, view: View) -> dict[str, NDArray]:
+    """`info` of a reset: the keys of a step's, every reward term 0."""
+    shape = view.qpos.shape[:-1]
+    zero = {"reward/" + name: np.zeros(shape)[()] for name in robot.terms}
+    return zero | robot.facts(view) | {"unstable": np.zeros(shape, bool)[()]}
+
+
+def checked_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Reset options; an unknown one, or a terrain for a flat environment, raises `InputError`."""
+    given = {k: v for k, v in (options or {}).items() if v is not None}
+    for key in given:
+        if key not in (*OPTIONS, *more):
+            raise InputError(f"reset has no option {key!r}; it has: {', '.join((*OPTIONS, *more))}")
+        if not rough and key in ("heightfield", "perceived", "terrain_id"):
+            raise InputError(f"option {key!r}: the ground of a Flat environment is a plane; use the Rough one")
+    if "heightfield" in given and "terrain_id" in given:
+        raise InputError("options 'heightfield' and 'terrain_id' both name the terrain: give one of them")
+    return given
+
+
+def psi_of(space: ParameterSpace, values: Any, shape: tuple[int, ...], name: str = "psi") -> Array:
+    """(*shape, d) psi from a vector, one a simulation, or a dict of names (the rest nominal); None is nominal.
+
+    Raises:
+      InputError: an unknown name, another shape, a value that is not finite.
+    """
+    if values is None:
+        psi: ArrayLike = space.nominal
+    elif isinstance(values, Mapping):
+        psi = np.broadcast_to(space.nominal, (*shape, len(space))).copy()
+        for key, value in values.items():
+            if key not in space.names:
+                raise InputError(f"{name} has no parameter {key!r}; there are: {', '.join(space.names)}")
+            if np.shape(value) not in ((), shape):
+                raise InputError(f"{name}[{key!r}] has shape {np.shape(value)}, want () or {shape}")
+            psi[..., space.names.index(key)] = value
+    else:
+        psi = np.asarray(values, float)
+        if psi.shape not in ((len(space),), (*shape, len(space))):
+            raise InputError(f"{name} has shape {psi.shape}, want {(*shape, len(space))}: {', '.join(space.names)}")
+    psi = np.broadcast_to(psi, (*shape, len(space))).astype(float)
+    wrong = ~np.isfinite(psi).reshape(-1, len(space)).all(0)
+    if wrong.any():
+        raise InputError(f"{name}: {space.names[int(np.flatnonzero(wrong)[0])]} is not finite")
+    return psi
+
+
+def seen_psi(space: ParameterSpace, psi: Array) -> NDArray[np.float32]:
+    """psi as agents see it: [-1, 1] by the prior's bounds, clipped."""
+    return np.clip(space.normalise(psi), -1, 1).astype(np.float32)
+
+
+def wrong_action(action: NDArray, shape: tuple[int, ...]) -> InputError:
+    """The error for an action of another shape or with an entry that is not finite, which it names."""
+    if action.shape != shape:
+        return InputError(f"action has shape {action.shape}, want {shape}")
+    at = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
+    return InputError(f"action[{', '.join(map(str, at))}] is {action[at]}, want finite numbers in [-1, 1]")

@@ -1,0 +1,125 @@
+"""Pictures and a window of a simulation, in which a heightfield that changed at run time is seen to have changed."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+
+Camera = str | Mapping[str, Any]
+
+
+def camera_of(model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
+    """A camera of the model by name, or a free one.
+
+    Args:
+      model: the scene.
+      camera: a name, or {"lookat": (x, y, z) m, "distance": m, "azimuth": degrees, "elevation": degrees}, or
+        {"trackbody": name, ...} to follow a body; what is left out is MuJoCo's default.
+    """
+    view = mujoco.MjvCamera()
+    if isinstance(camera, str):
+        names = [model.camera(k).name for k in range(model.ncam)]
+        if camera not in names:
+            raise InputError(f"no camera is called {camera!r}; the scene has {', '.join(names) or 'none'}")
+        view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(camera)
+        return view
+    known = ("lookat", "distance", "azimuth", "elevation", "trackbody")
+    mujoco.mjv_defaultFreeCamera(model, view)
+    for key, value in camera.items():
+        if key not in known:
+            raise InputError(f"a free camera has no {key!r}; it has {', '.join(known)}")
+        if key == "trackbody":
+            view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, model.body(value).id
+        elif key == "lookat":
+            view.lookat[:] = value
+        else:
+            setattr(view, key, float(value))
+    return view
+
+
+class _Shown:
+    """Which heights a graphics context holds: a change of `hfield_data` reaches it only by an upload."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.data = model.hfield_data.copy()
+
+    def changed(self, model: mujoco.MjModel) -> list[int]:
+        """Heightfields that differ from what is shown, which is then taken to be brought up to date."""
+        if np.array_equal(self.data, model.hfield_data):
+            return []
+        out = []
+        for k in range(model.nhfield):
+            part = slice(model.hfield_adr[k], model.hfield_adr[k] + model.hfield_nrow[k] * model.hfield_ncol[k])
+            if not np.array_equal(self.data[part], model.hfield_data[part]):
+                out.append(k)
+        self.data[:] = model.hfield_data
+        return out
+
+
+class Pictures:
+    """Renders off screen (`MUJOCO_GL=egl` or `osmesa` where there is no display).
+
+    Args:
+      model: the scene.
+      width, height: of the picture in pixels.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        self._size = (height, width, 3)
+        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+        self._gl = mujoco.GLContext(width, height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=2000)
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._shown = _Shown(model)
+
+    def render(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> NDArray[np.uint8]:
+        """(height, width, 3) picture of a simulation of the scene."""
+        self._gl.make_current()
+        for k in self._shown.changed(model):
+            mujoco.mjr_uploadHField(model, self._context, k)
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        view = camera_of(model, camera)
+        mujoco.mjv_updateScene(model, data, self._option, self._perturb, view, every, self._scene)
+        area = mujoco.MjrRect(0, 0, self._size[1], self._size[0])
+        mujoco.mjr_render(area, self._scene, self._context)
+        picture = np.empty(self._size, np.uint8)
+        mujoco.mjr_readPixels(picture, None, area, self._context)
+        return np.ascontiguousarray(picture[::-1])
+
+    def close(self) -> None:
+        """Free the graphics context."""
+        self._context.free()
+        self._gl.free()
+
+
+class Window:
+    """MuJoCo's passive viewer on a simulation."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> None:
+        import mujoco.viewer
+
+        self._handle = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+        self._shown = _Shown(model)
+        view = camera_of(model, camera)
+        with self._handle.lock():
+            for key in ("type", "fixedcamid", "trackbodyid", "distance", "azimuth", "elevation"):
+                setattr(self._handle.cam, key, getattr(view, key))
+            self._handle.cam.lookat[:] = view.lookat
+
+    def render(self, model: mujoco.MjModel) -> None:
+        """Show the present state."""
+        for k in self._shown.changed(model):
+            self._handle.update_hfield(k)
+        self._handle.sync()
+
+    def close(self) -> None:
+        """Close the window."""
+        self._handle.close()

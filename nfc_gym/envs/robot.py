@@ -1,0 +1,151 @@
+"""`Robot`: a robot's task as pure functions over a `View`; the engines (`single`, `vector`) know nothing else of it."""
+
+import tomllib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym import assets
+from nfc_gym.core.errors import InputError
+from nfc_gym.envs.view import View
+from nfc_gym.physics.parameters import Parameter, ParameterSpace
+
+Array = NDArray[np.float64]
+Ground = Callable[[NDArray], Array]
+
+TIMESTEP = 0.005  # s, physics 200 Hz
+FRAME_SKIP = 4  # control 50 Hz
+DT = TIMESTEP * FRAME_SKIP  # s
+FASTEST = 1e4  # m/s or rad/s: beyond it (or NaN) a simulation has come apart
+
+
+@dataclass(frozen=True)
+class Start:
+    """How an episode begins.
+
+    Attributes:
+      qpos: (*B, nq); velocities are zero, activations and controls those of the keyframe.
+      task: the episode's memory, name -> (*B, ...).
+    """
+
+    qpos: Array
+    task: Mapping[str, NDArray] = field(default_factory=dict)
+
+
+class Robot(ABC):
+    """A robot with its task. Every method is a pure function over arrays with a leading batch shape B, () or (n,).
+
+    In a control step the engine calls, in this order: `actuate`, the physics, `advance`, `derive`, `reward`, `facts`,
+    `terminated`, and the observations. At a reset: `begin`, `derive`, and the observations.
+
+    Args:
+      model: the compiled scene, from which names are resolved once.
+      task: one of `tasks`.
+
+    Attributes:
+      name: folder of its MJCF under `nfc_gym/assets`.
+      tasks: what it can be asked to do; the first is the default.
+      goal_size: size of the `goal` observation, 0 where `proprio` holds the command.
+      place_size: size of a goal as a place in the world (`achieved`, `desired`), 0 where the tasks have none.
+      terrain_kind, terrain_scale: of the rough ground: one of `nfc_gym.terrain.KINDS`, and what multiplies its heights.
+      draws: how many uniform numbers in [0, 1) an episode's start is made of.
+      reads: derived `MjData` fields that the laws read (`sensordata`, `xpos`, ...).
+      terms: names of the reward terms of this task, set by the constructor.
+      home: (nq,) position of the keyframe `home`.
+    """
+
+    name: ClassVar[str]
+    tasks: ClassVar[tuple[str, ...]]
+    action_size: ClassVar[int]
+    proprio_size: ClassVar[int]
+    goal_size: ClassVar[int] = 0
+    place_size: ClassVar[int] = 0
+    terrain_kind: ClassVar[str] = "mixed"
+    terrain_scale: ClassVar[float] = 1.0
+    draws: ClassVar[int]
+    reads: ClassVar[tuple[str, ...]] = ()
+    terms: tuple[str, ...]
+
+    def __init__(self, model: mujoco.MjModel, task: str) -> None:
+        self.task = task
+        self.home = model.key("home").qpos.copy()
+
+    @classmethod
+    def parameters(cls) -> list[Parameter]:
+        """psi, in the paper's order, from the robot's `psi.toml`."""
+        rows = tomllib.loads(assets.path(cls.name).with_name("psi.toml").read_text())["parameter"]
+        return [Parameter(**{**row, "of": tuple(row.get("of", ()))}) for row in rows]
+
+    @classmethod
+    def space(cls, model: mujoco.MjModel) -> ParameterSpace:
+        """psi bound to a model."""
+        return ParameterSpace(model, cls.parameters())
+
+    @classmethod
+    def choose(cls, task: str | None) -> str:
+        """The task of that name, the default one for None; another raises `InputError`."""
+        if task is None:
+            return cls.tasks[0]
+        if task not in cls.tasks:
+            raise InputError(f"{cls.name} has no task {task!r}; it has: {', '.join(cls.tasks)}")
+        return task
+
+    # ---- the laws -------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def begin(self, u: Array, ground: Ground) -> Start:
+        """Start of an episode from uniform numbers u (*B, draws); `ground` gives heights below points (*B, ..., 2)."""
+
+    @abstractmethod
+    def actuate(self, action: Array, view: View) -> Array:
+        """Action (*B, action_size) in [-1, 1] -> ctrl (*B, nu)."""
+
+    @abstractmethod
+    def derive(self, view: View) -> Any:
+        """Quantities that several laws need, computed once a step; found as `view.now` (and `view.before`) by the rest.
+
+        Reads the state and `view.task` alone, so that computing it twice changes nothing.
+        """
+
+    def advance(self, view: View, action: Array) -> Mapping[str, NDArray]:
+        """Entries of `view.task` that change as a control step ends (clock, last action), as fresh arrays (*B, ...)."""
+        return {}
+
+    @abstractmethod
+    def reward(self, view: View, action: Array) -> dict[str, Array]:
+        """Reward terms (*B,), one for each of `terms` and in that order; the reward is their sum."""
+
+    @abstractmethod
+    def terminated(self, view: View) -> NDArray[np.bool_]:
+        """(*B,) whether the episode ends early."""
+
+    @abstractmethod
+    def proprio(self, view: View) -> Sequence[NDArray]:
+        """Parts (*B, k) whose concatenation is the observation `proprio` (*B, proprio_size)."""
+
+    def goal(self, view: View) -> NDArray:
+        """(*B, goal_size) the command in the robot's frame, where it is not part of `proprio`."""
+        raise NotImplementedError
+
+    def facts(self, view: View) -> dict[str, NDArray]:
+        """What `info` reports besides the reward terms, (*B,) each; goal tasks: `success`, `distance`."""
+        return {}
+
+    # ---- goal-conditioned robots ----------------------------------------------------------------------------------
+
+    def state(self, view: View) -> Sequence[NDArray]:
+        """Parts (*B, k) of `proprio` with nothing of the goal in it, which a goal-conditioned learner may relabel."""
+        return self.proprio(view)
+
+    def achieved(self, view: View) -> NDArray:
+        """(*B, place_size) where the robot is, as a goal."""
+        raise NotImplementedError
+
+    def desired(self, view: View) -> NDArray:
+        """(*B, place_size) the goal."""
+        raise NotImplementedError

@@ -1,0 +1,305 @@
+"""`RobotEnv`: one robot in one simulation, a thin shell around the robot's laws."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from nfc_gym import assets
+from nfc_gym.core.errors import InputError
+from nfc_gym.envs import scene
+from nfc_gym.envs.contract import (
+    FLAT,
+    FPS,
+    Observer,
+    box,
+    broken,
+    checked_context,
+    checked_options,
+    nothing_yet,
+    outcome,
+    psi_of,
+    refresh_period,
+    robot_class,
+    seen_psi,
+    wrong_action,
+)
+from nfc_gym.envs.render import Camera, Pictures, Window
+from nfc_gym.envs.robot import FRAME_SKIP, TIMESTEP, Robot
+from nfc_gym.envs.rotations import yaw
+from nfc_gym.envs.terrains import Pool
+from nfc_gym.envs.view import View
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.terrain import Heightfield, elevation, surface
+from nfc_gym.terrain.egocentric import SIZE
+
+
+class RobotEnv(gymnasium.Env):
+    """A robot on flat ground or rough terrain.
+
+    Args:
+      robot: class of the robot, or `module:Class`.
+      rough: heightfields in place of a plane.
+      task: one of the robot's tasks; None is its first.
+      context: which of `psi` and `elevation` the observation holds; () gives a plain `Box`.
+      elevation_hz: how often the elevation map is renewed; None is every control step (50 Hz).
+      difficulty: of the terrain, in [0, 1].
+      terrain_seed, terrain_pool, terrain_kind: the pool of maps that episodes draw from; the default kind is the
+        robot's.
+      render_mode: None, `rgb_array` or `human`.
+      width, height: of pictures.
+      camera: name of a camera of the robot's file, or a free one (`render.camera_of`).
+
+    Attributes:
+      model, data: the simulation. Edits of the model last until the next reset where psi or `fields` touched them.
+      fields: `ModelFields` of `model`; what is written through it goes back to nominal at every reset.
+      psi_space: names, units, bounds and nominal values of psi.
+      substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
+      camera: as above; may be changed between pictures.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": FPS}
+    goal_conditioned = False
+
+    def __init__(
+        self,
+        robot: str | type[Robot],
+        rough: bool = False,
+        *,
+        task: str | None = None,
+        context: Sequence[str] = ("psi", "elevation"),
+        elevation_hz: float | None = None,
+        difficulty: float = 0.5,
+        terrain_seed: int = 0,
+        terrain_pool: int = 64,
+        terrain_kind: str | None = None,
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        camera: Camera = "track",
+    ) -> None:
+        self._arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            modes = ", ".join(self.metadata["render_modes"])
+            raise InputError(f"render_mode is {render_mode!r}, want None or one of: {modes}")
+        kind = robot_class(robot)
+        self.rough = bool(rough)
+        self.model = scene.build(assets.path(kind.name), maps=1 if rough else 0)
+        self.data = mujoco.MjData(self.model)
+        self.robot = kind(self.model, kind.choose(task))
+        self.psi_space = kind.space(self.model)
+        self.fields = ModelFields(self.model)
+        self.frame_skip = FRAME_SKIP
+        self.substep_hooks: list[Callable[[RobotEnv], None]] = []
+        self.camera, self.render_mode, self._size = camera, render_mode, (width, height)
+        self._pictures: Pictures | None = None
+        self._window: Window | None = None
+
+        self._pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
+        self._terrain = self._perceived = FLAT
+        self._observe = Observer(self.robot, len(self.psi_space), checked_context(context), self.goal_conditioned)
+        self._period = refresh_period(elevation_hz)
+        self._map: NDArray[np.float32] | None = None
+        self._age = 0
+        self.observation_space = self._observe.space
+        self.action_space: spaces.Box = box(kind.action_size, bound=1.0)
+
+        self._home = self.model.key("home").id
+        self._psi = self.psi_space.nominal.copy()
+        self._seen = seen_psi(self.psi_space, self._psi)
+        self._view = View(self.model, lambda name: getattr(self.data, name), kind.reads, self._ground)
+        self._limit = np.ones(kind.action_size)
+
+    # ---- what may be read back ------------------------------------------------------------------------------------
+
+    @property
+    def dt(self) -> float:
+        """Control step, s."""
+        return TIMESTEP * self.frame_skip
+
+    @property
+    def psi(self) -> NDArray[np.float64]:
+        """(d,) psi of the simulation in physical units."""
+        return self._psi.copy()
+
+    @property
+    def heightfield(self) -> Heightfield:
+        """The terrain that is simulated; zeros on flat ground."""
+        return self._terrain
+
+    @property
+    def perceived(self) -> Heightfield:
+        """The terrain that `elevation` is taken from: the simulated one, unless a reset was told another."""
+        return self._perceived
+
+    # ---- Gymnasium's interface ------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, dict[str, NDArray]]:
+        """Begin an episode.
+
+        Args:
+          seed: of the environment's own generator, from which start, goal and terrain are drawn.
+          options: `psi` and `psi_belief`: (d,) in physical units or a dict of names, the rest nominal (what the agent
+            believes is by default the truth). On rough ground `heightfield`: (256, 256) m, or `terrain_id`: a map of
+            the pool; `perceived`: (256, 256) m, what `elevation` shows, by default the simulated terrain.
+
+        Raises:
+          InputError: an unknown option or name, another shape, values that are not finite or physically impossible.
+        """
+        super().reset(seed=seed)
+        given = checked_options(options, self.rough)
+        u = self.np_random.random(1 + self.robot.draws)
+        self._set_psi(given)
+        if self.rough:
+            self._set_terrain(given, u[0])
+        mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
+        start = self.robot.begin(u[1:], self._ground)
+        self.data.qpos[:] = start.qpos
+        mujoco.mj_forward(self.model, self.data)
+        view = self._view
+        view.task = dict(start.task)
+        view.now = self.robot.derive(view)
+        self._age = 0
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), nothing_yet(self.robot, view)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, NDArray]]:
+        """One control step of `frame_skip` physics steps.
+
+        Args:
+          action: (action_size,); values outside [-1, 1] are clipped.
+
+        Raises:
+          InputError: another shape, or an entry that is not finite, which the message names.
+        """
+        action = np.asarray(action, np.float64)
+        if action.shape != self._limit.shape or not np.isfinite(action.sum()):
+            raise wrong_action(action, self._limit.shape)
+        action = np.minimum(np.maximum(action, -self._limit), self._limit)
+        view, data = self._view, self.data
+        data.ctrl[:] = self.robot.actuate(action, view)
+        self._advance()
+        unstable = broken(view)
+        if unstable:
+            self._rest()
+        reward, terminated, info = outcome(self.robot, view, action, unstable if unstable else None)
+        self._age += 1
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), float(reward), bool(terminated), False, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """(height, width, 3) picture for `rgb_array`; brings the window up to date for `human`."""
+        if self.render_mode == "rgb_array":
+            if self._pictures is None:
+                self._pictures = Pictures(self.model, *self._size)
+            return self._pictures.render(self.model, self.data, self.camera)
+        if self.render_mode == "human":
+            if self._window is None:
+                self._window = Window(self.model, self.data, self.camera)
+            self._window.render(self.model)
+        return None
+
+    def close(self) -> None:
+        """Free what rendering holds."""
+        for shown in (self._pictures, self._window):
+            if shown is not None:
+                shown.close()
+        self._pictures = self._window = None
+
+    # ---- inside ---------------------------------------------------------------------------------------------------
+
+    def _ground(self, xy: NDArray) -> NDArray[np.float64]:
+        if not self.rough:
+            return np.zeros(xy.shape[:-1])
+        return surface(self._terrain.heights, xy, self._terrain.resolution, self._terrain.origin)[0]
+
+    def _set_psi(self, given: Mapping[str, Any]) -> None:
+        space = self.psi_space
+        psi = psi_of(space, given.get("psi"), ())
+        belief = psi_of(space, given["psi_belief"], (), "psi_belief") if "psi_belief" in given else psi
+        self.fields.restore()
+        space.write(self.fields, psi)
+        self.fields.commit()
+        self._psi, self._seen = psi, seen_psi(space, belief)
+
+    def _set_terrain(self, given: Mapping[str, Any], u: float) -> None:
+        if "heightfield" in given:
+            self._terrain = scene.checked(given["heightfield"])
+        else:
+            self._terrain = self._pool.map(given.get("terrain_id", self._pool.draw(u)))
+        self._perceived = scene.checked(given["perceived"], "perceived") if "perceived" in given else self._terrain
+        scene.write(self.model, 0, self._terrain.heights)
+
+    def _advance(self) -> None:
+        try:
+            if not self.substep_hooks:
+                mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
+                return
+            for _ in range(self.frame_skip):
+                for hook in self.substep_hooks:
+                    hook(self)
+                mujoco.mj_step(self.model, self.data)
+        except mujoco.FatalError:  # the solver ran out of memory, as happens where bodies are driven into one another
+            self.data.qvel[:] = np.nan
+
+    def _rest(self) -> None:
+        """A simulation that came apart goes back to its keyframe, so that nothing that is returned holds NaN."""
+        mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
+        mujoco.mj_forward(self.model, self.data)
+
+    def _observation(self) -> Any:
+        return self._observe(self._view, self._seen, self._elevation() if self._observe.elevation else None)
+
+    def _elevation(self) -> NDArray[np.float32]:
+        """A fresh elevation map, or a copy of the last one between two refreshes."""
+        if self._age % self._period == 0 or self._map is None:
+            qpos = self.data.qpos
+            if self.rough:
+                out = elevation(self._perceived, qpos[:3], yaw(qpos[3:7]))
+            else:
+                out = np.full((SIZE, SIZE), -qpos[2], np.float32)
+            if self._period > 1:
+                self._map = out.copy()
+            return out
+        return self._map.copy()
+
+    def __getstate__(self) -> dict[str, Any]:
+        view = self._view
+        state = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION.value))
+        mujoco.mj_getState(self.model, self.data, state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+        kept = ("_np_random", "_np_random_seed", "_psi", "_seen", "_terrain", "_perceived", "_map", "_age", "spec")
+        return {
+            "arguments": self._arguments,
+            "kept": {k: self.__dict__[k] for k in kept if k in self.__dict__},
+            "state": state,
+            "view": (view.task, view.now, view.before),
+        }
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        """Goes on where the pickled environment stopped, to the bit; edits of the model other than psi are not kept."""
+        self.__init__(**saved["arguments"])
+        self.__dict__.update(saved["kept"])
+        self.psi_space.write(self.fields, self._psi)
+        self.fields.commit()
+        if self.rough:
+            scene.write(self.model, 0, self._terrain.heights)
+        mujoco.mj_setState(self.model, self.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION.value)
+        mujoco.mj_forward(self.model, self.data)
+        self._view.task, self._view.now, self._view.before = saved["view"]
+
+
+def make(robot: str | type[Robot], rough: bool = False, *, goal_conditioned: bool = False, **kwargs: Any) -> RobotEnv:
+    """A `RobotEnv`, or for `goal_conditioned=True` one with gymnasium-robotics' `GoalEnv` interface."""
+    if not goal_conditioned:
+        return RobotEnv(robot, rough, **kwargs)
+    from nfc_gym.envs.goals import GoalRobotEnv
+
+    return GoalRobotEnv(robot, rough, **kwargs)

@@ -1,0 +1,26 @@
+"""Heightfields: generation, mesh import and export, elevation maps, what a depth camera makes of them.
+
+Needs numpy and OpenCV; trimesh where meshes are read or written. MuJoCo's models are only ever handed in.
+"""
+
+from nfc_gym.terrain.egocentric import elevation
+from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield, surface
+from nfc_gym.terrain.generate import KINDS, make, obstacles, pool
+from nfc_gym.terrain.model import HfieldAsset, asset, bounds, write, write_pool
+
+__all__ = [
+    "KINDS",
+    "RESOLUTION",
+    "SHAPE",
+    "Heightfield",
+    "HfieldAsset",
+    "asset",
+    "bounds",
+    "elevation",
+    "make",
+    "obstacles",
+    "pool",
+    "surface",
+    "write",
+    "write_pool",
+]

@@ -1,0 +1,134 @@
+"""Terrains by name: one map, a field of obstacles, or a pool of maps."""
+
+import cv2
+import numpy as np
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.terrain.kinds import BLEND, SINGLE, TILE, Array, Grid
+from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield
+from nfc_gym.terrain.towers import towers
+
+KINDS = (*SINGLE, "mixed", "obstacles")
+SPAWN = 1.0  # m, radius of the flat patch: an Ant's span is 1.6 m, and a robot needs a step's room around it
+RIM = 0.8  # m, over which the patch passes into the terrain
+
+
+def make(
+    kind: str,
+    difficulty: float,
+    seed: int,
+    shape: tuple[int, int] = SHAPE,
+    resolution: float = RESOLUTION,
+    spawn: float = SPAWN,
+    scale: float = 1.0,
+) -> Heightfield:
+    """A terrain around a flat patch at height 0, where robots start; the same arguments give the same bits.
+
+    Args:
+      kind: one of `KINDS`.
+      difficulty: in [0, 1]; 0 is flat, and one seed's terrain only gets harder with it.
+      seed: non-negative.
+      shape: (nrow, ncol).
+      resolution: m a cell.
+      spawn: radius of the flat patch [m]; beyond it a rim of `RIM` passes smoothly into the terrain.
+      scale: multiplies all heights, for robots much smaller or larger than a quadruped (see `kinds`).
+
+    Raises:
+      InputError: an argument outside the above.
+    """
+    if kind not in KINDS:
+        raise InputError(f"no terrain is called {kind!r}; the kinds are {', '.join(KINDS)}")
+    rng, grid = _prepare(difficulty, seed, shape, resolution, spawn, scale)
+    if kind == "obstacles":
+        return Heightfield(towers(rng, grid, difficulty), resolution)
+    heights = _mixed(rng, grid, difficulty) if kind == "mixed" else SINGLE[kind](rng, grid, difficulty)
+    x, y = grid.xy
+    rise = np.clip((np.hypot(x, y) - spawn) / RIM, 0.0, 1.0)
+    return Heightfield(scale * heights * rise * rise * (3 - 2 * rise), resolution)
+
+
+def obstacles(
+    difficulty: float,
+    seed: int,
+    shape: tuple[int, int] = SHAPE,
+    resolution: float = RESOLUTION,
+    spawn: float = SPAWN,
+    scale: float = 1.0,
+    goal: tuple[float, float] | None = None,
+    corridor: float = 0.0,
+) -> Heightfield:
+    """A floor with pillars and towers; start and goal are free, and with `corridor` the straight way between them.
+
+    Args:
+      difficulty, seed, shape, resolution, spawn, scale: as for `make`; the free start has radius `spawn`.
+      goal: world x and y [m] around which a disc of radius `spawn` stays free.
+      corridor: width of the free passage from the middle to the goal [m]; 0 is none.
+    """
+    rng, grid = _prepare(difficulty, seed, shape, resolution, spawn, scale)
+    return Heightfield(towers(rng, grid, difficulty, goal, corridor), resolution)
+
+
+def pool(
+    size: int,
+    seed: int,
+    difficulty: float | tuple[float, float],
+    kind: str = "mixed",
+    shape: tuple[int, int] = SHAPE,
+    resolution: float = RESOLUTION,
+    spawn: float = SPAWN,
+    scale: float = 1.0,
+) -> list[Heightfield]:
+    """`size` maps of one kind; map k depends on `seed` and k alone, so a larger pool begins with the smaller one.
+
+    Args:
+      size: at least 1.
+      seed: non-negative.
+      difficulty: of all, or (from, to) to spread it evenly over the pool.
+      kind, shape, resolution, spawn, scale: as for `make`.
+    """
+    if size < 1:
+        raise InputError(f"size {size!r}: a pool has at least one map")
+    low, high = difficulty if isinstance(difficulty, tuple | list) else (difficulty, difficulty)
+    levels = np.linspace(low, high, size)
+    seeds = [int(np.random.SeedSequence([_seed(seed), k]).generate_state(1)[0]) for k in range(size)]
+    return [
+        make(kind, float(level), each, shape, resolution, spawn, scale)
+        for level, each in zip(levels, seeds, strict=True)
+    ]
+
+
+def _prepare(
+    difficulty: float, seed: int, shape: tuple[int, int], resolution: float, spawn: float, scale: float
+) -> tuple[np.random.Generator, Grid]:
+    if not 0 <= difficulty <= 1:
+        raise InputError(f"difficulty {difficulty!r}: want a number from 0 (flat) to 1")
+    if len(shape) != 2 or min(shape) < 2:
+        raise InputError(f"shape {shape!r}: want (nrow, ncol), both at least 2")
+    for name, value in (("resolution", resolution), ("scale", scale)):
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name} {value!r}: want a number above 0")
+    if not (np.isfinite(spawn) and spawn >= 0):
+        raise InputError(f"spawn {spawn!r}: want a radius in metres, 0 or more")
+    return np.random.default_rng(_seed(seed)), Grid((int(shape[0]), int(shape[1])), resolution, spawn, scale)
+
+
+def _seed(seed: int) -> int:
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"seed {seed!r}: want an integer, 0 or more")
+    return int(seed)
+
+
+def _mixed(rng: np.random.Generator, grid: Grid, difficulty: float) -> Array:
+    """Tiles of single kinds with soft seams, over a little roughness everywhere."""
+    layers = [
+        generate(each, grid, difficulty) for generate, each in zip(SINGLE.values(), rng.spawn(len(SINGLE)), strict=True)
+    ]
+    rows, cols = (int(np.ceil(n * grid.resolution / TILE)) for n in grid.shape)
+    kinds = rng.permutation(np.resize(np.arange(len(layers)), rows * cols)).reshape(rows, cols)
+    row, col = ((np.arange(n) * grid.resolution / TILE).astype(int) for n in grid.shape)
+    chosen = kinds[row][:, col]
+    heights = 0.3 * layers[0]
+    for k, layer in enumerate(layers):  # the weights of all kinds add up to one, as their sum before the blur does
+        mask = (chosen == k).astype(np.float64)
+        heights += layer * cv2.GaussianBlur(mask, (0, 0), BLEND / grid.resolution, borderType=cv2.BORDER_REPLICATE)
+    return heights
