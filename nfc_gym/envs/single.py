@@ -59,6 +59,7 @@ class RobotEnv(gymnasium.Env):
       fields: `ModelFields` of `model`; what is written through it goes back to nominal at every reset.
       psi_space: names, units, bounds and nominal values of psi.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
+      after_hooks: called with this environment after the last physics step, before anything is observed.
       camera: as above; may be changed between pictures.
     """
 
@@ -95,6 +96,7 @@ class RobotEnv(gymnasium.Env):
         self.fields = ModelFields(self.model)
         self.frame_skip = FRAME_SKIP
         self.substep_hooks: list[Callable[[RobotEnv], None]] = []
+        self.after_hooks: list[Callable[[RobotEnv], None]] = []
         self.camera, self.render_mode, self._size = camera, render_mode, (width, height)
         self._pictures: Pictures | None = None
         self._window: Window | None = None
@@ -247,6 +249,8 @@ class RobotEnv(gymnasium.Env):
                 for hook in self.substep_hooks:
                     hook(self)
                 mujoco.mj_step(self.model, self.data)
+            for hook in self.after_hooks:
+                hook(self)
         except mujoco.FatalError:  # the solver ran out of memory, as happens where bodies are driven into one another
             self.data.qvel[:] = np.nan
 

@@ -132,7 +132,8 @@ class ResidualDynamics(EnvWrapper):
         super().__init__(env, source=source, mode=mode, covariance=covariance, components=components, key=key)
         sim = simulation_of(env, "ResidualDynamics")
         self.draws, bound, root = prepare(env, sim, source, mode, covariance, components)
-        sim.attach("ResidualDynamics")
+        sim.attach("ResidualDynamics", after=mode == "state")
+        self.sim = sim
         self.key = box_key(env.observation_space, key, bound.size) if bound.observed.size else None
         self.injection = Injection(sim, bound, mode, root)
 
@@ -146,6 +147,7 @@ class ResidualDynamics(EnvWrapper):
         self.injection.rng = self.stream(seed)
         self.injection.bias = self.draws.draw(1, self.injection.rng)[0]
         self.injection.delta = self.injection.bias
+        self.sim.begin_episode()
         observation, info = self.env.reset(seed=seed, options=options)
         return self._observed(observation), info
 

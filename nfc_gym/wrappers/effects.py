@@ -137,9 +137,11 @@ class ApplyEffects(EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Edit the model from nominal, forget hidden states, reset."""
-        self.sim.rewrite()
+        self.sim.edit()
         self.sim.begin_episode()
-        return self.env.reset(seed=seed, options=options)
+        result = self.env.reset(seed=seed, options=options)
+        self.sim.edit_after()
+        return result
 
     def _begin(self) -> None:
         """Before a control step: forget hidden states where it is an episode's first."""

@@ -122,7 +122,7 @@ class Psi:
             self.value = self.space.vector(options["psi"])
             return options
         self.value = self.space.vector(options.pop("psi", value))
-        self.sim.rewrite()
+        self.sim.edit()
         return options or None
 
 

@@ -91,20 +91,28 @@ class Simulation:
 
 
 class SingleSimulation(Simulation):
-    """One environment with `model` and `data`."""
+    """One environment with `model` and `data`.
+
+    An environment with `fields` (a `ModelFields` of its model, brought back to nominal at each of its resets) has its own
+    psi: edits are then made right after a reset. Any other's model is edited right before.
+    """
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
-        self.nominal = copy.copy(env.model)
-        self.fields = ModelFields(env.model, self.nominal)
+        own = getattr(env, "fields", None)
+        self.own_fields = isinstance(own, ModelFields)
+        self.fields = own if isinstance(own, ModelFields) else ModelFields(env.model, copy.copy(env.model))
+        self.nominal = self.fields.nominal_model
         self._steps: tuple[Any, str] | None = _stepper(env)
-        self._attached = False
+        self._attached = self._inside = False
+        self._calls = 0
         self._time = np.inf
         self.started = True
         self._look()
 
     @property
     def owner(self) -> Any:
+        """See `Simulation`."""
         return self._steps[0] if self._steps else self.env
 
     def _look(self) -> None:
@@ -126,33 +134,48 @@ class SingleSimulation(Simulation):
 
     # ---- model edits ----------------------------------------------------------------------------------------------
 
-    def rewrite(self) -> None:
-        """The nominal model with every wrapper's edits, lower ranks first; derived constants follow."""
-        self.fields.restore()
+    def edit(self) -> None:
+        """Before a reset: the nominal model with every wrapper's edits, psi's first; derived constants follow."""
+        if not self.own_fields:
+            self.fields.restore()
+            self._write()
+
+    def edit_after(self) -> None:
+        """After a reset: the edits that come on top of the psi that the environment itself has written."""
+        if self.own_fields and self.edits:
+            self._write()
+
+    def _write(self) -> None:
         for _, edit in sorted(self.edits, key=lambda e: e[0]):
             edit(self.fields)
         self.fields.commit()
 
     # ---- stepping -------------------------------------------------------------------------------------------------
 
-    def attach(self, who: str) -> None:
+    def attach(self, who: str, after: bool = False) -> None:
         """Make sure that the hooks are called.
 
+        Args:
+          who: for errors.
+          after: `on_after` is needed too.
+
         Raises:
-          InputError: the environment steps its model where no hook can be put.
+          InputError: the environment steps its model where no such hook can be put.
         """
+        owner, how = self._steps or (self.env, "")
+        if not how or (after and how == "substep_hooks" and not hasattr(owner, "after_hooks")):
+            place = "after the last physics step" if how else "between physics steps"
+            raise InputError(
+                f"{who} acts {place}, and {type(self.env).__name__} has no place for that: it needs `substep_hooks` and "
+                "`after_hooks`, lists of callables that it calls with itself before every mj_step and after the last "
+                "one of a control step, or to be stepped by gymnasium's MujocoEnv"
+            )
         if self._attached:
             return
-        if self._steps is None:
-            raise InputError(
-                f"{who} acts between physics steps, and {type(self.env).__name__} has no place for that: it needs "
-                "`substep_hooks` and `after_hooks`, lists of callables that it calls before every mj_step and after the "
-                "last one, or to be stepped by gymnasium's MujocoEnv"
-            )
-        owner, how = self._steps
         if how == "substep_hooks":
             owner.substep_hooks.append(self._called)
-            owner.after_hooks.append(lambda _: self._end())
+            if hasattr(owner, "after_hooks"):
+                owner.after_hooks.append(lambda _: self._end())
         else:
             setattr(owner, how, _Patched(owner, how, self))
         self._attached = True
@@ -160,10 +183,12 @@ class SingleSimulation(Simulation):
     def begin_episode(self) -> None:
         """The next control step is the first of an episode."""
         self.started = True
-        self._time = np.inf
+        self._inside, self._calls, self._time = False, 0, np.inf
 
     def _begin(self) -> None:
         """Before the first physics step of a control step; `ctrl` is set."""
+        if self._inside:  # nobody said that the last control step is over
+            self._end()
         data = self.env.data
         if data is not self.data:
             self._look()
@@ -174,7 +199,7 @@ class SingleSimulation(Simulation):
         self._base[1][:] = self.xfrc_applied
         for hook in self.on_control:
             hook()
-        self.started = False
+        self.started, self._inside = False, True
         self._held[0][:] = self.qfrc_applied
         self._held[1][:] = self.xfrc_applied
 
@@ -194,13 +219,11 @@ class SingleSimulation(Simulation):
         self._time = self.data.time
         self._inside = False
 
-    _inside = False
-
     def _called(self, _: Any) -> None:
-        """A hook of an environment that has some: before every physics step."""
-        if not self._inside:
+        """Before a physics step of an environment that has hooks of its own."""
+        if self._calls == 0:
             self._begin()
-            self._inside = True
+        self._calls = (self._calls + 1) % int(self.env.frame_skip)
         self._substep()
 
     def run(self, original: Callable[..., None], plain: bool, ctrl: Array, frames: int) -> None:
@@ -254,7 +277,7 @@ class _Patched:
 
 def _stepper(env: Any) -> tuple[Any, str] | None:
     """Who steps the model of an environment, and through what; None where nothing is known to."""
-    if hasattr(env, "substep_hooks") and hasattr(env, "after_hooks"):
+    if hasattr(env, "substep_hooks"):
         return env, "substep_hooks"
     held: Iterable[Any] = (env, *vars(env).values())
     for thing in held:
