@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nfc_gym.core.errors import InputError
 
-ROBOTS = ("jackal", "quadcopter", "quadruped")
+ROBOTS = ("ant", "humanoid", "jackal", "quadcopter", "quadruped")
 
 _HERE = Path(__file__).resolve().parent
 

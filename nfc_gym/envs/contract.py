@@ -62,12 +62,13 @@ class Observer:
       robot: whose.
       psi_size: d.
       context: a checked context.
-      goal_conditioned: `observation`, `achieved_goal`, `desired_goal` in place of `proprio` and `goal`.
+
+    A goal-conditioned robot has `observation`, `achieved_goal` and `desired_goal` in place of `proprio` and `goal`.
     """
 
-    def __init__(self, robot: Robot, psi_size: int, context: tuple[str, ...], goal_conditioned: bool) -> None:
-        self._robot = robot
-        self._goal_conditioned = goal_conditioned
+    def __init__(self, robot: Robot, psi_size: int, context: tuple[str, ...]) -> None:
+        goal_conditioned = robot.goal_conditioned is not None
+        self._robot, self._goal_conditioned = robot, goal_conditioned
         self.psi, self.elevation = "psi" in context, "elevation" in context
         self.plain = not context and not goal_conditioned
         parts: dict[str, spaces.Space] = {}
@@ -124,12 +125,12 @@ def outcome(
     """
     view.task.update(robot.advance(view, action))
     view.before, view.now = view.now, robot.derive(view)
-    terms = robot.reward(view, action)
+    terms = robot.scored(view, action)
     ended = robot.terminated(view)
     info = {}
     reward: Any = 0.0
     for name, term in terms.items():
-        if unstable is not None:
+        if unstable is not None and robot.goal_conditioned is None:
             term = np.where(unstable, 0.0, term)[()]
         info["reward/" + name] = term
         reward = reward + term
@@ -139,14 +140,18 @@ def outcome(
     else:
         info["unstable"] = unstable
         ended = ended | unstable
+    if robot.goal_conditioned is not None:
+        info["failed"] = ended
     return reward, ended, info
 
 
 def nothing_yet(robot: Robot, view: View) -> dict[str, NDArray]:
     """`info` of a reset: the keys of a step's, every reward term 0."""
     shape = view.qpos.shape[:-1]
-    zero = {"reward/" + name: np.zeros(shape)[()] for name in robot.terms}
-    return zero | robot.facts(view) | {"unstable": np.zeros(shape, bool)[()]}
+    own = robot.goal_conditioned is None
+    zero = {"reward/" + name: np.zeros(shape)[()] for name in (robot.terms if own else ("goal",))}
+    flags = ("unstable",) if own else ("unstable", "failed")
+    return zero | robot.facts(view) | {name: np.zeros(shape, bool)[()] for name in flags}
 
 
 def checked_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[str, ...] = ()) -> dict[str, Any]:

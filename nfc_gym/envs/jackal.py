@@ -19,7 +19,6 @@ REACH = 0.30  # m, from the base to the outside of any wheel
 FULL_SPEED = 2.0  # m/s, the data sheet's; action 1
 FULL_TURN = 4.0  # rad/s, the data sheet's; action 1
 
-ARRIVED = 0.3  # m, as all goal tasks
 NEAREST, FARTHEST = 3.0, 8.0  # m to a goal: 4 s of driving at most, so that 20 s leave room for detours
 START = 0.5  # m, half the side of the square that episodes start in: the terrain is level within 1 m
 EDGE = 12.4  # m from the middle: there the map of 25.5 m ends within a robot's length
@@ -105,9 +104,7 @@ class Jackal(Robot):
         distance = np.sqrt(dx * dx + dy * dy)
         cos, sin = frame.xx, frame.yx  # horizontal part of the forward axis, to be scaled to unit length
         scale = 1 / np.maximum(np.sqrt(cos * cos + sin * sin), 1e-6)
-        return Now(
-            frame, np.array((gx, gy)).T, (cos * dx + sin * dy) * scale, (cos * dy - sin * dx) * scale, distance
-        )
+        return Now(frame, np.array((gx, gy)).T, (cos * dx + sin * dy) * scale, (cos * dy - sin * dx) * scale, distance)
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See the table of weights above."""
@@ -119,7 +116,7 @@ class Jackal(Robot):
             main = TRACKING * np.exp(-distance * distance / WIDTH**2)
         return {
             self.terms[0]: main,
-            "arrival": ARRIVAL * (distance < ARRIVED),
+            "arrival": ARRIVAL * (distance < self.arrived),
             "jerk": -JERK * view.task["jerk"],
             "tilt": TILT * (now.frame.zz - 1),
         }
@@ -140,7 +137,7 @@ class Jackal(Robot):
 
     def facts(self, view: View) -> dict[str, NDArray]:
         """Distance to the goal in the plane (m), and whether that counts as reached."""
-        return {"success": view.now.distance < ARRIVED, "distance": view.now.distance}
+        return {"success": view.now.distance < self.arrived, "distance": view.now.distance}
 
     def achieved(self, view: View) -> NDArray:
         """World x and y (m)."""

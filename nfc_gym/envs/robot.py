@@ -4,7 +4,7 @@ import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import mujoco
 import numpy as np
@@ -22,6 +22,20 @@ TIMESTEP = 0.005  # s, physics 200 Hz
 FRAME_SKIP = 4  # control 50 Hz
 DT = TIMESTEP * FRAME_SKIP  # s
 FASTEST = 1e4  # m/s or rad/s: beyond it (or NaN) a simulation has come apart
+GOAL_REWARDS = ("sparse", "dense")
+
+
+def goal_reward(achieved: NDArray, desired: NDArray, arrived: float, kind: str) -> Array:
+    """Reward of a goal-conditioned environment, (...).
+
+    Args:
+      achieved, desired: (..., k) places [m], taken as float32 as observations have them.
+      arrived: distance that counts as there [m].
+      kind: `sparse`, 0 there and -1 elsewhere, or `dense`, minus the distance.
+    """
+    gap = np.asarray(achieved, np.float32).astype(float) - np.asarray(desired, np.float32)
+    distance = np.sqrt(sum(part * part for part in gap.T)).T
+    return -distance if kind == "dense" else -1.0 * (distance >= arrived)
 
 
 @dataclass(frozen=True)
@@ -55,7 +69,9 @@ class Robot(ABC):
       terrain_kind, terrain_scale: of the rough ground: one of `nfc_gym.terrain.KINDS`, and what multiplies its heights.
       draws: how many uniform numbers in [0, 1) an episode's start is made of.
       reads: derived `MjData` fields that the laws read (`sensordata`, `xpos`, ...).
-      terms: names of the reward terms of this task, set by the constructor.
+      arrived: distance from a goal that counts as there [m].
+      goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward; set by `of`.
+      terms: names of the robot's own reward terms of this task, set by the constructor.
       home: (nq,) position of the keyframe `home`.
     """
 
@@ -69,7 +85,10 @@ class Robot(ABC):
     terrain_scale: ClassVar[float] = 1.0
     draws: ClassVar[int]
     reads: ClassVar[tuple[str, ...]] = ()
+    arrived: ClassVar[float] = 0.3
     terms: tuple[str, ...]
+
+    goal_conditioned: str | None = None
 
     def __init__(self, model: mujoco.MjModel, task: str) -> None:
         self.task = task
@@ -87,13 +106,17 @@ class Robot(ABC):
         return ParameterSpace(model, cls.parameters())
 
     @classmethod
-    def choose(cls, task: str | None) -> str:
-        """The task of that name, the default one for None; another raises `InputError`."""
-        if task is None:
-            return cls.tasks[0]
-        if task not in cls.tasks:
+    def of(cls, model: mujoco.MjModel, task: str | None, goal_conditioned: bool, reward_type: str) -> Self:
+        """The robot with a task: None is the default one; `InputError` where it has none of that name, or no goals."""
+        if task is not None and task not in cls.tasks:
             raise InputError(f"{cls.name} has no task {task!r}; it has: {', '.join(cls.tasks)}")
-        return task
+        if reward_type not in GOAL_REWARDS:
+            raise InputError(f"reward_type is {reward_type!r}, want one of: {', '.join(GOAL_REWARDS)}")
+        if goal_conditioned and not cls.place_size:
+            raise InputError(f"goal_conditioned: the {cls.name} has no goals to reach")
+        robot = cls(model, task or cls.tasks[0])
+        robot.goal_conditioned = reward_type if goal_conditioned else None
+        return robot
 
     # ---- the laws -------------------------------------------------------------------------------------------------
 
@@ -135,6 +158,12 @@ class Robot(ABC):
     def facts(self, view: View) -> dict[str, NDArray]:
         """What `info` reports besides the reward terms, (*B,) each; goal tasks: `success`, `distance`."""
         return {}
+
+    def scored(self, view: View, action: Array) -> dict[str, Array]:
+        """The reward terms that count: the robot's own, or that of the goal alone."""
+        if self.goal_conditioned is None:
+            return self.reward(view, action)
+        return {"goal": goal_reward(self.achieved(view), self.desired(view), self.arrived, self.goal_conditioned)}
 
     # ---- goal-conditioned robots ----------------------------------------------------------------------------------
 

@@ -48,17 +48,13 @@ def axes(quat: Array) -> Axes:
 def to_robot(r: Axes, vector: Array) -> Array:
     """World vectors (..., 3) in the robot's frame, (..., 3)."""
     x, y, z = vector.T
-    return np.array(
-        (r.xx * x + r.yx * y + r.zx * z, r.xy * x + r.yy * y + r.zy * z, r.xz * x + r.yz * y + r.zz * z)
-    ).T
+    return np.array((r.xx * x + r.yx * y + r.zx * z, r.xy * x + r.yy * y + r.zy * z, r.xz * x + r.yz * y + r.zz * z)).T
 
 
 def to_world(r: Axes, vector: Array) -> Array:
     """The robot's vectors (..., 3) in the world's frame, (..., 3)."""
     x, y, z = vector.T
-    return np.array(
-        (r.xx * x + r.xy * y + r.xz * z, r.yx * x + r.yy * y + r.yz * z, r.zx * x + r.zy * y + r.zz * z)
-    ).T
+    return np.array((r.xx * x + r.xy * y + r.xz * z, r.yx * x + r.yy * y + r.yz * z, r.zx * x + r.zy * y + r.zz * z)).T
 
 
 def yaw(quat: Array) -> Array:

@@ -45,6 +45,8 @@ class RobotEnv(gymnasium.Env):
       robot: class of the robot, or `module:Class`.
       rough: heightfields in place of a plane.
       task: one of the robot's tasks; None is its first.
+      goal_conditioned: `observation`, `achieved_goal`, `desired_goal` in place of `proprio` and `goal` (see `goals`).
+      reward_type: of a goal-conditioned environment, `sparse` (0 at the goal, else -1) or `dense` (minus the distance).
       context: which of `psi` and `elevation` the observation holds; () gives a plain `Box`.
       elevation_hz: how often the elevation map is renewed; None is every control step (50 Hz).
       difficulty: of the terrain, in [0, 1].
@@ -64,7 +66,6 @@ class RobotEnv(gymnasium.Env):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": FPS}
-    goal_conditioned = False
 
     def __init__(
         self,
@@ -72,6 +73,8 @@ class RobotEnv(gymnasium.Env):
         rough: bool = False,
         *,
         task: str | None = None,
+        goal_conditioned: bool = False,
+        reward_type: str = "sparse",
         context: Sequence[str] = ("psi", "elevation"),
         elevation_hz: float | None = None,
         difficulty: float = 0.5,
@@ -91,7 +94,7 @@ class RobotEnv(gymnasium.Env):
         self.rough = bool(rough)
         self.model = scene.build(assets.path(kind.name), maps=1 if rough else 0)
         self.data = mujoco.MjData(self.model)
-        self.robot = kind(self.model, kind.choose(task))
+        self.robot = kind.of(self.model, task, goal_conditioned, reward_type)
         self.psi_space = kind.space(self.model)
         self.fields = ModelFields(self.model)
         self.frame_skip = FRAME_SKIP
@@ -103,7 +106,7 @@ class RobotEnv(gymnasium.Env):
 
         self._pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
         self._terrain = self._perceived = FLAT
-        self._observe = Observer(self.robot, len(self.psi_space), checked_context(context), self.goal_conditioned)
+        self._observe = Observer(self.robot, len(self.psi_space), checked_context(context))
         self._period = refresh_period(elevation_hz)
         self._map: NDArray[np.float32] | None = None
         self._age = 0
@@ -170,7 +173,7 @@ class RobotEnv(gymnasium.Env):
         self._age = 0
         if self.render_mode == "human":
             self.render()
-        return self._observation(), nothing_yet(self.robot, view)
+        return self._observation(), _leaves(nothing_yet(self.robot, view))
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, NDArray]]:
         """One control step of `frame_skip` physics steps.
@@ -195,7 +198,7 @@ class RobotEnv(gymnasium.Env):
         self._age += 1
         if self.render_mode == "human":
             self.render()
-        return self._observation(), float(reward), bool(terminated), False, info
+        return self._observation(), float(reward), bool(terminated), False, _leaves(info)
 
     def render(self) -> NDArray[np.uint8] | None:
         """(height, width, 3) picture for `rgb_array`; brings the window up to date for `human`."""
@@ -300,9 +303,14 @@ class RobotEnv(gymnasium.Env):
         self._view.task, self._view.now, self._view.before = saved["view"]
 
 
-def make(robot: str | type[Robot], rough: bool = False, *, goal_conditioned: bool = False, **kwargs: Any) -> RobotEnv:
+def _leaves(info: dict[str, Any]) -> dict[str, NDArray]:
+    """Flags as arrays of shape (), of which Gymnasium's vector environments make arrays of bool rather than objects."""
+    return {key: np.asarray(value) if value.dtype == bool else value for key, value in info.items()}
+
+
+def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotEnv:
     """A `RobotEnv`, or for `goal_conditioned=True` one with gymnasium-robotics' `GoalEnv` interface."""
-    if not goal_conditioned:
+    if not kwargs.get("goal_conditioned"):
         return RobotEnv(robot, rough, **kwargs)
     from nfc_gym.envs.goals import GoalRobotEnv
 

@@ -123,3 +123,38 @@ class ModelFields:
         else:
             mujoco.mj_setConst(self._target, mujoco.MjData(self._target))
         self._dirty = False
+
+    def rows(self, ids: NDArray[np.intp]) -> "RowFields":
+        """The same fields of some of a batch's simulations, (k,) ids in ascending order."""
+        return RowFields(self, ids)
+
+
+class RowFields(ModelFields):
+    """Fields of some simulations of a batch: copies (k, ...), which `commit` puts into their rows.
+
+    Args:
+      whole: the fields of all simulations; what is touched here counts as touched there.
+      ids: (k,) simulations, ascending.
+    """
+
+    def __init__(self, whole: ModelFields, ids: NDArray[np.intp]) -> None:
+        self._whole, self._ids = whole, ids
+        self._target, self.nominal_model, self.batched = whole._target, whole.nominal_model, True
+        self._arrays = {name: whole[name][ids] for name in whole._arrays}
+        self._dirty = False
+
+    def __getitem__(self, name: str) -> NDArray:
+        """Copy of the simulations' values, (k, ...), to be written before `commit`."""
+        if name not in self._arrays:
+            self._arrays[name] = self._whole[name][self._ids]
+        if name in _SETCONST:
+            self._dirty = True
+        return self._arrays[name]
+
+    def commit(self) -> None:
+        """Put the values into the batch, and recompute what MuJoCo derives from them."""
+        for name, values in self._arrays.items():
+            self._whole[name][self._ids] = values
+        if self._dirty:
+            self._target.set_const(self._ids)
+        self._dirty = False

@@ -4,8 +4,9 @@ Needs numpy and OpenCV; trimesh where meshes are read or written. MuJoCo's model
 """
 
 from nfc_gym.terrain.egocentric import elevation
-from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield, surface
 from nfc_gym.terrain.generate import KINDS, make, obstacles, pool
+from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield, surface
+from nfc_gym.terrain.mesh import from_mesh, to_mesh
 from nfc_gym.terrain.model import HfieldAsset, asset, bounds, write, write_pool
 
 __all__ = [
@@ -17,10 +18,12 @@ __all__ = [
     "asset",
     "bounds",
     "elevation",
+    "from_mesh",
     "make",
     "obstacles",
     "pool",
     "surface",
+    "to_mesh",
     "write",
     "write_pool",
 ]

@@ -1,8 +1,8 @@
 """Ego-centric elevation maps: terrain heights around a robot, turned with its heading, relative to its base.
 
 `elevation[i, j]` is the terrain's height minus the base's at x = (i - 63.5) 0.1 m forward and y = (j - 63.5) 0.1 m left
-of the base. Between grid points it is bilinear (what a mapping node that resamples its grid gives), which differs from the
-collision surface of `Heightfield.height` by at most a quarter of a cell's twist. Beyond the edge it repeats the edge.
+of the base. Between grid points it is bilinear (what a mapping node that resamples its grid gives), which differs from
+the collision surface of `Heightfield.height` by at most a quarter of a cell's twist. Beyond the edge it repeats that.
 """
 
 from collections.abc import Sequence

@@ -1,11 +1,10 @@
 """Terrains by name: one map, a field of obstacles, or a pool of maps."""
 
-import cv2
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.terrain.kinds import BLEND, SINGLE, TILE, Array, Grid
 from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield
+from nfc_gym.terrain.kinds import BLEND, SINGLE, TILE, Array, Grid
 from nfc_gym.terrain.towers import towers
 
 KINDS = (*SINGLE, "mixed", "obstacles")
@@ -119,16 +118,29 @@ def _seed(seed: int) -> int:
 
 
 def _mixed(rng: np.random.Generator, grid: Grid, difficulty: float) -> Array:
-    """Tiles of single kinds with soft seams, over a little roughness everywhere."""
-    layers = [
-        generate(each, grid, difficulty) for generate, each in zip(SINGLE.values(), rng.spawn(len(SINGLE)), strict=True)
-    ]
-    rows, cols = (int(np.ceil(n * grid.resolution / TILE)) for n in grid.shape)
-    kinds = rng.permutation(np.resize(np.arange(len(layers)), rows * cols)).reshape(rows, cols)
-    row, col = ((np.arange(n) * grid.resolution / TILE).astype(int) for n in grid.shape)
-    chosen = kinds[row][:, col]
-    heights = 0.3 * layers[0]
-    for k, layer in enumerate(layers):  # the weights of all kinds add up to one, as their sum before the blur does
-        mask = (chosen == k).astype(np.float64)
-        heights += layer * cv2.GaussianBlur(mask, (0, 0), BLEND / grid.resolution, borderType=cv2.BORDER_REPLICATE)
+    """Tiles of single kinds with soft seams, over a little roughness everywhere.
+
+    Each tile is levelled by its median, so that no seam becomes a wall between a kind's high and another's low ground.
+    """
+    parts = zip(SINGLE.values(), rng.spawn(len(SINGLE)), strict=True)
+    layers = [generate(each, grid, difficulty) for generate, each in parts]
+    along, across = (_windows(n, grid.resolution) for n in grid.shape)
+    rows = np.array_split(np.arange(grid.shape[0]), len(along))
+    cols = np.array_split(np.arange(grid.shape[1]), len(across))
+    kinds = rng.permutation(np.resize(np.arange(len(layers)), len(rows) * len(cols))).reshape(len(rows), len(cols))
+    levels = np.zeros(kinds.shape)
+    for (i, j), kind in np.ndenumerate(kinds):
+        levels[i, j] = np.median(layers[kind][np.ix_(rows[i], cols[j])])
+    heights = 0.3 * layers[0] - along.T @ levels @ across
+    for k, layer in enumerate(layers):
+        heights += layer * (along.T @ (kinds == k) @ across)
     return heights
+
+
+def _windows(count: int, resolution: float) -> Array:
+    """(tiles, count) weights along one axis: about one within a tile, none far from it, one in sum everywhere."""
+    tiles = max(1, round(count * resolution / TILE))
+    seams = np.arange(1, tiles)[:, None] * count / tiles
+    share = np.clip((np.arange(count) - seams) * resolution / (2 * BLEND) + 0.5, 0.0, 1.0)
+    passed = np.concatenate([np.ones((1, count)), share * share * (3 - 2 * share), np.zeros((1, count))])
+    return passed[:-1] - passed[1:]

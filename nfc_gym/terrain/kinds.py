@@ -5,9 +5,10 @@ amplitude grows with it, so that one seed gives one landscape that a higher diff
 
 The amplitudes are those at difficulty 1; at 0 all is flat. Legged robots with legs of about 0.5 m have been trained on
 slopes up to 25 degrees, steps of 0.2 m and roughness of 0.1 m (Rudin et al. 2022, "Learning to Walk in Minutes Using
-Massively Parallel Deep Reinforcement Learning", CoRL), so 1 lies at the edge of what an Ant (legs of 0.57 m) can learn and
-beyond what a quadruped with hips at 0.3 m can. `Grid.scale` multiplies heights for other machines: a driven wheel climbs a
-step of about a third of its radius, so with 0.3 the steps of difficulty 0.5 are a Jackal's limit (0.03 m, wheels of 0.098 m).
+Massively Parallel Deep Reinforcement Learning", CoRL), so 1 lies at the edge of what an Ant (legs of 0.57 m) can learn
+and beyond what a quadruped with hips at 0.3 m can. `Grid.scale` multiplies heights for other machines: a driven wheel
+climbs a step of about a third of its radius, so with a scale of 0.3 the steps of difficulty 0.5 are a Jackal's limit
+(0.03 m; wheels of 0.098 m).
 """
 
 from collections.abc import Callable
@@ -39,7 +40,7 @@ RAMPS = (1.5, 3.5)  # m, length of a slope before it turns
 STONES = (0.5, 0.8)  # m, side of a stone
 TRENCHES = (1.6, 3.0)  # m, from one trench to the next
 TILE = 5.0  # m, patches of one kind in a mixture
-BLEND = 0.5  # m, standard deviation of the seam between them
+BLEND = 0.75  # m, half the width of the seam between them
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ class Grid:
     def xy(self) -> tuple[Array, Array]:
         """x (1, ncol) and y (nrow, 1) from the middle [m]."""
         nrow, ncol = self.shape
-        y, x = ((np.arange(n) - 0.5 * (n - 1)) * self.resolution for n in (nrow, ncol))
-        return x[None, :], y[:, None]
+        x = np.arange(ncol, dtype=np.float64) - 0.5 * (ncol - 1)
+        y = np.arange(nrow, dtype=np.float64) - 0.5 * (nrow - 1)
+        return x[None, :] * self.resolution, y[:, None] * self.resolution
 
     @cached_property
     def ring(self) -> Array:

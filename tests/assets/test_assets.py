@@ -11,9 +11,17 @@ import pytest
 from nfc_gym import assets
 from nfc_gym.core.errors import InputError
 
-MASS = {"jackal": 17.0, "quadcopter": 1.0, "quadruped": 12.0}  # kg, as documented
-PSI_SIZE = {"jackal": 17, "quadcopter": 9, "quadruped": 13}
+MASS = {"ant": 8.2, "humanoid": 40.6, "jackal": 17.0, "quadcopter": 1.0, "quadruped": 12.0}  # kg, as documented
+PSI_SIZE = {"ant": 21, "humanoid": 37, "jackal": 17, "quadcopter": 9, "quadruped": 13}
+BODIES = {"ant": 13, "humanoid": 16, "jackal": 5, "quadcopter": 5, "quadruped": 17}
+ROOT = {"ant": "torso", "humanoid": "torso", "jackal": "base", "quadcopter": "base", "quadruped": "base"}
+CORNERS = ("front_left", "front_right", "rear_left", "rear_right")
+TRUNK = ["abdomen_z", "abdomen_y", "abdomen_x"]
+LEG = ("hip_x", "hip_z", "hip_y", "knee", "ankle_y", "ankle_x")
+ARM = ("shoulder1", "shoulder2", "elbow")
 ACTUATORS = {
+    "ant": [f"{leg}_{joint}" for leg in CORNERS for joint in ("hip", "ankle")],
+    "humanoid": TRUNK + [f"{side}_{joint}" for limb in (LEG, ARM) for side in ("right", "left") for joint in limb],
     "jackal": ["front_left", "front_right", "rear_left", "rear_right"],
     "quadcopter": ["front_left", "front_right", "rear_left", "rear_right"],
     "quadruped": [f"{leg}_{joint}" for leg in ("FL", "FR", "RL", "RR") for joint in ("abduction", "hip", "knee")],
@@ -62,7 +70,7 @@ def restitution_table() -> dict[str, Any]:
 
 
 def test_path_names_the_robots_for_an_unknown_one() -> None:
-    with pytest.raises(InputError, match=r"'husky'.*jackal, quadcopter, quadruped"):
+    with pytest.raises(InputError, match=r"'husky'.*ant, humanoid, jackal, quadcopter, quadruped"):
         assets.path("husky")
     assert all(isinstance(assets.path(name), Path) and assets.path(name).is_file() for name in assets.ROBOTS)
 
@@ -81,7 +89,8 @@ def test_contract_of_names_and_options(robot: str) -> None:
     model, _ = load(robot)
     assert [model.actuator(i).name for i in range(model.nu)] == ACTUATORS[robot]
     assert int(model.jnt_type[model.joint("root").id]) == int(mujoco.mjtJoint.mjJNT_FREE)
-    assert model.body(model.jnt_bodyid[model.joint("root").id]).name == "base"
+    assert model.body(model.jnt_bodyid[model.joint("root").id]).name == ROOT[robot]
+    assert model.nbody - 1 == BODIES[robot]
     assert int(model.geom("ground").type[0]) == int(mujoco.mjtGeom.mjGEOM_PLANE)
     assert model.opt.timestep == 0.005
     assert int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -109,7 +118,7 @@ def test_inertias_are_complete_and_valid(robot: str) -> None:
 def test_inertia_is_mirror_symmetric(robot: str) -> None:
     """Left and right halves weigh the same: the centre of mass lies on the middle plane, for the base frame's y."""
     model, data = load(robot)
-    assert data.subtree_com[model.body("base").id][1] == pytest.approx(0.0, abs=1e-6)
+    assert data.subtree_com[model.body(ROOT[robot]).id][1] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_home_is_an_equilibrium(robot: str) -> None:

@@ -1,0 +1,158 @@
+"""`Runner`: what Ant and Humanoid have in common, legged robots with a motor in each joint that run towards a target.
+
+The target is a point `RING` metres from the middle of the map. A robot that comes within `REACHED` of it is given the next,
+`ONWARD` further round the ring, so that even a fast one stays on its map for a whole episode.
+"""
+
+from typing import ClassVar, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
+from nfc_gym.envs.rotations import Axes, axes, to_robot, yaw
+from nfc_gym.envs.spawn import place, spread, underside
+from nfc_gym.envs.view import View
+
+RING = 9.0  # m; the map ends 12.75 m from its middle
+REACHED = 1.0  # m
+ONWARD = np.pi * (3 - np.sqrt(5))  # rad, the golden angle: 16.8 m from one target to the next, in ever new directions
+MIDDLE = 0.05  # m, half the side of the square that episodes start in: the level middle of a rough map has 1 m of radius
+ASIDE = 0.5  # rad, the most by which the first target lies off the robot's heading
+NEAR_LIMIT = 0.95  # of half a joint's range: from there on a joint counts as near its limit, fully so at the limit itself
+FACING = 0.8  # cosine of 37 degrees: who heads closer to the target than that has the heading reward in full
+
+
+class Weights(NamedTuple):
+    """What the terms of the reward weigh, a control step."""
+
+    progress: float  # per m/s towards the target
+    alive: float  # per step
+    upright: float  # times the cosine between the torso's up axis and the vertical
+    heading: float  # times the cosine between the torso's forward axis and the target, over `FACING`, at most 1
+    action: float  # per unit of squared action, summed over the joints
+    energy: float  # per W of mechanical power, absolute, summed over the joints
+    limits: float  # per joint at its limit
+
+
+class Now(NamedTuple):
+    """The torso with respect to ground and target; all (*B,)."""
+
+    frame: Axes
+    x: Array  # m, world
+    y: Array
+    height: Array  # m above the ground below
+    towards_x: Array  # unit vector to the target, horizontal
+    towards_y: Array
+    yaw: Array  # rad
+    roll: Array  # rad
+    angle: Array  # rad, of the target, from the heading, anticlockwise
+    facing: Array  # cosine between the forward axis and the direction to the target
+
+
+class Runner(Robot):
+    """A robot that runs; subclasses give sizes, weights and what they feel.
+
+    Attributes:
+      weights: of the reward.
+      lowest: m, height of the torso above the ground below at which an episode ends.
+      noise: rad, half the range by which joints start off the pose `home`.
+      feet: in the order of the foot wrenches.
+    """
+
+    tasks = ("run",)
+    terms = Weights._fields
+    weights: ClassVar[Weights]
+    lowest: ClassVar[float]
+    noise: ClassVar[float]
+    feet: ClassVar[tuple[str, ...]]
+
+    def __init__(self, model: mujoco.MjModel, task: str) -> None:
+        super().__init__(model, task)
+        self.gear = model.actuator_gear[:, 0].copy()  # N m at full action
+        self.low, self.high = model.jnt_range[1:].T.copy()
+        self.below = underside(model, self.home)
+        # A joint off by `noise` lowers a foot by no more than this, the leg being shorter than the torso is high or wide.
+        self.gap = 0.01 + self.noise * float(np.abs(self.below).max())
+        first, last = model.sensor(f"{self.feet[0]}_force"), model.sensor(f"{self.feet[-1]}_torque")
+        self.wrenches = slice(int(first.adr[0]), int(last.adr[0]) + 3)
+
+    def begin(self, u: Array, ground: Ground) -> Start:
+        """Near the middle, the first target roughly ahead, joints a little off their pose, feet just above the ground."""
+        x, y, bearing, aside = u.T[:4]
+        bearing = 2 * np.pi * bearing
+        x, y = spread(x, -MIDDLE, MIDDLE), spread(y, -MIDDLE, MIDDLE)
+        qpos = place(self.home, self.below, x, y, bearing + spread(aside, -ASIDE, ASIDE), ground, self.gap)
+        qpos[..., 7:] = np.clip(qpos[..., 7:] + spread(u[..., 4:], -self.noise, self.noise), self.low, self.high)
+        target = RING * np.array((np.cos(bearing), np.sin(bearing))).T
+        return Start(qpos, {"target": target, "action": np.zeros((*u.shape[:-1], self.action_size))})
+
+    def actuate(self, action: Array, view: View) -> Array:
+        """Torque over the motor's largest."""
+        return action
+
+    def advance(self, view: View, action: Array) -> dict[str, NDArray]:
+        """The last action; the next target for whoever has reached the present one."""
+        (x, y), (tx, ty) = view.qpos.T[:2], view.task["target"].T
+        reached = (tx - x) ** 2 + (ty - y) ** 2 < REACHED**2
+        cos, sin = np.cos(ONWARD), np.sin(ONWARD)
+        target = np.where(reached, (cos * tx - sin * ty, sin * tx + cos * ty), (tx, ty)).T
+        return {"target": target, "action": action}
+
+    def derive(self, view: View) -> Now:
+        """Torso with respect to ground and target."""
+        q = view.qpos.T
+        frame = axes(q[3:7].T)
+        x, y, z = q[:3] + 0.0  # copies: the state is live
+        tx, ty = view.task["target"].T
+        dx, dy = tx - x, ty - y
+        scale = 1 / np.maximum(np.sqrt(dx * dx + dy * dy), 1e-6)
+        ux, uy = dx * scale, dy * scale
+        heading = yaw(q[3:7].T)
+        cos, sin = np.cos(heading), np.sin(heading)
+        return Now(
+            frame,
+            x,
+            y,
+            z - view.ground(view.qpos[..., :2]),
+            ux,
+            uy,
+            heading,
+            np.arctan2(frame.zy, frame.zz),
+            np.arctan2(cos * uy - sin * ux, cos * ux + sin * uy),
+            frame.xx * ux + frame.yx * uy,
+        )
+
+    def reward(self, view: View, action: Array) -> dict[str, Array]:
+        """See `Weights`; progress is measured over the control step, along the direction to the target at its start."""
+        w, now, was = self.weights, view.now, view.before
+        moved = (now.x - was.x) * was.towards_x + (now.y - was.y) * was.towards_y
+        power = np.abs(self.gear * view.ctrl * view.qvel[..., 6:]).sum(-1)
+        reach = np.abs(2 * view.qpos[..., 7:] - (self.low + self.high)) / (self.high - self.low)
+        near = np.clip((reach - NEAR_LIMIT) / (1 - NEAR_LIMIT), 0, 1).sum(-1)
+        return {
+            "progress": w.progress / DT * moved,
+            "alive": w.alive * np.ones_like(moved),
+            "upright": w.upright * now.frame.zz,
+            "heading": w.heading * np.minimum(now.facing / FACING, 1),
+            "action": -w.action * (action * action).sum(-1),
+            "energy": -w.energy * power,
+            "limits": -w.limits * near,
+        }
+
+    def terminated(self, view: View) -> NDArray[np.bool_]:
+        """The torso is down."""
+        return view.now.height < self.lowest
+
+    def torso(self, view: View) -> NDArray:
+        """The twelve numbers that both robots' proprio begins with, (*B, 12).
+
+        Height above the ground, velocity and rates in the torso's frame, yaw, roll, angle to the target, projection of
+        up on the vertical and of forward on the target's direction.
+        """
+        now, v = view.now, view.qvel.T
+        velocity = to_robot(now.frame, v[:3].T).T
+        return np.array(
+            (now.height, *velocity, *v[3:6], now.yaw, now.roll, now.angle, now.frame.zz, now.facing)
+        ).T
