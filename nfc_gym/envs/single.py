@@ -132,6 +132,11 @@ class RobotEnv(gymnasium.Env):
         return self._psi.copy()
 
     @property
+    def mjcf(self) -> str:
+        """The nominal model with the ground of the running episode, as MJCF that plain MuJoCo loads."""
+        return scene.text(assets.path(self.robot.name), self._terrain if self.rough else None)
+
+    @property
     def heightfield(self) -> Heightfield:
         """The terrain that is simulated; zeros on flat ground."""
         return self._terrain
@@ -152,7 +157,8 @@ class RobotEnv(gymnasium.Env):
           seed: of the environment's own generator, from which start, goal and terrain are drawn.
           options: `psi` and `psi_belief`: (d,) in physical units or a dict of names, the rest nominal (what the agent
             believes is by default the truth). On rough ground `heightfield`: (256, 256) m, or `terrain_id`: a map of
-            the pool; `perceived`: (256, 256) m, what `elevation` shows, by default the simulated terrain.
+            the pool; `perceived`: (256, 256) m, what `elevation` shows, by default that terrain; `terrain_residual`:
+            (256, 256) m, added to the simulated terrain alone.
 
         Raises:
           InputError: an unknown option or name, another shape, values that are not finite or physically impossible.
@@ -241,6 +247,8 @@ class RobotEnv(gymnasium.Env):
         else:
             self._terrain = self._pool.map(given.get("terrain_id", self._pool.draw(u)))
         self._perceived = scene.checked(given["perceived"], "perceived") if "perceived" in given else self._terrain
+        if "terrain_residual" in given:
+            self._terrain = scene.risen(self._terrain, given["terrain_residual"])
         scene.write(self.model, 0, self._terrain.heights)
 
     def _advance(self) -> None:

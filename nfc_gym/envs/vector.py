@@ -62,6 +62,7 @@ class RobotVectorEnv(VectorEnv):
       fields: `ModelFields` of the batch; what is written through it goes back to nominal at every reset.
       psi_space: names, units, bounds and nominal values of psi.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
+      after_hooks: called with this environment after the last physics step, before anything is observed.
       reset_hooks: called with the ids (k,) about to be reset, autoresets included; a returned dict of reset options,
         leading shape (k,), holds for those unless `reset` itself was given that option.
     """
@@ -98,6 +99,7 @@ class RobotVectorEnv(VectorEnv):
         self.render_mode, self.camera, self._size = render_mode, camera, (width, height)
         self._pictures: Pictures | None = None
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
+        self.after_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
         self._kind, self._nthread = kind, nthread
         self._task = task, goal_conditioned, reward_type
@@ -193,7 +195,7 @@ class RobotVectorEnv(VectorEnv):
         """
         n = self.num_envs
         given = checked_options(options, self.rough, ("reset_mask",))
-        for key in ("heightfield", "perceived"):
+        for key in ("heightfield", "perceived", "terrain_residual"):
             if key in given:
                 raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
         mask = given.pop("reset_mask", None)
@@ -348,6 +350,8 @@ class RobotVectorEnv(VectorEnv):
                 for hook in self.substep_hooks:
                     hook(self)
                 self.batch.step(active)
+            for hook in self.after_hooks:
+                hook(self)
         except SimulationError as error:  # the solver ran out of memory in some
             self._view.qvel[error.ids] = np.nan
 
