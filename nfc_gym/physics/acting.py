@@ -34,8 +34,8 @@ class Engine(Protocol):
         """A live field of `MjData`."""
         ...
 
-    def forward(self) -> None:
-        """Recompute the derived fields for the state as it is."""
+    def forward(self, ids: Any = None) -> None:
+        """Recompute the derived fields for the state as it is, of all simulations or of some."""
         ...
 
 
@@ -67,13 +67,22 @@ class Acting:
         self.pushing = [i for i, e in enumerate(effects) if overrides(e, "force")]
         self.memories: list[Any] = []
         self.derived: set[str] = set()
-        self.base_friction = np.zeros(0)
-        self.note_friction()
+        self.fresh: NDArray[np.bool_] | None = None
+        self.base_friction = self.fields["dof_frictionloss"].copy() if self.rubbing else np.zeros(0)
 
-    def note_friction(self) -> None:
-        """Take the dry friction that the model has now as what effects add to: after every edit of the model."""
+    def restart(self, rows: NDArray[np.bool_] | None = None) -> None:
+        """Episodes begin, of all simulations or of the `rows` (n,): hidden states are settled by the next command.
+
+        The model's dry friction as it is now becomes what the effects add to.
+        """
+        if rows is None or rows.all():
+            self.memories.clear()
+            self.derived.clear()
+            rows = None
+        self.fresh = rows
         if self.rubbing:
-            self.base_friction = self.fields["dof_frictionloss"].copy()
+            loss = self.fields["dof_frictionloss"]
+            self.base_friction = loss.copy() if rows is None else np.where(rows[:, None], loss, self.base_friction)
 
     def command(self, ctrl: Array, exogenous: Mapping[str, Array]) -> Array:
         """The command (..., nu) of a step after the effects on it; the first one settles their hidden states."""
@@ -81,14 +90,20 @@ class Acting:
             effect, theta = self.effects[i], self.thetas[i]
             if len(self.memories) == slot:
                 self.memories.append(effect.state0(ctrl.shape[:-1], ctrl, theta, self.dt))
+            elif self.fresh is not None:
+                settled = effect.state0(ctrl.shape[:-1], ctrl, theta, self.dt)
+                self.memories[slot] = _merged(settled, self.memories[slot], self.fresh)
             ctrl, self.memories[slot] = effect.action(ctrl, theta, self.memories[slot], exogenous, self.dt)
         return ctrl
 
     def push(self, ctrl: Array, exogenous: Mapping[str, Array]) -> None:
         """Write the dry friction of the coming step and add its forces to what is applied already."""
+        fresh, self.fresh = self.fresh, None
         if not (self.rubbing or self.pushing):
             return
         engine = self.engine
+        if fresh is not None and self.derived:
+            engine.forward(np.flatnonzero(fresh))
         ctx = Context(self.model, self.dt, engine.qpos, engine.qvel, ctrl, exogenous, self._derived, self._nominal)
         if self.rubbing:
             loss = self.fields["dof_frictionloss"]
@@ -117,3 +132,12 @@ class Acting:
         if name == "dof_frictionloss" and self.rubbing:
             return self.base_friction
         return self.fields[name]
+
+
+def _merged(new: Any, old: Any, rows: NDArray[np.bool_]) -> Any:
+    """Hidden states with `rows` (n,) taken from `new` and the others from `old`."""
+    if isinstance(old, tuple | list):
+        return type(old)(_merged(a, b, rows) for a, b in zip(new, old, strict=True))
+    if old is None:
+        return None
+    return np.where(rows.reshape(-1, *(1,) * (np.ndim(old) - 1)), new, old)

@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
@@ -19,9 +20,10 @@ from nfc_gym.physics.acting import Acting
 from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.wrappers.base import EnvWrapper
+from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
+from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.effects_file import check_model, read_effects
-from nfc_gym.wrappers.simulation import simulation_of
+from nfc_gym.wrappers.simulation import Simulation, simulation_of
 
 Array = NDArray[np.float64]
 Given = Sequence[tuple[Effect, Array] | Mapping[str, Any]] | str | os.PathLike[str]
@@ -60,6 +62,69 @@ def check_signals(effects: Sequence[Effect], exogenous: Mapping[str, Signal]) ->
                 raise InputError(f"ApplyEffects: {effect.id} reads {name!r}: give it in `exogenous`; given: {given}")
 
 
+class Application:
+    """Effects wired into a simulation, one or a batch.
+
+    Args:
+      sim: the simulation.
+      given: as `ApplyEffects` takes them.
+      exogenous: as `ApplyEffects` takes them.
+    """
+
+    def __init__(self, sim: Simulation, given: Given, exogenous: Mapping[str, Signal] | None) -> None:
+        self.sim, self.exogenous = sim, dict(exogenous or {})
+        self.effects, values = bound(given, sim.nominal)
+        self.thetas = [np.broadcast_to(t, (*sim.shape, len(t))) for t in values]
+        check_signals(self.effects, self.exogenous)
+        self.reads = any(e.signals for e in self.effects)
+        dt = float(sim.nominal.opt.timestep)
+        self.acting = Acting(sim.nominal, self.effects, self.thetas, sim.fields, sim, dt)
+        if any(overrides(e, "model") for e in self.effects):
+            sim.edits.append((1, self._edit))
+        if self.acting.commanding or self.acting.rubbing or self.acting.pushing:
+            sim.attach("ApplyEffects")
+            sim.on_control.append(self._begin)
+            sim.on_substep.append(self._act)
+        sim.senses += [
+            lambda channel, series, step, e=e, t=t: e.sense(channel, series, t, step)
+            for e, t in zip(self.effects, values, strict=True)
+            if overrides(e, "sense")
+        ]
+
+    def _edit(self, fields: ModelFields) -> None:
+        for effect, theta in zip(self.effects, self.thetas, strict=True):
+            # Values are the same in every simulation, so any that many as `fields` holds will do.
+            effect.model(fields, theta if not fields.batched else theta[: _rows_of(fields)])
+
+    def _begin(self) -> None:
+        """Before a control step: forget the hidden states of episodes that begin."""
+        started = self.sim.started
+        if started is True:
+            self.acting.restart()
+        elif started is not False and started.any():
+            self.acting.fields = self.sim.fields
+            self.acting.restart(started)
+
+    def _act(self) -> None:
+        """One physics step's command, friction and forces."""
+        sim = self.sim
+        signals = self._signals() if self.reads else {}
+        if self.acting.commanding:
+            sim.ctrl[...] = self.acting.command(sim.commanded, signals)
+        if self.acting.pushing:
+            sim.restore_forces()
+        self.acting.push(sim.ctrl, signals)
+
+    def _signals(self) -> dict[str, Any]:
+        time = np.asarray(self.sim.bind("time"), float)
+        given = {n: np.asarray(s(time) if callable(s) else s, float) for n, s in self.exogenous.items()}
+        return {"exo:time": time, **{n: np.broadcast_to(v, self.sim.shape) for n, v in given.items()}}
+
+
+def _rows_of(fields: ModelFields) -> int:
+    return len(fields["body_mass"])
+
+
 class ApplyEffects(EnvWrapper):
     """Effects at work in an environment.
 
@@ -79,13 +144,18 @@ class ApplyEffects(EnvWrapper):
 
     def __init__(self, env: gym.Env, effects: Given, exogenous: Mapping[str, Signal] | None = None) -> None:
         super().__init__(env, effects=effects, exogenous=exogenous)
-        sim = simulation_of(env, "ApplyEffects")
-        self.effects, self.thetas = bound(effects, sim.nominal)
-        self.exogenous = dict(exogenous or {})
-        self.reads = any(e.signals for e in self.effects)
-        check_signals(self.effects, self.exogenous)
-        self.sim = sim
-        self._wire()
+        self.sim = simulation_of(env, "ApplyEffects")
+        self.application = Application(self.sim, effects, exogenous)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects at work, bound to the environment's model."""
+        return tuple(self.application.effects)
+
+    @property
+    def thetas(self) -> tuple[Array, ...]:
+        """Their parameter values, (k,) each."""
+        return tuple(self.application.thetas)
 
     @classmethod
     def from_file(
@@ -115,26 +185,6 @@ class ApplyEffects(EnvWrapper):
         """See `EnvWrapper`."""
         return recorded(value) if name == "effects" else super().recorded(name, value)
 
-    def _wire(self) -> None:
-        sim, model = self.sim, self.sim.nominal
-        dt = float(model.opt.timestep)
-        self.acting = Acting(model, self.effects, self.thetas, sim.fields, sim, dt)
-        if any(overrides(e, "model") for e in self.effects):
-            sim.edits.append((1, self._edit))
-        if self.acting.commanding or self.acting.rubbing or self.acting.pushing:
-            sim.attach("ApplyEffects")
-            sim.on_control.append(self._begin)
-            sim.on_substep.append(self._act)
-        sim.senses += [
-            lambda channel, values, step, e=e, t=t: e.sense(channel, values, t, step)
-            for e, t in zip(self.effects, self.thetas, strict=True)
-            if overrides(e, "sense")
-        ]
-
-    def _edit(self, fields: ModelFields) -> None:
-        for effect, theta in zip(self.effects, self.thetas, strict=True):
-            effect.model(fields, theta)
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Edit the model from nominal, forget hidden states, reset."""
         self.sim.edit()
@@ -143,24 +193,30 @@ class ApplyEffects(EnvWrapper):
         self.sim.edit_after()
         return result
 
-    def _begin(self) -> None:
-        """Before a control step: forget hidden states where it is an episode's first."""
-        if self.sim.started:
-            self.acting.memories.clear()
-            self.acting.derived.clear()
-            self.acting.note_friction()
 
-    def _act(self) -> None:
-        """One physics step's command, friction and forces."""
-        sim = self.sim
-        signals = self._exogenous() if self.reads else {}
-        if self.acting.commanding:
-            sim.ctrl[...] = self.acting.command(sim.commanded, signals)
-        if self.acting.pushing:
-            sim.restore_forces()
-        self.acting.push(sim.ctrl, signals)
+class VectorApplyEffects(VectorEnvWrapper):
+    """The same around a vector environment on `mujoco.batch`: each simulation has hidden states of its own.
 
-    def _exogenous(self) -> dict[str, Any]:
-        time = float(self.sim.data.time)
-        given = {n: np.asarray(s(time) if callable(s) else s, float) for n, s in self.exogenous.items()}
-        return {"exo:time": np.asarray(time), **given}
+    Signals that are functions are given the episodes' times (n,).
+    """
+
+    def __init__(self, env: VectorEnv, effects: Given, exogenous: Mapping[str, Signal] | None = None) -> None:
+        super().__init__(env, effects=effects, exogenous=exogenous)
+        self.sim = batch_simulation_of(env, "ApplyEffects")
+        self.application = Application(self.sim, effects, exogenous)
+
+    def recorded(self, name: str, value: Any) -> Any:
+        """See `EnvWrapper`."""
+        return recorded(value) if name == "effects" else super().recorded(name, value)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset, and edit the models of the rows that were."""
+        result = self.env.reset(seed=seed, options=options)
+        self.sim.edit_after()
+        return result
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step, and edit the models of the rows that were reset meanwhile."""
+        result = self.env.step(actions)
+        self.sim.edit_after()
+        return result

@@ -9,7 +9,7 @@ is stepped here in place of its own `_step_mujoco_simulation`, and gymnasium-rob
 """
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.wrappers.stepping import Stepped, stepper_of
 
 Array = NDArray[np.float64]
 Hook = Callable[[], None]
-_ATTRIBUTE = "_nfc_simulation"
+ATTRIBUTE = "_nfc_simulation"  # of an unwrapped environment
 
 
 def _nothing() -> None:
@@ -33,6 +34,7 @@ class Simulation:
 
     Attributes:
       env: the unwrapped environment.
+      fields, nominal: model fields that edits go through, and the model that they start from.
       shape: leading batch shape, () or (n,).
       commanded: (..., nu) what the environment sent to the actuators in this control step, before any effect.
       started: which simulations are in the first control step of an episode: a bool, or (n,) bool.
@@ -42,6 +44,9 @@ class Simulation:
     """
 
     shape: tuple[int, ...] = ()
+    fields: ModelFields
+    nominal: mujoco.MjModel
+    started: bool | NDArray[np.bool_]
     qpos: Array
     qvel: Array
     ctrl: Array
@@ -56,6 +61,7 @@ class Simulation:
         self.edits: list[tuple[int, Callable[[ModelFields], None]]] = []
         self.senses: list[Callable[[str, Array, float], Array]] = []
         self.commanded = np.zeros(0)
+        self.attached = False
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
         return _nothing, ()
@@ -69,8 +75,16 @@ class Simulation:
         """A live field of `MjData`, (..., *shape)."""
         raise NotImplementedError
 
-    def forward(self) -> None:
+    def forward(self, ids: Any = None) -> None:
         """Recompute the derived fields for the state as it is."""
+        raise NotImplementedError
+
+    def attach(self, who: str, after: bool = False) -> None:
+        """Make sure that the hooks are called."""
+        raise NotImplementedError
+
+    def restore_forces(self) -> None:
+        """Applied forces as they were after the last `on_control`: what a substep's own forces are added to."""
         raise NotImplementedError
 
     def duration(self) -> float:
@@ -103,8 +117,8 @@ class SingleSimulation(Simulation):
         self.own_fields = isinstance(own, ModelFields)
         self.fields = own if isinstance(own, ModelFields) else ModelFields(env.model, copy.copy(env.model))
         self.nominal = self.fields.nominal_model
-        self._steps: tuple[Any, str] | None = _stepper(env)
-        self._attached = self._inside = False
+        self._steps: tuple[Any, str] | None = stepper_of(env)
+        self._inside = False
         self._calls = 0
         self._time = np.inf
         self.started = True
@@ -128,7 +142,7 @@ class SingleSimulation(Simulation):
         """See `Simulation`."""
         return getattr(self.data, name)
 
-    def forward(self) -> None:
+    def forward(self, ids: Any = None) -> None:
         """See `Simulation`."""
         mujoco.mj_forward(self.env.model, self.data)
 
@@ -170,15 +184,15 @@ class SingleSimulation(Simulation):
                 "`after_hooks`, lists of callables that it calls with itself before every mj_step and after the last "
                 "one of a control step, or to be stepped by gymnasium's MujocoEnv"
             )
-        if self._attached:
+        if self.attached:
             return
         if how == "substep_hooks":
             owner.substep_hooks.append(self._called)
             if hasattr(owner, "after_hooks"):
                 owner.after_hooks.append(lambda _: self._end())
         else:
-            setattr(owner, how, _Patched(owner, how, self))
-        self._attached = True
+            setattr(owner, how, Stepped(owner, how, self))
+        self.attached = True
 
     def begin_episode(self) -> None:
         """The next control step is the first of an episode."""
@@ -204,7 +218,7 @@ class SingleSimulation(Simulation):
         self._held[1][:] = self.xfrc_applied
 
     def restore_forces(self) -> None:
-        """Applied forces as they were after the last `on_control`: what a substep's own forces are added to."""
+        """See `Simulation`."""
         self.qfrc_applied[:], self.xfrc_applied[:] = self._held
 
     def _substep(self) -> None:
@@ -256,39 +270,6 @@ class SingleSimulation(Simulation):
         self._end()
 
 
-class _Patched:
-    """Takes the place of a method of one environment, and is pickled as that method."""
-
-    def __init__(self, owner: Any, name: str, simulation: SingleSimulation) -> None:
-        self.owner, self.name, self.simulation = owner, name, simulation
-        self.original = getattr(owner, name)
-        # A subclass may do more in its own version: that is then called once a physics step.
-        self.plain = getattr(type(owner), name).__module__ == "gymnasium.envs.mujoco.mujoco_env"
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return getattr, (self.owner, self.name)
-
-    def __call__(self, *args: Any) -> None:
-        if self.name == "_mujoco_step":
-            self.simulation.run_robot(self.original, args[0], int(self.owner.n_substeps))
-        else:
-            self.simulation.run(self.original, self.plain, *args)
-
-
-def _stepper(env: Any) -> tuple[Any, str] | None:
-    """Who steps the model of an environment, and through what; None where nothing is known to."""
-    if hasattr(env, "substep_hooks"):
-        return env, "substep_hooks"
-    held: Iterable[Any] = (env, *vars(env).values())
-    for thing in held:
-        if getattr(thing, "data", None) is not env.data:
-            continue
-        for name in ("_step_mujoco_simulation", "_mujoco_step"):
-            if callable(getattr(thing, name, None)):
-                return thing, name
-    return None
-
-
 def simulation_of(env: Any, who: str) -> SingleSimulation:
     """The simulation beneath an environment, the same one for all its wrappers.
 
@@ -296,7 +277,7 @@ def simulation_of(env: Any, who: str) -> SingleSimulation:
       InputError: the environment has no MuJoCo model and data.
     """
     base = env.unwrapped
-    known = vars(base).get(_ATTRIBUTE)
+    known = vars(base).get(ATTRIBUTE)
     if isinstance(known, SingleSimulation):
         return known
     model, data = getattr(base, "model", None), getattr(base, "data", None)
@@ -306,5 +287,5 @@ def simulation_of(env: Any, who: str) -> SingleSimulation:
             "`unwrapped.data` (mujoco.MjData)"
         )
     made = SingleSimulation(base)
-    setattr(base, _ATTRIBUTE, made)
+    setattr(base, ATTRIBUTE, made)
     return made
