@@ -12,12 +12,14 @@ from typing import Any, Literal, get_args
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.residual import Components
 from nfc_gym.physics.state import Inertia, Tangent
-from nfc_gym.wrappers.base import EnvWrapper
+from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
+from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.simulation import Simulation, simulation_of
 from nfc_gym.wrappers.source import Draws, Source
 
@@ -39,6 +41,7 @@ class Injection:
         self.bias = self.delta = np.zeros((*sim.shape, components.size))
         self.rng: np.random.Generator = np.random.default_rng(0)
         self.duration = sim.duration()
+        sim.bind("M")
         self.inertia, self.tangent = Inertia(sim.model), Tangent(sim.model)
         sim.on_control.append(self.begin)
         if mode == "state":
@@ -104,7 +107,21 @@ def box_key(space: gym.Space, key: str | None, size: int) -> str | None:
     return None
 
 
-class ResidualDynamics(EnvWrapper):
+class _Observing:
+    """What the wrapper and its twin share."""
+
+    injection: Injection
+    key: str | None
+
+    def _observed(self, observation: Any) -> Any:
+        if not self.injection.components.observed.size:
+            return observation
+        if self.key is None:
+            return self.injection.observe(observation)
+        return {**observation, self.key: self.injection.observe(observation[self.key])}
+
+
+class ResidualDynamics(_Observing, EnvWrapper):
     """Puts residual dynamics into the physics of any MuJoCo environment.
 
     Args:
@@ -156,12 +173,48 @@ class ResidualDynamics(EnvWrapper):
         observation, *rest = self.env.step(action)
         return self._observed(observation), *rest
 
-    def _observed(self, observation: Any) -> Any:
-        if not self.injection.components.observed.size:
-            return observation
-        if self.key is None:
-            return self.injection.observe(observation)
-        return {**observation, self.key: self.injection.observe(observation[self.key])}
+
+class VectorResidualDynamics(_Observing, VectorEnvWrapper):
+    """The same around a vector environment on `mujoco.batch`: a bias of its own for each episode of each simulation."""
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        source: Source,
+        mode: Mode = "force",
+        covariance: ArrayLike | None = None,
+        components: Sequence[str] | None = None,
+        key: str | None = None,
+    ) -> None:
+        super().__init__(env, source=source, mode=mode, covariance=covariance, components=components, key=key)
+        sim = batch_simulation_of(env, "ResidualDynamics")
+        self.draws, bound, root = prepare(env, sim, source, mode, covariance, components)
+        self.key = box_key(env.single_observation_space, key, bound.size) if bound.observed.size else None
+        sim.attach("ResidualDynamics", after=mode == "state")
+        self.injection = Injection(sim, bound, mode, root)
+        sim.on_reset.append(self._draw)
+
+    @property
+    def delta_s(self) -> Array:
+        """(n, s) biases of the running episodes."""
+        return self.injection.bias.copy()
+
+    def _draw(self, ids: NDArray[np.intp]) -> None:
+        bias = self.injection.bias.copy()
+        bias[ids] = self.draws.draw(len(ids), self.stream(None))
+        self.injection.bias = bias
+        self.injection.delta = np.where(np.isin(np.arange(len(bias)), ids)[:, None], bias, self.injection.delta)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset; biases are drawn for the rows that are."""
+        self.injection.rng = self.stream(seed)
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._observed(observation), info
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step, and perturb what is observed."""
+        observation, *rest = self.env.step(actions)
+        return self._observed(observation), *rest
 
 
 def prepare(

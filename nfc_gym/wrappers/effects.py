@@ -94,7 +94,7 @@ class Application:
     def _edit(self, fields: ModelFields) -> None:
         for effect, theta in zip(self.effects, self.thetas, strict=True):
             # Values are the same in every simulation, so any that many as `fields` holds will do.
-            effect.model(fields, theta if not fields.batched else theta[: _rows_of(fields)])
+            effect.model(fields, theta[: fields.count] if fields.batched else theta)
 
     def _begin(self) -> None:
         """Before a control step: forget the hidden states of episodes that begin."""
@@ -119,10 +119,6 @@ class Application:
         time = np.asarray(self.sim.bind("time"), float)
         given = {n: np.asarray(s(time) if callable(s) else s, float) for n, s in self.exogenous.items()}
         return {"exo:time": time, **{n: np.broadcast_to(v, self.sim.shape) for n, v in given.items()}}
-
-
-def _rows_of(fields: ModelFields) -> int:
-    return len(fields["body_mass"])
 
 
 class ApplyEffects(EnvWrapper):

@@ -6,12 +6,14 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
-from nfc_gym.wrappers.base import EnvWrapper
+from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
+from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.simulation import SingleSimulation, simulation_of
 from nfc_gym.wrappers.source import Draws, Source
 
@@ -125,6 +127,18 @@ class Psi:
         self.sim.edit()
         return options or None
 
+    def write(self, value: Array) -> None:
+        """Psi of an episode that has begun but not moved yet; derived quantities follow."""
+        self.value = value
+        if self.own:
+            self.sim.fields.restore()
+            self.space.write(self.sim.fields, value)
+            self.sim.edit_after()
+            self.sim.fields.commit()
+        else:
+            self.sim.edit()
+        self.sim.forward()
+
 
 class RandomizePsi(EnvWrapper):
     """Draws psi at each reset.
@@ -159,4 +173,28 @@ class RandomizePsi(EnvWrapper):
         return self.env.reset(seed=seed, options=self._psi.options(value, options))
 
 
-__all__ = ["Prior", "Psi", "RandomizePsi", "space_of"]
+class VectorRandomizePsi(VectorEnvWrapper):
+    """The same around a vector environment on `mujoco.batch`: psi of its own for each episode of each simulation.
+
+    `reset(options={"psi": ...})` overrides the draws of the rows that it resets.
+    """
+
+    def __init__(self, env: VectorEnv, distribution: Distribution = 1.0) -> None:
+        super().__init__(env, distribution=distribution)
+        self.sim = batch_simulation_of(env, "RandomizePsi")
+        self.psi_space = space_of(env, self.sim.nominal, None, ())
+        self.prior = Prior(self.psi_space, distribution)
+        self.sim.on_reset.append(self._draw)
+
+    def _draw(self, ids: NDArray[np.intp]) -> dict[str, Any]:
+        return {"psi": self.prior.draw(len(ids), self.stream(None))}
+
+    @property
+    def psi(self) -> Array:
+        """(n, d) psi of the running episodes, physical units."""
+        return self.env.unwrapped.psi
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset; psi is drawn for the rows that are."""
+        self.stream(seed)
+        return self.env.reset(seed=seed, options=options)
