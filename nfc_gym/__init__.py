@@ -4,7 +4,10 @@ Importing this package needs the core dependencies alone: neither torch nor a pl
 """
 
 from nfc_gym.core import Channel, InputError, Log, MissingExtra, NfcError, SimulationUnstable
+from nfc_gym.envs import registry
 
 __version__ = "0.1.0"
+
+registry.register()  # `import nfc_gym` is what makes `gymnasium.make("nfc_gym/...")` know the ids
 
 __all__ = ["Channel", "InputError", "Log", "MissingExtra", "NfcError", "SimulationUnstable", "__version__"]

@@ -4,12 +4,13 @@ import importlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.envs.robot import DT, FASTEST, Array, Robot
+from nfc_gym.envs.robot import FASTEST, Array, Robot
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.terrain import SHAPE, Heightfield
@@ -17,7 +18,6 @@ from nfc_gym.terrain.egocentric import SIZE
 
 CONTEXT = ("psi", "elevation")
 OPTIONS = ("psi", "psi_belief", "heightfield", "perceived", "terrain_id", "terrain_residual")
-FPS = round(1 / DT)
 FLAT = Heightfield(np.zeros(SHAPE, np.float32))
 
 
@@ -40,19 +40,19 @@ def checked_context(context: Sequence[str]) -> tuple[str, ...]:
     return tuple(c for c in CONTEXT if c in context)
 
 
-def refresh_period(elevation_hz: float | None) -> int:
+def refresh_period(elevation_hz: float | None, fps: int) -> int:
     """Control steps between two elevation maps."""
     if elevation_hz is None:
         return 1
-    if not 0 < elevation_hz <= FPS or not float(FPS / elevation_hz).is_integer():
-        rates = ", ".join(f"{FPS / k:g}" for k in (1, 2, 5, 10, 25, 50))
-        raise InputError(f"elevation_hz is {elevation_hz!r}, want {FPS} divided by a whole number, such as {rates}")
-    return round(FPS / elevation_hz)
+    if not 0 < elevation_hz <= fps or not float(fps / elevation_hz).is_integer():
+        rates = ", ".join(f"{fps / k:g}" for k in (1, 2, 5, 10, 25, 50))
+        raise InputError(f"elevation_hz is {elevation_hz!r}, want {fps} divided by a whole number, such as {rates}")
+    return round(fps / elevation_hz)
 
 
-def box(*shape: int, bound: float = np.inf) -> spaces.Box:
-    """A float32 `Box` with the same bound everywhere."""
-    return spaces.Box(-bound, bound, shape, np.float32)
+def box(*shape: int, bound: float = np.inf, dtype: type[np.floating] = np.float32) -> spaces.Box:
+    """A `Box` with the same bound everywhere."""
+    return spaces.Box(-bound, bound, shape, dtype)
 
 
 class Observer:
@@ -71,37 +71,38 @@ class Observer:
         self._robot, self._goal_conditioned = robot, goal_conditioned
         self.psi, self.elevation = "psi" in context, "elevation" in context
         self.plain = not context and not goal_conditioned
+        dtype = robot.precision
         parts: dict[str, spaces.Space] = {}
         if goal_conditioned:
-            parts["observation"] = box(robot.proprio_size)
+            parts["observation"] = box(robot.proprio_size, dtype=dtype)
             parts["achieved_goal"] = parts["desired_goal"] = box(robot.place_size)
         else:
-            parts["proprio"] = box(robot.proprio_size)
+            parts["proprio"] = box(robot.proprio_size, dtype=dtype)
             if robot.goal_size:
-                parts["goal"] = box(robot.goal_size)
+                parts["goal"] = box(robot.goal_size, dtype=dtype)
         if self.psi:
             parts["psi"] = box(psi_size, bound=1.0)
         if self.elevation:
             parts["elevation"] = box(SIZE, SIZE)
-        self.space = box(robot.proprio_size + robot.goal_size) if self.plain else spaces.Dict(parts)
+        whole = box(robot.proprio_size + robot.goal_size, dtype=dtype)
+        self.space = whole if self.plain else spaces.Dict(parts)
 
     def __call__(self, view: View, psi: NDArray[np.float32], elevation: NDArray[np.float32] | None) -> Any:
         """Fresh arrays; `psi` is copied, `elevation` handed on."""
-        robot = self._robot
+        robot, dtype = self._robot, self._robot.precision
         if self.plain:
             parts = robot.proprio(view)
-            parts = (*parts, robot.goal(view)) if robot.goal_size else parts
-            return np.concatenate(parts, -1, dtype=np.float32)
+            return np.concatenate((*parts, robot.goal(view)) if robot.goal_size else parts, -1, dtype=dtype)
         if self._goal_conditioned:
             obs = {
-                "observation": np.concatenate(robot.state(view), -1, dtype=np.float32),
+                "observation": np.concatenate(robot.state(view), -1, dtype=dtype),
                 "achieved_goal": robot.achieved(view).astype(np.float32),
                 "desired_goal": robot.desired(view).astype(np.float32),
             }
         else:
-            obs = {"proprio": np.concatenate(robot.proprio(view), -1, dtype=np.float32)}
+            obs = {"proprio": np.concatenate(robot.proprio(view), -1, dtype=dtype)}
             if robot.goal_size:
-                obs["goal"] = robot.goal(view).astype(np.float32)
+                obs["goal"] = robot.goal(view).astype(dtype)
         if self.psi:
             obs["psi"] = psi.copy()
         if elevation is not None:
@@ -111,7 +112,7 @@ class Observer:
 
 def broken(view: View) -> NDArray[np.bool_]:
     """(*B,) whether a simulation has come apart: NaN or an absurd speed."""
-    return ~(np.abs(view.qvel).max(-1) < FASTEST)
+    return ~(np.vecdot(view.qvel, view.qvel) < FASTEST * FASTEST)
 
 
 def outcome(
@@ -197,6 +198,11 @@ def psi_of(space: ParameterSpace, values: Any, shape: tuple[int, ...], name: str
 def seen_psi(space: ParameterSpace, psi: Array) -> NDArray[np.float32]:
     """psi as agents see it: [-1, 1] by the prior's bounds, clipped."""
     return np.clip(space.normalise(psi), -1, 1).astype(np.float32)
+
+
+def rest_key(model: mujoco.MjModel) -> int:
+    """Keyframe that simulations are reset to: `home`, or -1, the model's own state, where it has no keyframes."""
+    return int(model.key("home").id) if model.nkey else -1
 
 
 def wrong_action(action: NDArray, shape: tuple[int, ...]) -> InputError:

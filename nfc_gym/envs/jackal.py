@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, to_robot, turned
+from nfc_gym.envs.rotations import Axes, axes, components, root, to_robot, turned
 from nfc_gym.envs.view import View
 
 # Public dimensions of the machine, as in its MJCF.
@@ -40,7 +40,8 @@ class Now(NamedTuple):
     """Where the rover is with respect to its goal."""
 
     frame: Axes
-    goal: Array  # (*B, 2) m, world
+    x: Array  # (*B,) m, of the goal, world
+    y: Array
     ahead: Array  # (*B,) m, of the goal, along the horizontal heading
     left: Array  # (*B,) m
     distance: Array  # (*B,) m, in the plane
@@ -81,30 +82,32 @@ class Jackal(Robot):
 
     def actuate(self, action: Array, view: View) -> Array:
         """Wheel speeds (rad/s) in the order front left, front right, rear left, rear right."""
-        forward, turn = FULL_SPEED / RADIUS * action.T[0], FULL_TURN * TRACK / 2 / RADIUS * action.T[1]
+        forward, turn = components(action)
+        forward, turn = FULL_SPEED / RADIUS * forward, FULL_TURN * TRACK / 2 / RADIUS * turn
         return np.array((forward - turn, forward + turn, forward - turn, forward + turn)).T
 
     def advance(self, view: View, action: Array) -> dict[str, NDArray]:
         """The last action and how much it changed; the clock of the figure of eight."""
-        change = action - view.task["action"]
-        task = {"action": action, "jerk": (change * change).sum(-1)}
+        (forward, turn), (last_forward, last_turn) = components(action), components(view.task["action"])
+        forward, turn = forward - last_forward, turn - last_turn
+        task = {"action": action, "jerk": forward * forward + turn * turn}
         if self.task == "figure8":
             task["clock"] = view.task["clock"] + DT
         return task
 
     def derive(self, view: View) -> Now:
         """Goal as seen from the rover."""
-        frame = axes(view.qpos.T[3:7].T)
-        x, y = view.qpos.T[:2]
+        frame = axes(view.qpos[..., 3:7])
+        x, y = components(view.qpos[..., :2])
         if self.task == "figure8":
-            gx, gy = figure_eight(view.task["clock"] / LAP, LOOP, *view.task["start"].T)
+            gx, gy = figure_eight(view.task["clock"] / LAP, LOOP, *components(view.task["start"]))
         else:
-            gx, gy = view.task["goal"].T
+            gx, gy = components(view.task["goal"])
         dx, dy = gx - x, gy - y
-        distance = np.sqrt(dx * dx + dy * dy)
+        distance = root(dx * dx + dy * dy)
         cos, sin = frame.xx, frame.yx  # horizontal part of the forward axis, to be scaled to unit length
-        scale = 1 / np.maximum(np.sqrt(cos * cos + sin * sin), 1e-6)
-        return Now(frame, np.array((gx, gy)).T, (cos * dx + sin * dy) * scale, (cos * dy - sin * dx) * scale, distance)
+        scale = 1 / root(cos * cos + sin * sin + 1e-12)  # upright on its nose it has no heading
+        return Now(frame, gx, gy, (cos * dx + sin * dy) * scale, (cos * dy - sin * dx) * scale, distance)
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See the table of weights above."""
@@ -123,13 +126,13 @@ class Jackal(Robot):
 
     def terminated(self, view: View) -> NDArray[np.bool_]:
         """Tipped over, or off the map."""
-        x, y = np.abs(view.qpos.T[:2])
-        return (view.now.frame.zz < TIPPED) | (np.maximum(x, y) > EDGE)
+        x, y = components(view.qpos[..., :2])
+        return (view.now.frame.zz < TIPPED) | (x * x > EDGE * EDGE) | (y * y > EDGE * EDGE)
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Quaternion, velocity and rates in the rover's own frame, position, last action."""
-        q, v = view.qpos.T, view.qvel.T
-        return q[3:7].T, to_robot(view.now.frame, v[:3].T), v[3:6].T, q[:3].T, view.task["action"]
+        q, v = view.qpos, view.qvel
+        return q[..., 3:7], to_robot(view.now.frame, v[..., :3]), v[..., 3:6], q[..., :3], view.task["action"]
 
     def goal(self, view: View) -> NDArray:
         """Goal ahead and to the left (m)."""
@@ -141,8 +144,8 @@ class Jackal(Robot):
 
     def achieved(self, view: View) -> NDArray:
         """World x and y (m)."""
-        return view.qpos.T[:2].T
+        return view.qpos[..., :2]
 
     def desired(self, view: View) -> NDArray:
         """World x and y of the goal (m)."""
-        return view.now.goal
+        return np.array((view.now.x, view.now.y)).T

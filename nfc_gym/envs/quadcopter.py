@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, turned
+from nfc_gym.envs.rotations import Axes, axes, components, root, turned
 from nfc_gym.envs.view import View
 
 REACH = 0.35  # m, from the chassis' centre to a propeller's tip, with room
@@ -88,19 +88,18 @@ class Quadcopter(Robot):
     def derive(self, view: View) -> Now:
         """Goal as seen from the craft."""
         if self.task == "figure8":
-            x, y, z, heading = view.task["place"].T
+            x, y, z, heading = components(view.task["place"])
             goal = np.array((*figure_eight(view.task["clock"] / LAP, LOOP, x, y, heading), z)).T
         else:
             goal = view.task["goal"]
-        q = view.qpos.T
-        offset = goal - q[:3].T
-        dx, dy, dz = offset.T
-        return Now(axes(q[3:7].T), goal, offset, np.sqrt(dx * dx + dy * dy + dz * dz))
+        offset = goal - view.qpos[..., :3]
+        dx, dy, dz = components(offset)
+        return Now(axes(view.qpos[..., 3:7]), goal, offset, root(dx * dx + dy * dy + dz * dz))
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See the table of weights above."""
         distance = view.now.distance
-        rx, ry, rz = view.qvel.T[3:6]
+        rx, ry, rz = components(view.qvel[..., 3:6])
         return {
             "nearness": NEARNESS / (1 + distance * distance),
             "upright": UPRIGHT * view.now.frame.zz,
@@ -112,16 +111,16 @@ class Quadcopter(Robot):
         """Collided, overturned, or too far off the way."""
         now = view.now
         lost = self._off_the_way(view) > STRAY if self.task == "goal" else now.distance > STRAY
-        return (view.sensordata.T[self._touch] > 0) | (now.frame.zz < TILTED) | lost
+        return (view.sensordata[..., self._touch] > 0) | (now.frame.zz < TILTED) | lost
 
     def _off_the_way(self, view: View) -> Array:
         """Distance (*B,) from the straight line between start and goal [m]."""
-        ax, ay, az = (view.now.goal - view.task["start"]).T
-        dx, dy, dz = view.now.offset.T
+        ax, ay, az = components(view.now.goal - view.task["start"])
+        dx, dy, dz = components(view.now.offset)
         share = (ax * dx + ay * dy + az * dz) / (ax * ax + ay * ay + az * az)
         share = np.minimum(np.maximum(share, 0.0), 1.0)  # of the way that is left
         ex, ey, ez = dx - share * ax, dy - share * ay, dz - share * az
-        return np.sqrt(ex * ex + ey * ey + ez * ez)
+        return root(ex * ex + ey * ey + ez * ez)
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Goal offset (world), then `_motion`."""
@@ -129,13 +128,12 @@ class Quadcopter(Robot):
 
     def state(self, view: View) -> tuple[NDArray, ...]:
         """Position (world) in place of the goal offset, then `_motion`."""
-        return view.qpos.T[:3].T, *self._motion(view)
+        return view.qpos[..., :3], *self._motion(view)
 
     @staticmethod
     def _motion(view: View) -> tuple[NDArray, ...]:
         """Quaternion, linear velocity (world), angular velocity (own frame), angles of the rotor mounts."""
-        q, v = view.qpos.T, view.qvel.T
-        return q[3:7].T, v[:6].T, q[7:].T
+        return view.qpos[..., 3:7], view.qvel[..., :6], view.qpos[..., 7:]
 
     def facts(self, view: View) -> dict[str, NDArray]:
         """Distance to the goal (m), and whether that counts as reached."""
@@ -143,7 +141,7 @@ class Quadcopter(Robot):
 
     def achieved(self, view: View) -> NDArray:
         """World position (m)."""
-        return view.qpos.T[:3].T
+        return view.qpos[..., :3]
 
     def desired(self, view: View) -> NDArray:
         """World position of the goal (m)."""

@@ -16,7 +16,9 @@ NOISE = 0.05  # rad by which joints start off their pose
 MIDDLE = 0.3  # m, half the side of the square that episodes start in
 TILTED = np.cos(1.0)  # of the angle to the vertical at which an episode ends
 TOUCHED = 1.0  # N on trunk or thigh that count as touching the ground, or on a foot as standing on it
-EDGE = 11.0  # m from the middle in x or y: from there a command that leads outwards is turned round; maps end at 12.75 m
+EDGE = (
+    11.0  # m from the middle in x or y: from there a command that leads outwards is turned round; maps end at 12.75 m
+)
 
 # The command of an episode: forward and sideways velocity and yaw rate, in the robot's frame.
 FORWARD = (-0.5, 1.0)  # m/s, a fast walk of a robot of 0.29 m hip height

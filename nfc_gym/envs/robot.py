@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from nfc_gym import assets
 from nfc_gym.core.errors import InputError
+from nfc_gym.envs import scene
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 
 Array = NDArray[np.float64]
 Ground = Callable[[NDArray], Array]
 
-TIMESTEP = 0.005  # s, physics 200 Hz
-FRAME_SKIP = 4  # control 50 Hz
-DT = TIMESTEP * FRAME_SKIP  # s
-FASTEST = 1e4  # m/s or rad/s: beyond it (or NaN) a simulation has come apart
+FRAME_SKIP = 4  # physics steps a control step
+DT = scene.TIMESTEP * FRAME_SKIP  # s: control 50 Hz
+FASTEST = 1e4  # root sum of squares of all speeds, m/s and rad/s: beyond it (or NaN) a simulation has come apart
 GOAL_REWARDS = ("sparse", "dense")
 
 
@@ -43,12 +43,14 @@ class Start:
     """How an episode begins.
 
     Attributes:
-      qpos: (*B, nq); velocities are zero, activations and controls those of the keyframe.
+      qpos: (*B, nq); activations and controls are those of the keyframe.
       task: the episode's memory, name -> (*B, ...).
+      qvel: (*B, nv), or a number for all.
     """
 
     qpos: Array
     task: Mapping[str, NDArray] = field(default_factory=dict)
+    qvel: Array | float = 0.0
 
 
 class Robot(ABC):
@@ -72,7 +74,9 @@ class Robot(ABC):
       arrived: distance from a goal that counts as there [m].
       goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward; set by `of`.
       terms: names of the robot's own reward terms of this task, set by the constructor.
-      home: (nq,) position of the keyframe `home`.
+      home: (nq,) position of the keyframe `home`, the model's own where it has none.
+      frame_skip: physics steps a control step.
+      precision: of the observations.
     """
 
     name: ClassVar[str]
@@ -86,13 +90,20 @@ class Robot(ABC):
     draws: ClassVar[int]
     reads: ClassVar[tuple[str, ...]] = ()
     arrived: ClassVar[float] = 0.3
+    frame_skip: ClassVar[int] = FRAME_SKIP
+    precision: ClassVar[type[np.floating]] = np.float32
     terms: tuple[str, ...]
 
     goal_conditioned: str | None = None
 
     def __init__(self, model: mujoco.MjModel, task: str) -> None:
         self.task = task
-        self.home = model.key("home").qpos.copy()
+        self.home = model.key("home").qpos.copy() if model.nkey else model.qpos0.copy()
+
+    @classmethod
+    def compile(cls, maps: int) -> mujoco.MjModel:
+        """The robot in its scene; `maps`: heightfields to choose from, 0 for a plane (`scene.build`)."""
+        return scene.build(assets.path(cls.name), maps)
 
     @classmethod
     def parameters(cls) -> list[Parameter]:

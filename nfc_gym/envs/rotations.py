@@ -4,12 +4,27 @@ Written out in multiplications and additions, without matrix products: those rou
 many, and one robot must give the same bits as a row of a batch.
 """
 
-from typing import NamedTuple
+from math import sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+def components(array: Array) -> Any:
+    """Components (...) of an array (..., k), to be unpacked: floats for one robot, as their arithmetic is fastest.
+
+    Float and array arithmetic round alike, so that one robot and a row of many agree to the bit. Beware that floats
+    raise where arrays give infinity (division by zero), and that `x ** 2` rounds differently for the two: `x * x`.
+    """
+    return array.tolist() if array.ndim == 1 else array.T
+
+
+def root(x: Any) -> Any:
+    """Square root of a float or of arrays: rounded correctly by both libraries, so the same to the bit."""
+    return sqrt(x) if isinstance(x, float) else np.sqrt(x)
 
 
 class Axes(NamedTuple):
@@ -28,7 +43,7 @@ class Axes(NamedTuple):
 
 def axes(quat: Array) -> Axes:
     """Rotation matrix of quaternions (..., 4), by entries (...): `xy` is the world x of the robot's y axis."""
-    w, x, y, z = quat.T
+    w, x, y, z = components(quat)
     xx, yy, zz = x * x, y * y, z * z
     xy, xz, yz = x * y, x * z, y * z
     wx, wy, wz = w * x, w * y, w * z
@@ -47,19 +62,19 @@ def axes(quat: Array) -> Axes:
 
 def to_robot(r: Axes, vector: Array) -> Array:
     """World vectors (..., 3) in the robot's frame, (..., 3)."""
-    x, y, z = vector.T
+    x, y, z = components(vector)
     return np.array((r.xx * x + r.yx * y + r.zx * z, r.xy * x + r.yy * y + r.zy * z, r.xz * x + r.yz * y + r.zz * z)).T
 
 
 def to_world(r: Axes, vector: Array) -> Array:
     """The robot's vectors (..., 3) in the world's frame, (..., 3)."""
-    x, y, z = vector.T
+    x, y, z = components(vector)
     return np.array((r.xx * x + r.xy * y + r.xz * z, r.yx * x + r.yy * y + r.yz * z, r.zx * x + r.zy * y + r.zz * z)).T
 
 
 def yaw(quat: Array) -> Array:
     """Heading (...) of quaternions (..., 4): the angle of the forward axis in the world's plane [rad]."""
-    w, x, y, z = quat.T
+    w, x, y, z = components(quat)
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 

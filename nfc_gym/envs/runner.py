@@ -18,9 +18,13 @@ from nfc_gym.envs.view import View
 RING = 9.0  # m; the map ends 12.75 m from its middle
 REACHED = 1.0  # m
 ONWARD = np.pi * (3 - np.sqrt(5))  # rad, the golden angle: 16.8 m from one target to the next, in ever new directions
-MIDDLE = 0.05  # m, half the side of the square that episodes start in: the level middle of a rough map has 1 m of radius
+MIDDLE = (
+    0.05  # m, half the side of the square that episodes start in: the level middle of a rough map has 1 m of radius
+)
 ASIDE = 0.5  # rad, the most by which the first target lies off the robot's heading
-NEAR_LIMIT = 0.95  # of half a joint's range: from there on a joint counts as near its limit, fully so at the limit itself
+NEAR_LIMIT = (
+    0.95  # of half a joint's range: from there on a joint counts as near its limit, fully so at the limit itself
+)
 FACING = 0.8  # cosine of 37 degrees: who heads closer to the target than that has the heading reward in full
 
 
@@ -153,6 +157,4 @@ class Runner(Robot):
         """
         now, v = view.now, view.qvel.T
         velocity = to_robot(now.frame, v[:3].T).T
-        return np.array(
-            (now.height, *velocity, *v[3:6], now.yaw, now.roll, now.angle, now.frame.zz, now.facing)
-        ).T
+        return np.array((now.height, *velocity, *v[3:6], now.yaw, now.roll, now.angle, now.frame.zz, now.facing)).T

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.envs.robot import TIMESTEP
 from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield
 from nfc_gym.terrain.model import HfieldAsset, asset
 
 GROUND = "ground"
+TIMESTEP = 0.005  # s, physics 200 Hz
 LOWEST, HIGHEST = -5.0, 11.0  # m: what a map may hold; in float32 that still resolves a micrometre
 SOLID = 1.0  # m of ground below LOWEST
 

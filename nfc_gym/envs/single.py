@@ -1,6 +1,7 @@
 """`RobotEnv`: one robot in one simulation, a thin shell around the robot's laws."""
 
 from collections.abc import Callable, Mapping, Sequence
+from math import isfinite
 from typing import Any, ClassVar
 
 import gymnasium
@@ -9,12 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from nfc_gym import assets
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
 from nfc_gym.envs.contract import (
     FLAT,
-    FPS,
     Observer,
     box,
     broken,
@@ -24,18 +23,21 @@ from nfc_gym.envs.contract import (
     outcome,
     psi_of,
     refresh_period,
+    rest_key,
     robot_class,
     seen_psi,
     wrong_action,
 )
 from nfc_gym.envs.render import Camera, Pictures, Window
-from nfc_gym.envs.robot import FRAME_SKIP, TIMESTEP, Robot
+from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.rotations import yaw
 from nfc_gym.envs.terrains import Pool
 from nfc_gym.envs.view import View
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.terrain import Heightfield, elevation, surface
 from nfc_gym.terrain.egocentric import SIZE
+
+_FLAG = (bool, np.bool_)
 
 
 class RobotEnv(gymnasium.Env):
@@ -65,7 +67,7 @@ class RobotEnv(gymnasium.Env):
       camera: as above; may be changed between pictures.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": FPS}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
 
     def __init__(
         self,
@@ -92,12 +94,13 @@ class RobotEnv(gymnasium.Env):
             raise InputError(f"render_mode is {render_mode!r}, want None or one of: {modes}")
         kind = robot_class(robot)
         self.rough = bool(rough)
-        self.model = scene.build(assets.path(kind.name), maps=1 if rough else 0)
+        self.model = kind.compile(maps=1 if rough else 0)
         self.data = mujoco.MjData(self.model)
         self.robot = kind.of(self.model, task, goal_conditioned, reward_type)
         self.psi_space = kind.space(self.model)
         self.fields = ModelFields(self.model)
-        self.frame_skip = FRAME_SKIP
+        self.frame_skip = kind.frame_skip
+        self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         self.substep_hooks: list[Callable[[RobotEnv], None]] = []
         self.after_hooks: list[Callable[[RobotEnv], None]] = []
         self.camera, self.render_mode, self._size = camera, render_mode, (width, height)
@@ -107,24 +110,24 @@ class RobotEnv(gymnasium.Env):
         self._pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
         self._terrain = self._perceived = FLAT
         self._observe = Observer(self.robot, len(self.psi_space), checked_context(context))
-        self._period = refresh_period(elevation_hz)
+        self._period = refresh_period(elevation_hz, self.metadata["render_fps"])
         self._map: NDArray[np.float32] | None = None
         self._age = 0
         self.observation_space = self._observe.space
         self.action_space: spaces.Box = box(kind.action_size, bound=1.0)
 
-        self._home = self.model.key("home").id
+        self._shape = (kind.action_size,)
+        self._home = rest_key(self.model)
         self._psi = self.psi_space.nominal.copy()
         self._seen = seen_psi(self.psi_space, self._psi)
         self._view = View(self.model, lambda name: getattr(self.data, name), kind.reads, self._ground)
-        self._limit = np.ones(kind.action_size)
 
     # ---- what may be read back ------------------------------------------------------------------------------------
 
     @property
     def dt(self) -> float:
         """Control step, s."""
-        return TIMESTEP * self.frame_skip
+        return self.model.opt.timestep * self.frame_skip
 
     @property
     def psi(self) -> NDArray[np.float64]:
@@ -169,9 +172,9 @@ class RobotEnv(gymnasium.Env):
         self._set_psi(given)
         if self.rough:
             self._set_terrain(given, u[0])
-        mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
+        self._still()
         start = self.robot.begin(u[1:], self._ground)
-        self.data.qpos[:] = start.qpos
+        self.data.qpos[:], self.data.qvel[:] = start.qpos, start.qvel
         mujoco.mj_forward(self.model, self.data)
         view = self._view
         view.task = dict(start.task)
@@ -190,10 +193,12 @@ class RobotEnv(gymnasium.Env):
         Raises:
           InputError: another shape, or an entry that is not finite, which the message names.
         """
-        action = np.asarray(action, np.float64)
-        if action.shape != self._limit.shape or not np.isfinite(action.sum()):
-            raise wrong_action(action, self._limit.shape)
-        action = np.minimum(np.maximum(action, -self._limit), self._limit)
+        action = np.array(action, np.float64)
+        values = action.tolist()  # a handful of numbers: looked at faster one by one than by numpy
+        if action.shape != self._shape or not all(map(isfinite, values)):
+            raise wrong_action(action, self._shape)
+        if max(values) > 1 or min(values) < -1:
+            action = np.clip(action, -1, 1)
         view, data = self._view, self.data
         data.ctrl[:] = self.robot.actuate(action, view)
         self._advance()
@@ -267,8 +272,14 @@ class RobotEnv(gymnasium.Env):
 
     def _rest(self) -> None:
         """A simulation that came apart goes back to its keyframe, so that nothing that is returned holds NaN."""
-        mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
+        self._still()
         mujoco.mj_forward(self.model, self.data)
+
+    def _still(self) -> None:
+        if self._home < 0:
+            mujoco.mj_resetData(self.model, self.data)
+        else:
+            mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
 
     def _observation(self) -> Any:
         return self._observe(self._view, self._seen, self._elevation() if self._observe.elevation else None)
@@ -312,8 +323,8 @@ class RobotEnv(gymnasium.Env):
 
 
 def _leaves(info: dict[str, Any]) -> dict[str, NDArray]:
-    """Flags as arrays of shape (), of which Gymnasium's vector environments make arrays of bool rather than objects."""
-    return {key: np.asarray(value) if value.dtype == bool else value for key, value in info.items()}
+    """Numpy leaves: float64 scalars, and flags as arrays of shape (), as Gymnasium's vectors want them."""
+    return {k: np.asarray(v) if isinstance(v, _FLAG) else np.float64(v) for k, v in info.items()}
 
 
 def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotEnv:

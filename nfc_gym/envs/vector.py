@@ -16,11 +16,9 @@ from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
-from nfc_gym import assets
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
 from nfc_gym.envs.contract import (
-    FPS,
     Observer,
     box,
     broken,
@@ -30,12 +28,13 @@ from nfc_gym.envs.contract import (
     outcome,
     psi_of,
     refresh_period,
+    rest_key,
     robot_class,
     seen_psi,
     wrong_action,
 )
 from nfc_gym.envs.render import Camera, Pictures
-from nfc_gym.envs.robot import FRAME_SKIP, TIMESTEP, Robot
+from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.rotations import yaw
 from nfc_gym.envs.terrains import Pool
 from nfc_gym.envs.view import View
@@ -93,9 +92,8 @@ class RobotVectorEnv(VectorEnv):
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode is {render_mode!r}; a vector environment has None and 'rgb_array'")
         kind = robot_class(robot)
-        self.num_envs, self.rough, self.frame_skip = int(num_envs), bool(rough), FRAME_SKIP
-        self.mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": FPS, "autoreset_mode": self.mode}
+        self.num_envs, self.rough, self.frame_skip = int(num_envs), bool(rough), kind.frame_skip
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.render_mode, self.camera, self._size = render_mode, camera, (width, height)
         self._pictures: Pictures | None = None
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
@@ -104,11 +102,13 @@ class RobotVectorEnv(VectorEnv):
         self._kind, self._nthread = kind, nthread
         self._task = task, goal_conditioned, reward_type
         self._horizon = np.iinfo(np.int64).max if max_episode_steps is None else int(max_episode_steps)
-        self._period = refresh_period(elevation_hz)
         context = checked_context(context)
 
         pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
         self._build([pool.map(k) for k in range(pool.size)] if rough else [])
+        fps = round(1 / self.dt)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps, "autoreset_mode": self.autoreset_mode}
+        self._period = refresh_period(elevation_hz, fps)
         self._observe = Observer(self.robot, len(self.psi_space), context)
         self.single_observation_space = self._observe.space
         self.single_action_space = box(kind.action_size, bound=1.0)
@@ -120,7 +120,7 @@ class RobotVectorEnv(VectorEnv):
     def _build(self, maps: Sequence[Heightfield], perceived: Sequence[Heightfield] | None = None) -> None:
         """Compile the scene and start a batch of it; every simulation then waits for its first reset."""
         n = self.num_envs
-        self.model = scene.build(assets.path(self._kind.name), len(maps))
+        self.model = self._kind.compile(len(maps))
         for k, heightfield in enumerate(maps):
             scene.write(self.model, k, heightfield.heights)
         self._maps, self._perceived = list(maps), list(maps if perceived is None else perceived)
@@ -129,8 +129,9 @@ class RobotVectorEnv(VectorEnv):
         self.psi_space = self._kind.space(self.model)
         self.batch = Batch(self.model, n, self._nthread)
         self.fields = ModelFields(self.batch)
-        self._chosen = self.batch.expand("geom_dataid") if maps else None
-        self._ground_id, self._home = self.model.geom(scene.GROUND).id, self.model.key("home").id
+        # Which map a simulation stands on: one entry of `geom_dataid`.
+        self._chosen = self.batch.expand("geom_dataid")[:, self.model.geom(scene.GROUND).id] if maps else None
+        self._home = rest_key(self.model)
         self._view = View(self.model, self.batch.bind, self._kind.reads, self._ground)
         self._psi = np.tile(self.psi_space.nominal, (n, 1))
         self._seen = np.zeros((n, len(self.psi_space)), np.float32)
@@ -138,14 +139,14 @@ class RobotVectorEnv(VectorEnv):
         self._steps = np.zeros(n, np.int64)
         self._waiting = np.ones(n, bool)  # for a reset
         self._fresh = True  # nothing was reset yet
-        self._elevation = np.zeros((n, SIZE, SIZE), np.float32) if self._period > 1 else None
+        self._elevation: NDArray[np.float32] | None = None
 
     # ---- what may be read back ------------------------------------------------------------------------------------
 
     @property
     def dt(self) -> float:
         """Control step, s."""
-        return TIMESTEP * self.frame_skip
+        return self.model.opt.timestep * self.frame_skip
 
     @property
     def psi(self) -> NDArray[np.float64]:
@@ -162,8 +163,20 @@ class RobotVectorEnv(VectorEnv):
         """The maps that `terrain_id` counts; none on flat ground."""
         return tuple(self._maps)
 
+    @property
+    def perceived(self) -> tuple[Heightfield, ...]:
+        """(n) the map that each simulation's `elevation` is taken from."""
+        if not self.rough:
+            return (FLAT,) * self.num_envs
+        return tuple(self._perceived[k] for k in self._terrain)
+
+    @property
+    def mjcf(self) -> str:
+        """The nominal model on the first map, as MJCF that plain MuJoCo loads."""
+        return scene.text(assets.path(self.robot.name), self._maps[0] if self.rough else None)
+
     def set_terrains(self, maps: Sequence[Any], perceived: Sequence[Any] | None = None) -> None:
-        """Other maps for the simulations to choose from; the batch is built anew, and must be reset before it is stepped.
+        """Other maps for the simulations to choose from; the batch is built anew, and must be reset before a step.
 
         Args:
           maps: `Heightfield`s or heights (256, 256) m; with n of them, `reset(options={"terrain_id": range(n)})` gives
@@ -237,7 +250,7 @@ class RobotVectorEnv(VectorEnv):
         if actions.shape != self._limit.shape or not np.isfinite(actions.sum()):
             raise wrong_action(actions, self._limit.shape)
         resetting = self._waiting.copy() if self._waiting.any() else None
-        if resetting is not None and (self._fresh or self.mode is not AutoresetMode.NEXT_STEP):
+        if resetting is not None and (self._fresh or self.autoreset_mode is not AutoresetMode.NEXT_STEP):
             raise gymnasium.error.ResetNeeded(f"environments {np.flatnonzero(resetting).tolist()} must be reset first")
         actions = np.minimum(np.maximum(actions, -self._limit), self._limit)
         view = self._view
@@ -255,7 +268,7 @@ class RobotVectorEnv(VectorEnv):
         done = ended | truncated
         info = _masked(info, np.ones(self.num_envs, bool))
         self._waiting = done.copy()
-        again = self.mode is AutoresetMode.SAME_STEP and done.any()
+        again = self.autoreset_mode is AutoresetMode.SAME_STEP and done.any()
         obs = self._restart(done, info) if again else self._observation()
         return obs, rewards, ended, truncated, info
 
@@ -297,10 +310,10 @@ class RobotVectorEnv(VectorEnv):
         if self._chosen is not None:
             chosen = given.get("terrain_id", (u[:, 0] * len(self._maps)).astype(np.intp))
             self._terrain[ids] = _terrain_ids(chosen, k, len(self._maps))
-            self._chosen[ids, self._ground_id] = self._terrain[ids]
+            self._chosen[ids] = self._terrain[ids]
         self.batch.reset(ids, self._home, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         start = self.robot.begin(u[:, 1:], lambda xy: self._ground(xy, self._terrain[ids]))
-        self._view.qpos[ids] = start.qpos
+        self._view.qpos[ids], self._view.qvel[ids] = start.qpos, start.qvel
         self.batch.forward(ids)
         for name, value in start.task.items():
             old = self._view.task.get(name)
@@ -373,8 +386,10 @@ class RobotVectorEnv(VectorEnv):
 
     def _around(self, rows: NDArray[np.bool_] | None) -> NDArray[np.float32]:
         """Elevation maps, fresh arrays; those that are not due are copies of the last ones."""
-        if self._elevation is None:
+        if self._period == 1:
             return self._look(np.arange(self.num_envs) if rows is None else np.flatnonzero(rows))
+        if self._elevation is None:
+            self._elevation = np.empty((self.num_envs, SIZE, SIZE), np.float32)
         due = self._steps % self._period == 0
         due = np.flatnonzero(due if rows is None else due & rows)
         if len(due):

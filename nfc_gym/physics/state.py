@@ -63,6 +63,12 @@ def rotate_back(q: Array, v: Array) -> Array:
     return rotate(quat_conjugate(q), v)
 
 
+def yaw(q: Array) -> Array:
+    """Heading (...,), rad, of unit quaternions (..., 4): of the body's x axis in the horizontal plane."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
 def _blocks(model: mujoco.MjModel) -> tuple[NDArray[np.intp], NDArray[np.intp], list[tuple[int, int]]]:
     """(coordinates, dofs) that subtract plainly, and (quaternion address, dof address) of the rotations."""
     plain_q: list[int] = []

@@ -54,28 +54,36 @@ def elevation(
     fields = [heightfield] * count if isinstance(heightfield, Heightfield) else list(heightfield)
     if len(fields) != count:
         raise InputError(f"{len(fields)} heightfields for {count} robots; want one for all or one each")
-    maps = out.reshape(count, SIZE, SIZE)
-    matrices = to_grid(fields, base.reshape(-1, 3), heading.reshape(-1))
-    lifts = base.reshape(-1, 3)[:, 2].astype(np.float32)
-
-    for field, matrix, lift, row in zip(fields, matrices, lifts, maps, strict=True):
+    places, turns = base.reshape(-1, 3), heading.reshape(-1)
+    if isinstance(heightfield, Heightfield):  # numbers rather than arrays of equal ones
+        resolution, origin = heightfield.resolution, np.array(heightfield.origin)
+    else:
+        resolution, origin = np.array([[f.resolution] for f in fields]), np.array([f.origin for f in fields])
+    centre = (places[:, :2] - origin.reshape(-1, 2)) / resolution
+    matrices = to_grid(centre, turns, CELL / np.reshape(resolution, -1))
+    rows = zip(fields, matrices, places[:, 2].astype(np.float32), out.reshape(count, SIZE, SIZE), strict=True)
+    for field, matrix, lift, row in rows:
         cv2.warpAffine(field.heights, matrix, (SIZE, SIZE), row, _FLAGS, borderMode=cv2.BORDER_REPLICATE)
         np.subtract(row, lift, out=row)  # while the map is still in the cache
     return out
 
 
-def to_grid(fields: Sequence[Heightfield], xyz: NDArray[np.float64], yaw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 2, 3) affine maps from (j, i) of the elevation map to (column, row) of each robot's heightfield."""
-    resolution = np.array([f.resolution for f in fields])
-    origin = np.array([f.origin for f in fields]).reshape(-1, 2)
-    cos, sin = np.cos(yaw) * CELL / resolution, np.sin(yaw) * CELL / resolution
-    centre = (xyz[:, :2] - origin) / resolution[:, None]
-    middle = (SIZE - 1) / 2
+def to_grid(
+    centre: NDArray[np.float64], yaw: NDArray[np.float64], ratio: float | NDArray[np.float64] = 1.0
+) -> NDArray[np.float64]:
+    """Affine maps from (j, i) of the elevation map to (column, row) of a grid.
+
+    Args:
+      centre: (..., 2) column and row below the base.
+      yaw: (...) headings [rad].
+      ratio: (...) size of the elevation map's cells over that of the grid's.
+
+    Returns:
+      (..., 2, 3).
+    """
+    cos, sin, middle = ratio * np.cos(yaw), ratio * np.sin(yaw), (SIZE - 1) / 2
+    matrix = np.empty((*np.shape(yaw), 2, 3))
     # world = base + forward (cos, sin) + left (-sin, cos), with forward along i and left along j
-    return np.stack(
-        [
-            np.stack([-sin, cos, centre[:, 0] + middle * (sin - cos)], axis=-1),
-            np.stack([cos, sin, centre[:, 1] - middle * (cos + sin)], axis=-1),
-        ],
-        axis=-2,
-    )
+    matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2] = -sin, cos, centre[..., 0] + middle * (sin - cos)
+    matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = cos, sin, centre[..., 1] - middle * (cos + sin)
+    return matrix

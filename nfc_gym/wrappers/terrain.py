@@ -49,7 +49,7 @@ class Ground:
         self.shape = (int(model.hfield_nrow[0]), int(model.hfield_ncol[0]))
         self.own = hasattr(base, "heightfield")
         if not self.own:
-            self.perceived = _read(model)
+            self.perceived = read_ground(model, who)
             self.start = getattr(sim.owner, "init_qpos", np.zeros(0)).copy()
 
     def options(self, residual: Array, options: dict[str, Any] | None) -> dict[str, Any] | None:
@@ -74,17 +74,26 @@ class Ground:
         owner.init_qpos[2] = self.start[2] + max(rise, 0.0)
 
 
-def _read(model: mujoco.MjModel) -> terrain.Heightfield:
-    """The map that a model's only heightfield and its geom make, in the world."""
+def read_ground(model: mujoco.MjModel, who: str) -> terrain.Heightfield:
+    """The map that a model's only heightfield and its geom make in the world, or that of its level plane.
+
+    Raises:
+      InputError: the model has neither, or a heightfield that no map can stand for.
+    """
+    if model.nhfield == 0:
+        planes = np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (model.geom_bodyid == 0))
+        if len(planes) != 1:
+            raise InputError(f"{who}: the model has no heightfield and {len(planes)} planes; want one of either as ground")
+        return terrain.Heightfield(np.full(terrain.SHAPE, model.geom_pos[planes[0], 2], np.float32))
     rows, cols = int(model.hfield_nrow[0]), int(model.hfield_ncol[0])
     geoms = np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)) & (model.geom_dataid == 0))
-    if len(geoms) != 1:
-        raise InputError(f"the model's heightfield belongs to {len(geoms)} geoms; want one")
+    if model.nhfield > 1 or len(geoms) != 1:
+        raise InputError(f"{who}: the model has {model.nhfield} heightfields, {len(geoms)} geoms of the first; want one each")
     x, y, z = model.geom_pos[geoms[0]]
     half_x, half_y, span, _ = model.hfield_size[0]
     resolution = 2 * half_x / (cols - 1)
     if not np.isclose(resolution, 2 * half_y / (rows - 1)):
-        raise InputError("the cells of the model's heightfield are not square, which a residual terrain needs")
+        raise InputError(f"{who}: the cells of the model's heightfield are not square")
     heights = z + span * np.asarray(model.hfield_data[: rows * cols], float).reshape(rows, cols)
     return terrain.Heightfield(heights.astype(np.float32), float(resolution), (float(x - half_x), float(y - half_y)))
 

@@ -1,7 +1,6 @@
 """Meshes in and out: round trips, sampling between points, holes, overhangs, and what is refused."""
 
 import time
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,9 @@ import trimesh
 from nfc_gym.core.errors import InputError
 from nfc_gym.terrain import Heightfield, from_mesh, make, to_mesh
 
-# Files of these formats hold float32: half a unit in the last place of 12.75 m is 5e-7 m, times the steepest slope here.
+pytestmark = pytest.mark.filterwarnings("error")  # a warning that a test does not ask for fails it
+
+# Files of these formats hold float32: half a unit in the last place of 12.75 m is 5e-7 m, times the steepest slope.
 FLOAT32 = 5e-7 * 10
 
 
@@ -28,12 +29,6 @@ def box(extents: tuple[float, float, float], centre: tuple[float, float, float])
     mesh = trimesh.creation.box(extents)
     mesh.apply_translation(centre)
     return mesh
-
-
-@pytest.fixture(autouse=True)
-def _no_silent_warning() -> None:
-    """A warning that a test does not ask for fails it."""
-    warnings.simplefilter("error")
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".glb", ".ply"])
