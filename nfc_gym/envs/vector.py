@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
 from nfc_gym.envs.contract import (
+    FLAT,
     Observer,
     box,
     broken,

@@ -41,6 +41,11 @@ class BatchSimulation(Simulation):
         for name in self._bound:
             batch.bind(name)
 
+    @property
+    def beginning(self) -> NDArray[np.bool_]:
+        """(n,) which simulations wait for the first control step of an episode."""
+        return self.pending
+
     def look_again(self) -> bool:
         """Whether the environment has another batch than before, which is then looked at."""
         if self.env.batch is self.batch:

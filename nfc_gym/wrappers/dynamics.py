@@ -226,13 +226,21 @@ def prepare(
     names: Sequence[str] | None,
 ) -> tuple[Draws, Components, Array]:
     """The draws, the components bound to the model and the noise's root, checked against each other."""
-    if mode not in get_args(Mode):
-        raise InputError(f"ResidualDynamics: no mode {mode!r}; there are: {', '.join(get_args(Mode))}")
+    checked_mode(mode)
     draws = Draws(source, "delta_s", "ResidualDynamics")
     if len(draws.shape) != 1:
         raise InputError(f"ResidualDynamics: a sample of delta_s is a vector, got shape {draws.shape}")
     size = draws.shape[0]
+    return draws, Components(sim.model, component_names(env, names, size), size), noise_root(covariance, size)
+
+
+def checked_mode(mode: str) -> None:
+    """Refuse a mode that is none."""
+    if mode not in get_args(Mode):
+        raise InputError(f"residual dynamics: no mode {mode!r}; there are: {', '.join(get_args(Mode))}")
+
+
+def component_names(env: Any, names: Sequence[str] | None, size: int) -> Sequence[str] | None:
+    """Names of delta_s's entries: those given, else the environment's own where there are as many."""
     own = getattr(env.unwrapped, "proprio_components", None)
-    if names is None and own is not None and len(own) == size:
-        names = own
-    return draws, Components(sim.model, names, size), noise_root(covariance, size)
+    return own if names is None and own is not None and len(own) == size else names

@@ -5,9 +5,11 @@ from typing import Any
 from nfc_gym.core.errors import InputError
 
 # Wrappers that write one and the same thing: at most one of a set around an environment.
+PSI, TERRAIN = "psi is written by", "the simulated terrain is written by"
 _ALONE: dict[str, tuple[str, ...]] = {
-    "psi is written by": ("RandomizePsi", "Hallucinate"),
-    "the simulated terrain is written by": ("ResidualTerrain", "Hallucinate"),
+    PSI: ("RandomizePsi", "Hallucinate"),
+    TERRAIN: ("ResidualTerrain", "Hallucinate"),
+    "the action is widened by": ("Hallucinate",),
     "all effects go to one": ("ApplyEffects",),
     "the map of `elevation` is made by": ("PerceiveTerrain",),
 }

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from nfc_gym import terrain
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.state import yaw
+from nfc_gym.terrain.egocentric import SIZE
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.rows import Rows
@@ -39,8 +40,7 @@ def camera_of(noise: Camera | None) -> terrain.DepthCamera:
 def with_map(space: gym.Space) -> spaces.Dict:
     """An observation space with the key `elevation`, put into a Dict beside `observation` where it is none."""
     parts = dict(space.items()) if isinstance(space, spaces.Dict) else {"observation": space}
-    size = terrain.SIZE
-    return spaces.Dict({**parts, KEY: spaces.Box(-np.inf, np.inf, (size, size), np.float32)})
+    return spaces.Dict({**parts, KEY: spaces.Box(-np.inf, np.inf, (SIZE, SIZE), np.float32)})
 
 
 def base_joint(model: mujoco.MjModel, who: str) -> int:

@@ -78,7 +78,7 @@ def space_of(env: Any, model: mujoco.MjModel, space: Space | None, names: Sequen
             return own
         if not names:
             raise InputError(
-                f"RandomizePsi: {type(env.unwrapped).__name__} has no `psi_space`: give `space`, a ParameterSpace, a list "
+                f"psi: {type(env.unwrapped).__name__} has no `psi_space`: give `space`, a ParameterSpace, a list "
                 f"of parameters or names of bodies whose masses vary: {_bodies(model)}"
             )
         space = list(names)

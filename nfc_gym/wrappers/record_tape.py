@@ -34,4 +34,5 @@ class Tape:
 
     def record(self) -> dict[str, Array]:
         """`time` (T,), and `qpos`, `qvel`, `ctrl`, `sensordata`, (T, ...) each."""
-        return {"time": np.array(self.time), **{k: np.array(v) for k, v in self.rows.items()}}
+        whole = len(self.rows["sensordata"]) or len(self.time)  # a simulation that came apart never made its last reading
+        return {"time": np.array(self.time[:whole]), **{k: np.array(v[:whole]) for k, v in self.rows.items()}}
