@@ -46,13 +46,15 @@ class _Common(RecordConstructorArgs):
         """Whether the wrapper writes what `order` says that only one may; some do so only with certain arguments."""
         return True
 
-    def stream(self, seed: int | None) -> np.random.Generator:
+    def stream(self, seed: Any) -> np.random.Generator:
         """The generator of the coming episode: anew from a seed, else as it goes on from the last episode."""
         if seed is None and self.rng is not None:
             return self.rng
         if seed is None:  # never seeded: what the environment has, which makes itself a seed where it has none
             seed = self.env.unwrapped.np_random_seed
-        entropy = None if seed is None or seed < 0 else [seed, crc32(kind(self).encode()), self._depth]
+        if isinstance(seed, list | tuple):  # one a row: the first that is given counts
+            seed = next((s for s in seed if s is not None), None)
+        entropy = None if seed is None or seed < 0 else [int(seed), crc32(kind(self).encode()), self._depth]
         self.rng = np.random.default_rng(entropy)
         return self.rng
 
@@ -75,9 +77,3 @@ class VectorEnvWrapper(_Common, VectorWrapper):
             raise InputError(f"Vector{kind(self)} wraps a vector environment; around a single one use {kind(self)}")
         self._open(env, arguments)
         VectorWrapper.__init__(self, env)
-
-    def stream(self, seed: Any) -> np.random.Generator:
-        """As for one environment; of a list of seeds, one a row, the first that is given counts."""
-        if isinstance(seed, list | tuple):
-            seed = next((s for s in seed if s is not None), None)
-        return super().stream(seed)

@@ -1,6 +1,6 @@
 """Which channels a log of a model has, how they are read off its state, and the model file that names them all."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.fields import names_of
+from nfc_gym.physics.names import names
 from nfc_gym.physics.state import rotate
 
 Array = NDArray[np.float64]
-_OBJ = mujoco.mjtObj
 _FREE, _SLIDE, _HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{n}")) for n in ("FREE", "SLIDE", "HINGE"))
 _SENSOR_UNITS = {
     "GYRO": "rad/s", "ACCELEROMETER": "m/s^2", "VELOCIMETER": "m/s", "FRAMEPOS": "m", "FRAMELINVEL": "m/s",
@@ -34,34 +33,6 @@ class Column:
     at: int
     size: int = 1
     quat: int = 0
-
-
-@dataclass(frozen=True)
-class Names:
-    """Names of a model's objects; what is unnamed is called after the joint it moves, or by its kind and number."""
-
-    actuators: list[str] = field(default_factory=list)
-    joints: list[str] = field(default_factory=list)
-    bodies: list[str] = field(default_factory=list)
-    sensors: list[str] = field(default_factory=list)
-
-
-def names(model: mujoco.MjModel) -> Names:
-    """Names for everything that a log speaks of, none of them twice."""
-    joints = _filled(names_of(model, _OBJ.mjOBJ_JOINT, model.njnt), "joint")
-    bodies = _filled(names_of(model, _OBJ.mjOBJ_BODY, model.nbody), "body")
-    actuators = names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nu)
-    for i, name in enumerate(actuators):
-        moves = int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_JOINT)
-        joint = joints[int(model.actuator_trnid[i, 0])] if moves else ""
-        actuators[i] = name or (joint if joint not in actuators else "")
-    return Names(
-        _filled(actuators, "actuator"), joints, bodies, _filled(names_of(model, _OBJ.mjOBJ_SENSOR, model.nsensor), "sensor")
-    )
-
-
-def _filled(given: list[str], kind: str) -> list[str]:
-    return [name or f"{kind}_{i}" for i, name in enumerate(given)]
 
 
 def columns(model: mujoco.MjModel) -> list[Column]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError, MissingExtra
 from nfc_gym.core.files import replacing, write_whole
-from nfc_gym.wrappers.record_channels import columns, model_text, names, values
+from nfc_gym.physics.names import names
+from nfc_gym.wrappers.record_channels import columns, model_text, values
 
 Array = NDArray[np.float64]
 _NEEDED = ("pyarrow", "yaml")

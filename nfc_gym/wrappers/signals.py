@@ -74,11 +74,11 @@ class Channel:
 
     fresh: NDArray[np.bool_] | None = None
 
-    def __call__(self, values: Any, rng: np.random.Generator) -> NDArray:
-        """What comes out of a value that goes in."""
+    def __call__(self, values: Any, rng: np.random.Generator, again: NDArray[np.bool_] | None = None) -> NDArray:
+        """What comes out of a value that goes in; of the rows `again` (n,) it is a value that went in before."""
         values = np.asarray(values)
         if self.fault.delay:
-            values = self._late(values)
+            values = self._late(values, again)
         out = values + self.total
         if self.noisy:
             out = out + self.sd * rng.standard_normal(self.shape)
@@ -86,14 +86,15 @@ class Channel:
             out = np.minimum(np.maximum(out, self.low), self.high)
         return out.astype(self.dtype)
 
-    def _late(self, values: NDArray) -> NDArray:
+    def _late(self, values: NDArray, again: NDArray[np.bool_] | None) -> NDArray:
         if self.fresh is not None and self.fresh.any() and self.past:
             mask = _rows(self.fresh, values)
             self.past = deque((np.where(mask, values, old) for old in self.past), maxlen=self.past.maxlen)
         self.fresh = None
         if not self.past:
             self.past.extend([values.copy()] * self.past.maxlen)  # type: ignore[operator]
-        self.past.append(values.copy())
+        if again is None:
+            self.past.append(values.copy())
         return self.past[0]
 
 
@@ -129,11 +130,12 @@ class _Perturbing:
         for channel in self.channels.values():
             channel.begin(first, self.rng)  # type: ignore[arg-type]
 
-    def _see(self, observation: Any) -> Any:
+    def _see(self, observation: Any, again: NDArray[np.bool_] | None = None) -> Any:
+        assert self.rng is not None, "step before reset"
         if not isinstance(observation, dict):
             channel = self.channels.get(OBSERVATION)
-            return observation if channel is None else channel(observation, self.rng)  # type: ignore[arg-type]
-        changed = {k: c(observation[k], self.rng) for k, c in self.channels.items() if k != ACTION}  # type: ignore[arg-type]
+            return observation if channel is None else channel(observation, self.rng, again)
+        changed = {k: c(observation[k], self.rng, again) for k, c in self.channels.items() if k != ACTION}
         return {**observation, **changed}
 
 
@@ -179,7 +181,7 @@ class VectorPerturbSignals(_Perturbing, VectorEnvWrapper):
         new = self.rows.reset(options)
         self._begin(None if new.all() else new)
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._see(observation), info
+        return self._see(observation, None if new.all() else ~new), info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step with perturbed actions; perturbed observations come back."""
