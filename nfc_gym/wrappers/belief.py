@@ -65,10 +65,14 @@ class Belief:
         self.shape = maps.shape[1:]
         flat = maps.reshape(len(maps), -1)
         self.middle = flat.mean(0)
-        left, values, right = np.linalg.svd(flat - self.middle, full_matrices=False)
-        keep = min(modes, max(1, int((values > 1e-12 * max(values[0], 1e-300)).sum())))
-        self.modes = right[:keep]
-        return left[:, :keep] * values[:keep]
+        # The eigenvectors of the samples' Gram matrix, n x n, are the left singular vectors; maps have 65536 cells.
+        spread = flat - self.middle
+        squared, left = np.linalg.eigh(spread @ spread.T)
+        values = np.sqrt(np.maximum(squared[::-1], 0))
+        keep = min(modes, max(1, int((values > 1e-6 * max(values[0], 1e-300)).sum())))
+        scale, left = values[:keep], left[:, ::-1][:, :keep]
+        self.modes = left.T @ spread / np.where(scale > 0, scale, 1)[:, None]
+        return left * scale
 
     def at(self, h: Array, beta: float) -> Fidelity:
         """The fidelity at mean + beta L h, h (..., size) clipped to [-1, 1]."""

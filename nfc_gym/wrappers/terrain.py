@@ -18,6 +18,10 @@ from nfc_gym.wrappers.simulation import SingleSimulation, simulation_of
 from nfc_gym.wrappers.source import Draws, Source
 
 Array = NDArray[np.float64]
+# Model fields that `terrain.write` changes.
+_WRITTEN = (
+    "hfield_data", "hfield_size", "geom_pos", "geom_sameframe", "geom_size", "geom_aabb", "geom_rbound", "bvh_aabb",
+)  # fmt: skip
 _FOOTPRINT = 1.0  # m around a start within which the ground must not rise into a robot
 
 
@@ -51,14 +55,18 @@ class Ground:
         if not self.own:
             self.perceived = read_ground(model, who)
             self.start = getattr(sim.owner, "init_qpos", np.zeros(0)).copy()
+            self._given = {name: getattr(model, name).copy() for name in _WRITTEN}
 
     def options(self, residual: Array, options: dict[str, Any] | None) -> dict[str, Any] | None:
         """Reset options under which the coming episode runs on e + residual (rows, columns)."""
         if self.own:
             return {**(options or {}), "terrain_residual": residual}
+        for name, value in self._given.items():
+            getattr(self.sim.model, name)[...] = value
         heights = (self.perceived.heights + residual).astype(np.float32)
         truth = terrain.Heightfield(heights, self.perceived.resolution, self.perceived.origin)
-        terrain.write(self.sim.model, self.name, truth)
+        if residual.any():  # through metres and back the heights would change in their last bit
+            terrain.write(self.sim.model, self.name, truth)
         self._lift(truth)
         return options
 
