@@ -13,7 +13,7 @@ class Ant(Runner):
     action_size, proprio_size, draws = 8, 52, 4 + 8
     reads = ("sensordata",)
     lowest = 0.26  # m: the torso, of 0.25 m radius, all but touches the ground
-    noise = 0.1  # rad
+    noise = 0.05  # rad
     feet = ("front_left_foot", "front_right_foot", "rear_left_foot", "rear_right_foot")
     weights = Weights(
         progress=1.0,  # the unit of all others: 1 for each m/s

@@ -189,9 +189,9 @@ def psi_of(space: ParameterSpace, values: Any, shape: tuple[int, ...], name: str
         if psi.shape not in ((len(space),), (*shape, len(space))):
             raise InputError(f"{name} has shape {psi.shape}, want {(*shape, len(space))}: {', '.join(space.names)}")
     psi = np.broadcast_to(psi, (*shape, len(space))).astype(float)
-    wrong = ~np.isfinite(psi).reshape(-1, len(space)).all(0)
-    if wrong.any():
-        raise InputError(f"{name}: {space.names[int(np.flatnonzero(wrong)[0])]} is not finite")
+    wrong = np.argwhere(~np.isfinite(psi))
+    if len(wrong):
+        raise InputError(f"{name}: {space.names[wrong[0, -1]]} is not finite")
     return psi
 
 

@@ -21,12 +21,12 @@ class Humanoid(Runner):
         upright=0.1,  # just enough to choose an upright torso between gaits that are as fast
         heading=0.5,  # running sideways must be 0.5 m/s faster to pay
         action=0.01,  # full torque everywhere costs 0.21
-        energy=0.0005,  # 500 W, about what it takes to run, costs 0.25
+        energy=0.0002,  # 1 kW, about what it takes to run, costs 0.2
         limits=0.25,  # both knees stretched to the stop cost 0.5: it is to walk on bent ones
     )
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
-        """Torso 12, joint positions, velocities and torques 21 each (rad, rad/s, N m), feet 12 (N, N m), last action 21."""
+        """Torso 12, joint positions, velocities, torques 21 each (rad, rad/s, N m), feet 12 (N, N m), action 21."""
         return (
             self.torso(view),
             view.qpos[..., 7:],

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.robot import Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, to_robot
+from nfc_gym.envs.rotations import Axes, axes, components, to_robot
 from nfc_gym.envs.spawn import place, spread, underside
 from nfc_gym.envs.view import View
 
@@ -16,6 +16,7 @@ NOISE = 0.05  # rad by which joints start off their pose
 MIDDLE = 0.3  # m, half the side of the square that episodes start in
 TILTED = np.cos(1.0)  # of the angle to the vertical at which an episode ends
 TOUCHED = 1.0  # N on trunk or thigh that count as touching the ground, or on a foot as standing on it
+FALLEN = -5.5  # m: below the lowest point that a map can have, so off its edge
 EDGE = (
     11.0  # m from the middle in x or y: from there a command that leads outwards is turned round; maps end at 12.75 m
 )
@@ -31,7 +32,7 @@ LINEAR = 1.0  # the unit of all others: the commanded velocity, exactly met
 YAW = 0.5  # the commanded yaw rate, exactly met
 WIDTH = 0.25  # (m/s)^2 or (rad/s)^2: an error of 0.5 m/s or rad/s still earns exp(-1)
 VERTICAL = 2.0  # per (m/s)^2: a bounce at 0.1 m/s costs 0.02
-ROLLING = 0.05  # per (rad/s)^2 of roll and pitch rate: 1 rad/s costs 0.05
+ROLLING = 0.02  # per (rad/s)^2 of roll and pitch rate: low enough that even thrashing about is better than falling
 TORQUE = 1e-5  # per (N m)^2, summed: standing costs 0.005
 RATE = 0.01  # per squared change of action, summed: all targets moved by 0.25 rad cost 0.12
 SLIP = 0.1  # per (m/s)^2 of each standing foot: one that slides at 1 m/s costs 0.1
@@ -44,6 +45,12 @@ class Now(NamedTuple):
 
     frame: Axes
     linear: Array  # (*B, 3) m/s
+
+
+def _readings(model: mujoco.MjModel, names: list[str], component: int = 0) -> slice:
+    """Where a component of sensors lies in `sensordata`, evenly spaced as they are."""
+    first, second, *_, last = (int(model.sensor(name).adr[0]) + component for name in names)
+    return slice(first, last + 1, second - first)
 
 
 class Quadruped(Robot):
@@ -60,13 +67,9 @@ class Quadruped(Robot):
         self.pose = model.key("home").ctrl.copy()
         self.below = underside(model, self.home)
         self.gap = 0.01 + NOISE * float(np.abs(self.below).max())
-
-        def touch(names: list[str]) -> NDArray[np.intp]:
-            return np.array([model.sensor(f"{name}_touch").adr[0] for name in names])
-
-        self.feet = touch([f"{leg}_foot" for leg in LEGS])
-        self.hull = touch(["base", *(f"{leg}_thigh" for leg in LEGS)])
-        self.sliding = np.array([[model.sensor(f"{leg}_foot_velocity").adr[0] + i for i in (0, 1)] for leg in LEGS])
+        self.feet = _readings(model, [f"{leg}_foot_touch" for leg in LEGS])
+        self.hull = _readings(model, ["base_touch", *(f"{leg}_thigh_touch" for leg in LEGS)])
+        self.along, self.across = (_readings(model, [f"{leg}_foot_velocity" for leg in LEGS], axis) for axis in (0, 1))
 
     def begin(self, u: Array, ground: Ground) -> Start:
         """Near the middle, any heading and command, joints a little off their pose, feet just above the ground."""
@@ -87,42 +90,45 @@ class Quadruped(Robot):
     def advance(self, view: View, action: Array) -> dict[str, NDArray]:
         """The last action and how much it changed; a command that leads off the map is turned round."""
         change = action - view.task["action"]
-        forward, sideways, turning = view.task["command"].T
-        x, y = view.qpos.T[:2]
-        frame = axes(view.qpos.T[3:7].T)
-        outwards = (frame.xx * forward + frame.xy * sideways) * x + (frame.yx * forward + frame.yy * sideways) * y > 0
-        turn = np.where(outwards & (np.maximum(np.abs(x), np.abs(y)) > EDGE), -1.0, 1.0)
-        command = np.array((turn * forward, turn * sideways, turning)).T
-        return {"command": command, "action": action, "rate": (change * change).sum(-1)}
+        task = {"action": action, "rate": np.add.reduce(change * change, -1)}
+        x, y = components(view.qpos[..., :2])
+        far = (x * x > EDGE * EDGE) | (y * y > EDGE * EDGE)
+        if np.count_nonzero(far):
+            frame = view.now.frame
+            forward, sideways, turning = components(view.task["command"])
+            vx, vy = frame.xx * forward + frame.xy * sideways, frame.yx * forward + frame.yy * sideways
+            turn = np.where(far & (vx * x + vy * y > 0), -1.0, 1.0)
+            task["command"] = np.array((turn * forward, turn * sideways, turning)).T
+        return task
 
     def derive(self, view: View) -> Now:
         """Velocity in the trunk's frame."""
-        frame = axes(view.qpos.T[3:7].T)
-        return Now(frame, to_robot(frame, view.qvel.T[:3].T))
+        frame = axes(view.qpos[..., 3:7])
+        return Now(frame, to_robot(frame, view.qvel[..., :3]))
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See the table of weights above."""
-        vx, vy, vz = view.now.linear.T
-        wx, wy, wz = view.qvel.T[3:6]
-        forward, sideways, turning = view.task["command"].T
+        vx, vy, vz = components(view.now.linear)
+        wx, wy, wz = components(view.qvel[..., 3:6])
+        forward, sideways, turning = components(view.task["command"])
         sensors, torque = view.sensordata, view.field("actuator_force")
-        standing = sensors[..., self.feet] > TOUCHED
-        sliding = sensors[..., self.sliding] ** 2
+        along, across = sensors[..., self.along], sensors[..., self.across]
+        slip = (sensors[..., self.feet] > TOUCHED) * (along * along + across * across)
+        dx, dy, dz = vx - forward, vy - sideways, wz - turning
         return {
-            "linear": LINEAR * np.exp(-((vx - forward) ** 2 + (vy - sideways) ** 2) / WIDTH),
-            "yaw": YAW * np.exp(-((wz - turning) ** 2) / WIDTH),
+            "linear": LINEAR * np.exp(-(dx * dx + dy * dy) / WIDTH),
+            "yaw": YAW * np.exp(-dz * dz / WIDTH),
             "vertical": -VERTICAL * vz * vz,
             "rolling": -ROLLING * (wx * wx + wy * wy),
-            "torque": -TORQUE * (torque * torque).sum(-1),
+            "torque": -TORQUE * np.add.reduce(torque * torque, -1),
             "rate": -RATE * view.task["rate"],
-            "slip": -SLIP * (standing * (sliding[..., 0] + sliding[..., 1])).sum(-1),
+            "slip": -SLIP * np.add.reduce(slip, -1),
         }
 
     def terminated(self, view: View) -> NDArray[np.bool_]:
         """Trunk or a thigh touches the ground, the trunk leans too far, or the robot has fallen off the map."""
-        touched = (view.sensordata[..., self.hull] > TOUCHED).any(-1)
-        sunk = view.qpos[..., 2] < view.ground(view.qpos[..., :2])
-        return touched | (view.now.frame.zz < TILTED) | sunk
+        touched = np.maximum.reduce(view.sensordata[..., self.hull], -1) > TOUCHED
+        return touched | (view.now.frame.zz < TILTED) | (view.qpos[..., 2] < FALLEN)
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Linear and angular velocity, down (own frame), command, joint positions and velocities, last action."""

@@ -1,7 +1,7 @@
 """`Runner`: what Ant and Humanoid have in common, legged robots with a motor in each joint that run towards a target.
 
-The target is a point `RING` metres from the middle of the map. A robot that comes within `REACHED` of it is given the next,
-`ONWARD` further round the ring, so that even a fast one stays on its map for a whole episode.
+The target is a point `RING` metres from the middle of the map. A robot that comes within `REACHED` of it is given the
+next, `ONWARD` further round the ring, so that even a fast one stays on its map for a whole episode.
 """
 
 from typing import ClassVar, NamedTuple
@@ -11,20 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, to_robot, yaw
+from nfc_gym.envs.rotations import Axes, axes, components, root, to_robot
 from nfc_gym.envs.spawn import place, spread, underside
 from nfc_gym.envs.view import View
 
 RING = 9.0  # m; the map ends 12.75 m from its middle
 REACHED = 1.0  # m
 ONWARD = np.pi * (3 - np.sqrt(5))  # rad, the golden angle: 16.8 m from one target to the next, in ever new directions
-MIDDLE = (
-    0.05  # m, half the side of the square that episodes start in: the level middle of a rough map has 1 m of radius
-)
+MIDDLE = 0.05  # m, half the side of the square of starts: the level middle of a rough map has a radius of 1 m
 ASIDE = 0.5  # rad, the most by which the first target lies off the robot's heading
-NEAR_LIMIT = (
-    0.95  # of half a joint's range: from there on a joint counts as near its limit, fully so at the limit itself
-)
+NEAR_LIMIT = 0.95  # of half a joint's range: from there nearness to the limit counts, up to 1 at the limit itself
 FACING = 0.8  # cosine of 37 degrees: who heads closer to the target than that has the heading reward in full
 
 
@@ -76,14 +72,17 @@ class Runner(Robot):
         super().__init__(model, task)
         self.gear = model.actuator_gear[:, 0].copy()  # N m at full action
         self.low, self.high = model.jnt_range[1:].T.copy()
+        # |stretch q - middle| runs from 0 in the middle of a joint's range to 1 / (1 - NEAR_LIMIT) at its limits.
+        self.stretch = 2 / (self.high - self.low) / (1 - NEAR_LIMIT)
+        self.middle = self.stretch * (self.low + self.high) / 2
         self.below = underside(model, self.home)
-        # A joint off by `noise` lowers a foot by no more than this, the leg being shorter than the torso is high or wide.
+        # A joint off by `noise` lowers a foot by no more than this: no leg is longer than the robot is high or wide.
         self.gap = 0.01 + self.noise * float(np.abs(self.below).max())
         first, last = model.sensor(f"{self.feet[0]}_force"), model.sensor(f"{self.feet[-1]}_torque")
         self.wrenches = slice(int(first.adr[0]), int(last.adr[0]) + 3)
 
     def begin(self, u: Array, ground: Ground) -> Start:
-        """Near the middle, the first target roughly ahead, joints a little off their pose, feet just above the ground."""
+        """Near the middle, target roughly ahead, joints a little off their pose, feet just above the ground."""
         x, y, bearing, aside = u.T[:4]
         bearing = 2 * np.pi * bearing
         x, y = spread(x, -MIDDLE, MIDDLE), spread(y, -MIDDLE, MIDDLE)
@@ -98,49 +97,51 @@ class Runner(Robot):
 
     def advance(self, view: View, action: Array) -> dict[str, NDArray]:
         """The last action; the next target for whoever has reached the present one."""
-        (x, y), (tx, ty) = view.qpos.T[:2], view.task["target"].T
-        reached = (tx - x) ** 2 + (ty - y) ** 2 < REACHED**2
+        (x, y), (tx, ty) = components(view.qpos[..., :2]), components(view.task["target"])
+        dx, dy = tx - x, ty - y
+        reached = dx * dx + dy * dy < REACHED**2
+        if not np.count_nonzero(reached):
+            return {"action": action}
         cos, sin = np.cos(ONWARD), np.sin(ONWARD)
         target = np.where(reached, (cos * tx - sin * ty, sin * tx + cos * ty), (tx, ty)).T
         return {"target": target, "action": action}
 
     def derive(self, view: View) -> Now:
         """Torso with respect to ground and target."""
-        q = view.qpos.T
-        frame = axes(q[3:7].T)
-        x, y, z = q[:3] + 0.0  # copies: the state is live
-        tx, ty = view.task["target"].T
+        frame = axes(view.qpos[..., 3:7])
+        x, y, z = components(view.qpos[..., :3])
+        tx, ty = components(view.task["target"])
         dx, dy = tx - x, ty - y
-        scale = 1 / np.maximum(np.sqrt(dx * dx + dy * dy), 1e-6)
+        scale = 1 / (root(dx * dx + dy * dy) + 1e-9)  # never a division by zero
         ux, uy = dx * scale, dy * scale
-        heading = yaw(q[3:7].T)
-        cos, sin = np.cos(heading), np.sin(heading)
+        facing = frame.xx * ux + frame.yx * uy
         return Now(
             frame,
-            x,
-            y,
+            x + 0.0,  # a copy: the state is live
+            y + 0.0,
             z - view.ground(view.qpos[..., :2]),
             ux,
             uy,
-            heading,
+            np.arctan2(frame.yx, frame.xx),
             np.arctan2(frame.zy, frame.zz),
-            np.arctan2(cos * uy - sin * ux, cos * ux + sin * uy),
-            frame.xx * ux + frame.yx * uy,
+            np.arctan2(frame.xx * uy - frame.yx * ux, facing),
+            facing,
         )
 
     def reward(self, view: View, action: Array) -> dict[str, Array]:
         """See `Weights`; progress is measured over the control step, along the direction to the target at its start."""
         w, now, was = self.weights, view.now, view.before
         moved = (now.x - was.x) * was.towards_x + (now.y - was.y) * was.towards_y
-        power = np.abs(self.gear * view.ctrl * view.qvel[..., 6:]).sum(-1)
-        reach = np.abs(2 * view.qpos[..., 7:] - (self.low + self.high)) / (self.high - self.low)
-        near = np.clip((reach - NEAR_LIMIT) / (1 - NEAR_LIMIT), 0, 1).sum(-1)
+        power = np.abs(self.gear * view.ctrl * view.qvel[..., 6:])
+        reach = np.abs(self.stretch * view.qpos[..., 7:] - self.middle)
+        near = np.maximum(reach - NEAR_LIMIT / (1 - NEAR_LIMIT), 0)
+        squared, power, near = np.add.reduce(np.array((action * action, power, near)), -1)
         return {
             "progress": w.progress / DT * moved,
-            "alive": w.alive * np.ones_like(moved),
+            "alive": w.alive + 0 * moved,
             "upright": w.upright * now.frame.zz,
             "heading": w.heading * np.minimum(now.facing / FACING, 1),
-            "action": -w.action * (action * action).sum(-1),
+            "action": -w.action * squared,
             "energy": -w.energy * power,
             "limits": -w.limits * near,
         }
@@ -155,6 +156,7 @@ class Runner(Robot):
         Height above the ground, velocity and rates in the torso's frame, yaw, roll, angle to the target, projection of
         up on the vertical and of forward on the target's direction.
         """
-        now, v = view.now, view.qvel.T
-        velocity = to_robot(now.frame, v[:3].T).T
-        return np.array((now.height, *velocity, *v[3:6], now.yaw, now.roll, now.angle, now.frame.zz, now.facing)).T
+        now = view.now
+        velocity = components(to_robot(now.frame, view.qvel[..., :3]))
+        rates = components(view.qvel[..., 3:6])
+        return np.array((now.height, *velocity, *rates, now.yaw, now.roll, now.angle, now.frame.zz, now.facing)).T

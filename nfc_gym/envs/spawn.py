@@ -15,8 +15,8 @@ _RIM = np.vstack([[0.0, 0.0], np.column_stack([np.cos(_AROUND), np.sin(_AROUND)]
 def underside(model: mujoco.MjModel, qpos: Array) -> Array:
     """Points (m, 3) below which a robot's colliding geoms do not reach, relative to its root, in a pose (nq,).
 
-    Capsules and spheres are sampled along their axis and round it, boxes on their faces; the height at each point is that
-    of the lowest point of the sampled piece, so that nothing is missed between points.
+    Capsules and spheres are sampled along their axis and round it, boxes throughout; the height at a point is that of
+    the lowest point of the sampled piece, so that nothing is missed between points.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos

@@ -61,10 +61,11 @@ def elevation(
         resolution, origin = np.array([[f.resolution] for f in fields]), np.array([f.origin for f in fields])
     centre = (places[:, :2] - origin.reshape(-1, 2)) / resolution
     matrices = to_grid(centre, turns, CELL / np.reshape(resolution, -1))
-    rows = zip(fields, matrices, places[:, 2].astype(np.float32), out.reshape(count, SIZE, SIZE), strict=True)
-    for field, matrix, lift, row in rows:
-        cv2.warpAffine(field.heights, matrix, (SIZE, SIZE), row, _FLAGS, borderMode=cv2.BORDER_REPLICATE)
-        np.subtract(row, lift, out=row)  # while the map is still in the cache
+    lifts, maps = places[:, 2].astype(np.float32), out.reshape(count, SIZE, SIZE)
+    # Robots on the same map one after the other, so that its heights are still in the cache.
+    for k in sorted(range(count), key=lambda k: id(fields[k])):
+        cv2.warpAffine(fields[k].heights, matrices[k], (SIZE, SIZE), maps[k], _FLAGS, borderMode=cv2.BORDER_REPLICATE)
+        np.subtract(maps[k], lifts[k], out=maps[k])  # while the map is in the cache, too
     return out
 
 

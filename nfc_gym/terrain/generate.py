@@ -120,7 +120,8 @@ def _seed(seed: int) -> int:
 def _mixed(rng: np.random.Generator, grid: Grid, difficulty: float) -> Array:
     """Tiles of single kinds with soft seams, over a little roughness everywhere.
 
-    Each tile is levelled by its median, so that no seam becomes a wall between a kind's high and another's low ground.
+    Tiles of slopes and steps are levelled by their median, as the other kinds lie level by themselves, so that no seam
+    becomes a wall between high and low ground.
     """
     parts = zip(SINGLE.values(), rng.spawn(len(SINGLE)), strict=True)
     layers = [generate(each, grid, difficulty) for generate, each in parts]
@@ -129,8 +130,11 @@ def _mixed(rng: np.random.Generator, grid: Grid, difficulty: float) -> Array:
     cols = np.array_split(np.arange(grid.shape[1]), len(across))
     kinds = rng.permutation(np.resize(np.arange(len(layers)), len(rows) * len(cols))).reshape(len(rows), len(cols))
     levels = np.zeros(kinds.shape)
-    for (i, j), kind in np.ndenumerate(kinds):
-        levels[i, j] = np.median(layers[kind][np.ix_(rows[i], cols[j])])
+    climbing = [list(SINGLE).index(name) for name in ("slopes", "steps")]
+    for i, j in np.argwhere(np.isin(kinds, climbing)):
+        levels[i, j] = np.median(layers[kinds[i, j]][np.ix_(rows[i], cols[j])])
+    # Around the spawn patch every kind begins at the patch's own level.
+    levels[(len(rows) - 1) // 2 : len(rows) // 2 + 1, (len(cols) - 1) // 2 : len(cols) // 2 + 1] = 0.0
     heights = 0.3 * layers[0] - along.T @ levels @ across
     for k, layer in enumerate(layers):
         heights += layer * (along.T @ (kinds == k) @ across)

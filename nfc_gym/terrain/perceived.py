@@ -2,7 +2,7 @@
 
 Each robot keeps a grid in the frame of its own pose estimate, which wraps around: a cell belongs to whatever place
 within `SIDE / 2` cells of the robot falls on it. An image's points are averaged a cell with weights 1 / variance,
-earlier weights fade with half of the camera's window as time constant, and cells not seen within the window are forgotten.
+earlier weights fade with half of the camera's window as time constant, and cells not seen within it are forgotten.
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.terrain.camera import DepthCamera, scan
+from nfc_gym.terrain.camera import DepthCamera
 from nfc_gym.terrain.egocentric import CELL, SIZE, to_grid
 from nfc_gym.terrain.heightfield import Heightfield
+from nfc_gym.terrain.scan import scan
 
 Array = NDArray[np.float64]
 
@@ -162,7 +163,7 @@ class _Robot:
         flat = cells[:, 1] * SIDE + cells[:, 0]
         gain = 1 / (sd * sd + FLOOR**2)
         total = np.bincount(flat, gain, SIDE * SIDE)
-        hit = np.flatnonzero(total)
+        hit = np.flatnonzero(total > 0)
         mean = np.bincount(flat, gain * believed[:, 2], SIDE * SIDE)[hit] / total[hit]
         height, weight, seen = (grid.reshape(-1) for grid in (self.height, self.weight, self.seen))
         age = now - seen[hit]

@@ -113,6 +113,14 @@ def test_a_drop_gains_no_energy_and_comes_to_rest(robot: str, height: float, til
     assert not any(w.number for w in data.warning)
 
 
+@pytest.mark.parametrize("robot", WALKERS)
+def test_feet_of_a_standing_robot_sink_by_less_than_a_millimetre(robot: str) -> None:
+    model, data = load(robot)
+    mujoco.mj_step(model, data, nstep=50)
+    assert data.ncon >= 4
+    assert -0.001 < data.contact.dist.min() < 0
+
+
 def test_the_ant_rests_on_its_feet_alone_over_the_prior() -> None:
     """The heaviest torso on the weakest springs still hangs clear of the ground, feet less than 2 mm in it."""
     model, data = load("ant")

@@ -70,7 +70,9 @@ def test_mixed_holds_every_kind_without_walls_at_the_seams() -> None:
     drops = np.abs(np.diff(mixed, axis=0))
     deepest = AMPLITUDES["stone_depth"][0] + 2 * AMPLITUDES["stone_lift"][0]
     assert AMPLITUDES["gap_depth"][0] < drops.max() < 1.2 * deepest
-    assert np.ptp(mixed) < 3.0
+    # The tops of stones and the ground between gaps lie level with the rest: nothing towers over its surroundings.
+    around = cv2.morphologyEx(mixed, cv2.MORPH_CLOSE, np.ones((9, 9)))
+    assert np.ptp(around) < 2.0
 
 
 @pytest.mark.parametrize("shape", [(64, 128), (33, 20), (2, 2)])

@@ -1,11 +1,18 @@
 """The surface between grid points against MuJoCo's rays and contacts, and heightfields written into models."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
+from mujoco.batch import Batch
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.terrain import Heightfield, asset, make, write, write_pool
+from nfc_gym.terrain import Heightfield, asset, make, surface, write, write_pool
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def compiled(*maps: Heightfield) -> mujoco.MjModel:
@@ -52,6 +59,12 @@ def test_height_and_normal_are_those_of_mujocos_rays(kind: str, jagged: Heightfi
     np.testing.assert_allclose(heightfield.normal(xy), seen[:, 1:], atol=1e-5, rtol=0)
 
 
+def test_one_point_at_a_time_is_the_same_to_the_bit(jagged: Heightfield) -> None:
+    low = np.array(jagged.origin) - 1.0
+    points = np.random.default_rng(2).uniform(low, low + jagged.extent + 2.0, (3000, 2))
+    assert [jagged.height_at(x, y) for x, y in points.tolist()] == jagged.height(points).tolist()
+
+
 def test_contacts_see_the_same_diagonal_as_rays() -> None:
     """A saddle: along one diagonal the surface is a ridge at 1 m, along the other it would be a valley at 0 m."""
     saddle = Heightfield([[1, 0], [0, 1]], 1.0)
@@ -74,8 +87,6 @@ def test_points_beyond_the_edge_take_the_edges_height(jagged: Heightfield) -> No
 
 
 def test_any_batch_shape_and_a_stack_of_maps() -> None:
-    from nfc_gym.terrain import surface
-
     maps = [make("rough", 1.0, seed, shape=(20, 30)) for seed in range(3)]
     stack = np.stack([m.heights for m in maps])
     xy = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 4, 2))
@@ -148,3 +159,34 @@ def test_heights_cannot_be_changed_behind_its_back() -> None:
     assert heightfield.heights[0, 0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
         heightfield.heights[0, 0] = 1.0
+
+
+def test_simulations_of_a_batch_stand_on_maps_of_their_own() -> None:
+    """A ball on a vertical slide comes to rest one radius, along the normal, off its own map's surface."""
+    maps = [make(kind, 0.6, seed=4, shape=(64, 64)) for kind in ("rough", "slopes", "mixed")]
+    radius, x, y = 0.05, 1.93, -1.37
+    spec = mujoco.MjSpec()
+    for k, heightfield in enumerate(maps):
+        data = asset(heightfield)
+        spec.add_hfield(name=f"map{k}", nrow=data.nrow, ncol=data.ncol, size=data.size, userdata=data.data)
+    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="map0")
+    ball = spec.worldbody.add_body(name="ball", pos=[x, y, 0])
+    ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], damping=[2.0, 0.0, 0.0])
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], mass=0.1, friction=[0, 0, 0])
+    model = spec.compile()
+    write_pool(model, ["map0", "map1", "map2"], maps)
+    batch = Batch(model, nsim=3, nthread=1)
+    batch.expand("geom_dataid")[:, model.geom("ground").id] = [model.hfield(f"map{k}").id for k in range(3)]
+    batch.bind("qpos")[:] = 1.5
+    for _ in range(3000):
+        batch.step()
+    grounds = [float(m.height([x, y])) for m in maps]
+    assert np.ptp(grounds) > 0.05
+    for rest, heightfield, ground in zip(batch.bind("qpos")[:, 0], maps, grounds, strict=True):
+        assert rest - ground == pytest.approx(radius / heightfield.normal([x, y])[2], abs=0.004)
+
+
+def test_importing_needs_neither_mujoco_nor_trimesh() -> None:
+    code = "import nfc_gym.terrain, sys; print({'mujoco', 'trimesh', 'scipy', 'torch', 'gymnasium'} & set(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert out.stdout.strip() == "set()"
