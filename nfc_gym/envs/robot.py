@@ -15,6 +15,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
+from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
 Ground = Callable[[NDArray], Array]
@@ -104,6 +105,11 @@ class Robot(ABC):
     def compile(cls, maps: int) -> mujoco.MjModel:
         """The robot in its scene; `maps`: heightfields to choose from, 0 for a plane (`scene.build`)."""
         return scene.build(assets.path(cls.name), maps)
+
+    @classmethod
+    def mjcf(cls, ground: Heightfield | None) -> str:
+        """The scene on one map, or on a plane, as MJCF that plain MuJoCo loads."""
+        return scene.text(assets.path(cls.name), ground)
 
     @classmethod
     def parameters(cls) -> list[Parameter]:

@@ -137,7 +137,7 @@ class RobotEnv(gymnasium.Env):
     @property
     def mjcf(self) -> str:
         """The nominal model with the ground of the running episode, as MJCF that plain MuJoCo loads."""
-        return scene.text(assets.path(self.robot.name), self._terrain if self.rough else None)
+        return self.robot.mjcf(self._terrain if self.rough else None)
 
     @property
     def heightfield(self) -> Heightfield:

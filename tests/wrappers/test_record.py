@@ -13,7 +13,7 @@ from machines import make
 
 import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym.core import InputError, MissingExtra
-from nfc_gym.measured.check import check
+from nfc_gym.measured.checks import check
 from nfc_gym.measured.mapping import load_mapping
 from nfc_gym.measured.readers import read_table
 from nfc_gym.physics.state import rotate
@@ -87,7 +87,7 @@ def test_a_recorded_log_passes_the_check(name: str, tmp_path: Path) -> None:
     _drive(env, 4, 80)
     assert len(list(tmp_path.glob("episode_*.parquet"))) == 4
     findings = check(tmp_path / "mapping.yaml")
-    assert [f for f in findings if f.level == "error"] == []
+    assert [f for f in findings if f.severity == "error"] == []
     mapping = load_mapping(tmp_path / "mapping.yaml")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     assert len(mapping.controls) == model.nu == env.unwrapped.model.nu
