@@ -25,18 +25,19 @@ class _Common(RecordConstructorArgs):
     """
 
     env: Any
+    arguments: dict[str, Any]
     rng: np.random.Generator | None
 
     def _open(self, env: Any, arguments: dict[str, Any]) -> None:
         """To be called first by every constructor."""
-        self._arguments = arguments
+        self.arguments = arguments
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **{k: self.recorded(k, v) for k, v in arguments.items()})
         check_order(self, env)
         self.rng = None
         self._depth = sum(kind(w) == kind(self) for w in beneath(env))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (type(self), self.env, self._arguments)
+        return _rebuild, (type(self), self.env, self.arguments)
 
     def recorded(self, name: str, value: Any) -> Any:
         """A constructor's argument as a spec keeps it: paths as text, the rest as it is."""
@@ -63,17 +64,28 @@ class EnvWrapper(_Common, gym.Wrapper):
     """Base of the wrappers around one environment."""
 
     def __init__(self, env: gym.Env, **arguments: Any) -> None:
-        if isinstance(env, VectorEnv):
-            raise InputError(f"{kind(self)} wraps one environment; around a vector environment use Vector{kind(self)}")
+        self.require(env)
         self._open(env, arguments)
         gym.Wrapper.__init__(self, env)
+
+    @classmethod
+    def require(cls, env: Any) -> None:
+        """Refuse a vector environment."""
+        if isinstance(env, VectorEnv):
+            raise InputError(f"{cls.__name__} wraps one environment; around a vector environment use Vector{cls.__name__}")
 
 
 class VectorEnvWrapper(_Common, VectorWrapper):
     """Base of their twins around a vector environment; all rows draw from one stream."""
 
     def __init__(self, env: VectorEnv, **arguments: Any) -> None:
-        if not isinstance(env, VectorEnv):
-            raise InputError(f"Vector{kind(self)} wraps a vector environment; around a single one use {kind(self)}")
+        self.require(env)
         self._open(env, arguments)
         VectorWrapper.__init__(self, env)
+
+    @classmethod
+    def require(cls, env: Any) -> None:
+        """Refuse a single environment."""
+        if not isinstance(env, VectorEnv):
+            name = cls.__name__.removeprefix("Vector")
+            raise InputError(f"Vector{name} wraps a vector environment; around a single one use {name}")

@@ -100,6 +100,7 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         mode: Mode = "force",
         components: Sequence[str] | None = None,
     ) -> None:
+        self.require(env)
         sampled = drawn(posterior, samples)
         sim = simulation_of(env, "Hallucinate")
         psi = None if sampled.psi is None else space_of(env, sim.nominal, space, ())
@@ -181,6 +182,7 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
         mode: Mode = "force",
         components: Sequence[str] | None = None,
     ) -> None:
+        self.require(env)
         sampled = drawn(posterior, samples)
         if sampled.delta_e is not None:
             raise InputError(

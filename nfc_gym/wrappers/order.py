@@ -13,11 +13,11 @@ _ALONE: dict[str, tuple[str, ...]] = {
     "all effects go to one": ("ApplyEffects",),
     "the map of `elevation` is made by": ("PerceiveTerrain",),
 }
-# (outer, inner) -> why that cannot work.
-_WRONG: dict[tuple[str, str], str] = {
-    ("PerceiveTerrain", "PerturbSignals"): "its map would replace the one that was perturbed",
-    ("PerturbSignals", "Hallucinate"): "it would perturb the hallucinated part of the action",
-    ("MonitorAnomaly", "Hallucinate"): "its detector would be shown the hallucinated part of the action",
+# (outer, inner) -> why that cannot work, and the signal whose noise it is about (None: whatever the arguments).
+_WRONG: dict[tuple[str, str], tuple[str, str | None]] = {
+    ("PerceiveTerrain", "PerturbSignals"): ("its map would replace the one that was perturbed", "elevation"),
+    ("PerturbSignals", "Hallucinate"): ("it would perturb the hallucinated part of the action", "action"),
+    ("MonitorAnomaly", "Hallucinate"): ("its detector would be shown the hallucinated part of the action", None),
 }
 
 
@@ -47,6 +47,7 @@ def check_order(wrapper: Any, env: Any) -> None:
         for what, names in _ALONE.items():
             if mine in names and theirs in names and wrapper.writes(what) and inner.writes(what):
                 raise InputError(f"{mine} around {theirs}: {what} {' or '.join(names)}, and that only once")
-        reason = _WRONG.get((mine, theirs))
-        if reason is not None:
+        reason, signal = _WRONG.get((mine, theirs), ("", None))
+        noisy = wrapper if mine == "PerturbSignals" else inner
+        if reason and (signal is None or signal in noisy.arguments["noise"]):
             raise InputError(f"{mine} around {theirs}: {reason}; put {theirs} around {mine}")

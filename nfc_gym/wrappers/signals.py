@@ -37,7 +37,7 @@ class Fault:
 
 
 class Channel:
-    """One signal with its fault: arrays (*batch, *shape) in, fresh arrays of the same type out, clipped to the space."""
+    """One signal with its fault: arrays (*batch, *shape) in, fresh ones of the same type out, clipped to the space."""
 
     def __init__(self, key: str, space: gym.Space, fault: Mapping[str, Any], batch: tuple[int, ...]) -> None:
         if not isinstance(space, spaces.Box):
@@ -84,7 +84,7 @@ class Channel:
             out = out + self.sd * rng.standard_normal(self.shape)
         if self.low is not None:
             out = np.minimum(np.maximum(out, self.low), self.high)
-        return out.astype(self.dtype)
+        return out.astype(values.dtype if values.dtype.kind == "f" else self.dtype)
 
     def _late(self, values: NDArray, again: NDArray[np.bool_] | None) -> NDArray:
         if self.fresh is not None and self.fresh.any() and self.past:
