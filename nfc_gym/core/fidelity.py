@@ -78,5 +78,3 @@ class Fidelity:
     def save(self, path: str | Path) -> None:
         """Write an `.npz` that `load_source` opens again."""
         np.savez(path, **{p: getattr(self, p) for p in self.given})  # type: ignore[arg-type]
-
-

@@ -1,5 +1,6 @@
 """What a posterior over `Fidelity` must offer, whoever computes it, and how one kept in a file is opened."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -41,7 +42,7 @@ def register_loader(suffix: str, loader: Loader) -> None:
     _LOADERS[suffix.lower()] = loader
 
 
-def load_source(path: str | Path) -> Sampler:
+def load_source(path: str | os.PathLike[str]) -> Sampler:
     """Open a file of fidelities or a posterior by the loader that its suffix names.
 
     Raises:

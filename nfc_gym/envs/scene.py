@@ -28,8 +28,9 @@ def build(mjcf: Path, maps: int) -> mujoco.MjModel:
       mjcf: the robot; a ground of its own is replaced, light and sky are added where it has none.
       maps: how many heightfields, named `terrain_0`, ...; 0 gives a plane.
     """
-    half = [(n - 1) * RESOLUTION / 2 for n in reversed(SHAPE)]
-    flat = HfieldAsset(*SHAPE, (*half, HIGHEST - LOWEST, SOLID), np.zeros(SHAPE[0] * SHAPE[1]), (0, 0, LOWEST))
+    rows, cols = SHAPE
+    size = ((cols - 1) * RESOLUTION / 2, (rows - 1) * RESOLUTION / 2, HIGHEST - LOWEST, SOLID)
+    flat = HfieldAsset(rows, cols, size, np.zeros(rows * cols, np.float32), (0, 0, LOWEST))
     model = _describe(mjcf, [flat] * maps).compile()
     for k in range(maps):
         write(model, k, np.zeros(SHAPE, np.float32))

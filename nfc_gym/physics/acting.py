@@ -25,11 +25,6 @@ class Engine(Protocol):
       qfrc_applied, xfrc_applied: (..., nv), (..., nbody, 6), where forces go.
     """
 
-    qpos: Array
-    qvel: Array
-    qfrc_applied: Array
-    xfrc_applied: Array
-
     def bind(self, name: str) -> Array:
         """A live field of `MjData`."""
         ...

@@ -29,7 +29,10 @@ def names(model: mujoco.MjModel) -> Names:
         joint = joints[int(model.actuator_trnid[i, 0])] if moves else ""
         actuators[i] = name or (joint if joint not in actuators else "")
     return Names(
-        _filled(actuators, "actuator"), joints, bodies, _filled(names_of(model, _OBJ.mjOBJ_SENSOR, model.nsensor), "sensor")
+        _filled(actuators, "actuator"),
+        joints,
+        bodies,
+        _filled(names_of(model, _OBJ.mjOBJ_SENSOR, model.nsensor), "sensor"),
     )
 
 

@@ -1,8 +1,8 @@
 """Residual dynamics: what delta_s means for the physical state, and how it is injected.
 
 delta_s of the paper has the observation's components. Only those that are physical state can be injected, and they live
-in tangent space: a velocity residual dv becomes the generalised force M dv / T over the control step T, so that contacts
-answer to it and positions follow; a quaternion's residual becomes the rotation vector 2 vec(q* dq).
+in tangent space: a velocity residual dv becomes the generalised force M dv / T over the control step T, so that
+contacts answer to it and positions follow; a quaternion's residual becomes the rotation vector 2 vec(q* dq).
 """
 
 import re
@@ -24,7 +24,8 @@ _FORM = re.compile(
     r"|^(body):(?P<body>.+):(?P<bq>pos|quat|linvel|angvel)(?P<own>@body)?\.(?P<axis>[wxyz])$"
 )
 _GRAMMAR = (
-    "joint:<name>:pos|vel, body:<name>:pos|linvel|angvel.x|y|z (world frame; with @body before the dot, the body's own), "
+    "joint:<name>:pos|vel, body:<name>:pos|linvel|angvel.x|y|z (world frame; with @body before the dot, the body's "
+    "own), "
     f"body:<name>:quat.w|x|y|z, or {OBSERVED} for what is no physical state"
 )
 

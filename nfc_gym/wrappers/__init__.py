@@ -1,7 +1,8 @@
 """Wrappers around any Gymnasium MuJoCo environment, each with a twin, `Vector...`, around vector environments.
 
 Those that act in the physics need `unwrapped.model` and `unwrapped.data` of an environment (their twins the vector
-environments of this package, which run on `mujoco.batch`); `PerturbSignals` and `MonitorAnomaly` need nothing of MuJoCo.
+environments of this package, which run on `mujoco.batch`); `PerturbSignals` and `MonitorAnomaly` need nothing of
+MuJoCo.
 """
 
 from nfc_gym.wrappers.anomaly import Detector, MonitorAnomaly, VectorMonitorAnomaly

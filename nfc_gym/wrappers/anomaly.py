@@ -38,7 +38,9 @@ def opened(detector: Detector | str | os.PathLike[str], threshold: float | None)
         raise InputError(f"MonitorAnomaly: a detector has reset(rows) and update(obs, action, next_obs), got {found!r}")
     limit = getattr(found, "threshold", None) if threshold is None else threshold
     if limit is None or not np.isfinite(limit):
-        raise InputError(f"MonitorAnomaly: the threshold of the score must be a number, given or the detector's, got {limit}")
+        raise InputError(
+            f"MonitorAnomaly: the threshold of the score must be a number, given or the detector's, got {limit}"
+        )
     return found, float(limit)
 
 

@@ -1,4 +1,4 @@
-"""What all wrappers share: recorded arguments, pickling, a stream of random numbers, and the checks on what is wrapped."""
+"""What all wrappers share: recorded arguments, pickling, random numbers, and the checks on what is wrapped."""
 
 import os
 from typing import Any
@@ -31,7 +31,9 @@ class _Common(RecordConstructorArgs):
     def _open(self, env: Any, arguments: dict[str, Any]) -> None:
         """To be called first by every constructor."""
         self.arguments = arguments
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **{k: self.recorded(k, v) for k, v in arguments.items()})
+        RecordConstructorArgs.__init__(
+            self, _disable_deepcopy=True, **{k: self.recorded(k, v) for k, v in arguments.items()}
+        )
         check_order(self, env)
         self.rng = None
         self._depth = sum(kind(w) == kind(self) for w in beneath(env))
@@ -72,7 +74,9 @@ class EnvWrapper(_Common, gym.Wrapper):
     def require(cls, env: Any) -> None:
         """Refuse a vector environment."""
         if isinstance(env, VectorEnv):
-            raise InputError(f"{cls.__name__} wraps one environment; around a vector environment use Vector{cls.__name__}")
+            raise InputError(
+                f"{cls.__name__} wraps one environment; around a vector environment use Vector{cls.__name__}"
+            )
 
 
 class VectorEnvWrapper(_Common, VectorWrapper):

@@ -73,7 +73,7 @@ class BatchSimulation(Simulation):
         return options
 
     def edit_after(self) -> None:
-        """After a reset, or a step that has reset rows: edits on top of the psi that the environment itself has written."""
+        """After a reset, or a step that has reset rows: edits on top of the psi that the environment has written."""
         ids = np.flatnonzero(self._unedited)
         self._unedited[:] = False
         if len(ids) and self.edits:
@@ -133,8 +133,8 @@ def batch_simulation_of(env: Any, who: str) -> BatchSimulation:
     lacking = [n for n in ("batch", "fields", "substep_hooks", "after_hooks", "reset_hooks") if not hasattr(base, n)]
     if lacking:
         raise InputError(
-            f"Vector{who} acts in the physics of a vector environment on mujoco.batch, as gymnasium.make_vec makes of this "
-            f"package's ids; {type(base).__name__} lacks {', '.join(lacking)}. Put {who} around each single environment: "
+            f"Vector{who} acts in the physics of a vector environment on mujoco.batch, as gymnasium.make_vec makes of "
+            f"this package's ids; {type(base).__name__} lacks {', '.join(lacking)}. Put {who} around each single one: "
             f"make_vec(..., vectorization_mode='sync', wrappers=[...])"
         )
     made = BatchSimulation(base)

@@ -15,9 +15,9 @@ _EDGE = 1e-6  # how near to its box's bounds psi may come, as a share of the box
 class Belief:
     """The mean of a posterior and the directions in which it is uncertain.
 
-    Coordinates are psi by its probit in the prior's box (widened where samples lie outside), the leading principal modes of
-    delta_e, and delta_s, jointly and in this order; L is the lower Cholesky factor of their covariance, so that what holds
-    for an episode comes first and does not depend on what varies with each step.
+    Coordinates are psi by its probit in the prior's box (widened where samples lie outside), the leading principal
+    modes of delta_e, and delta_s, jointly and in this order; L is the lower Cholesky factor of their covariance, so
+    that what holds for an episode comes first and does not depend on what varies with each step.
 
     Args:
       samples: (n,) of the posterior.
@@ -40,7 +40,8 @@ class Belief:
         if samples.psi is not None and space is not None:
             if samples.psi.shape[1] != len(space):
                 raise InputError(
-                    f"Hallucinate: the posterior's psi has {samples.psi.shape[1]} entries; want {', '.join(space.names)}"
+                    f"Hallucinate: the posterior's psi has {samples.psi.shape[1]} entries; want "
+                    + ", ".join(space.names)
                 )
             self.low = np.minimum(space.low, samples.psi.min(0))
             self.high = np.maximum(space.high, samples.psi.max(0))

@@ -1,9 +1,9 @@
 """`ResidualDynamics`: what the simulator's motion lacks, s' = f_psi(s, a) + delta_s, put into its physics.
 
-delta_s is a bias that holds for an episode, plus noise that is drawn each control step. Velocity residuals dv act as the
-generalised force M dv / T over the control step T, so that contacts answer and positions follow; `mode="state"` adds the
-residual to the state outright after the step, positions included. Entries that are no physical state perturb what is
-observed.
+delta_s is a bias that holds for an episode, plus noise that is drawn each control step. Velocity residuals dv act as
+the generalised force M dv / T over the control step T, so that contacts answer and positions follow; `mode="state"`
+adds the residual to the state outright after the step, positions included. Entries that are no physical state perturb
+what is observed.
 """
 
 from collections.abc import Sequence
@@ -85,7 +85,9 @@ def noise_root(covariance: ArrayLike | None, size: int) -> Array:
         )
     values, vectors = np.linalg.eigh(matrix)
     if not np.allclose(matrix, matrix.T) or values.min() < -1e-9 * max(abs(values).max(), 1e-300):
-        raise InputError(f"ResidualDynamics: covariance has the eigenvalue {values.min():g}; want symmetric, none below 0")
+        raise InputError(
+            f"ResidualDynamics: covariance has the eigenvalue {values.min():g}; want symmetric, none below 0"
+        )
     keep = values > 0
     return vectors[:, keep] * np.sqrt(values[keep])
 
@@ -100,7 +102,9 @@ def box_key(space: gym.Space, key: str | None, size: int) -> str | None:
         boxes = [k for k, s in space.items() if s.shape == (size,)]
         key = key or next(iter(boxes), None)
         if key not in boxes:
-            raise InputError(f"ResidualDynamics: no key {key!r} of width {size} in the observation: {list(space.items())}")
+            raise InputError(
+                f"ResidualDynamics: no key {key!r} of width {size} in the observation: {list(space.items())}"
+            )
         return key
     if space.shape != (size,):
         raise InputError(f"ResidualDynamics: delta_s has {size} entries where the observation has shape {space.shape}")
@@ -129,9 +133,9 @@ class ResidualDynamics(_Observing, EnvWrapper):
       source: where an episode's delta_s comes from: a posterior, an array (s,) or (n, s) of samples, a path.
       mode: `force` (M dv / T) or `state` (added to positions and velocities after the step).
       covariance: (s, s), or variances (s,), of noise drawn each control step; None is none.
-      components: what each entry of delta_s is, see `nfc_gym.physics.residual.Components`; default the environment's own
-        `proprio_components` where they fit, else the nv velocities, or 2 nv tangent positions and velocities. In `force`
-        mode positions follow from the velocities, and residuals of them are not added.
+      components: what each entry of delta_s is, see `nfc_gym.physics.residual.Components`; default the environment's
+        own `proprio_components` where they fit, else the nv velocities, or 2 nv tangent positions and velocities. In
+        `force` mode positions follow from the velocities, and residuals of them are not added.
       key: of a Dict observation, what entries named `obs` perturb.
 
     A residual of zero leaves every bit as it is.

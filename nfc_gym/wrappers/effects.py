@@ -1,7 +1,7 @@
 """`ApplyEffects`: the effects that a model lacks, put into the simulation of any MuJoCo environment.
 
-The objects are those of the calibrator, and act through the same class at every physics step: an effect found in logs is
-the effect that a policy trains under, bit for bit.
+The objects are those of the calibrator, and act through the same class at every physics step: an effect found in logs
+is the effect that a policy trains under, bit for bit.
 """
 
 import copy
@@ -27,7 +27,7 @@ from nfc_gym.wrappers.simulation import Simulation, simulation_of
 
 Array = NDArray[np.float64]
 Given = Sequence[tuple[Effect, Array] | Mapping[str, Any]] | str | os.PathLike[str]
-Signal = float | Callable[[float], float]
+Signal = float | Callable[[Any], Any]
 
 
 def recorded(effects: Given) -> list[dict[str, Any]] | str:
@@ -126,16 +126,18 @@ class ApplyEffects(EnvWrapper):
 
     Args:
       env: any MuJoCo environment.
-      effects: (effect, values) pairs, rows `{"family": ..., "where": ..., "parameters": {name: value}}`, or the path of an
-        `effects.yaml`. They act in this order.
-      exogenous: signals that effects read: name -> a number, or a function of the episode's time in s (`exo:time` is given).
+      effects: (effect, values) pairs, rows `{"family": ..., "where": ..., "parameters": {name: value}}`, or the path
+        of an `effects.yaml`. They act in this order.
+      exogenous: signals that effects read: name -> a number, or a function of the episode's time in s (`exo:time` is
+        given).
 
     Commands are changed, dry friction and forces written before every physics step; model edits are made at each reset,
-    on top of psi; hidden states (delays, lags, heat) begin settled at an episode's first command. Effects on sensors change
-    what `RecordLog` records, not the observation, whose entries have no channel names.
+    on top of psi; hidden states (delays, lags, heat) begin settled at an episode's first command. Effects on sensors
+    change what `RecordLog` records, not the observation, whose entries have no channel names.
 
     Raises:
-      InputError: an unknown family, place or parameter, a signal that is missing, an environment that cannot be stepped so.
+      InputError: an unknown family, place or parameter, a signal that is missing, an environment that cannot be
+        stepped so.
     """
 
     def __init__(self, env: gym.Env, effects: Given, exogenous: Mapping[str, Signal] | None = None) -> None:

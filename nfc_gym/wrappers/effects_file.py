@@ -1,6 +1,7 @@
 """`effects.yaml`: what a model lacks and MJCF cannot say, and the model that it was found for."""
 
 import hashlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ _TELLING = (
 )  # fmt: skip
 
 
-def read_effects(path: str | Path) -> dict[str, Any]:
+def read_effects(path: str | os.PathLike[str]) -> dict[str, Any]:
     """An `effects.yaml`: the keys `version`, `model_sha256` and `effects`, a list of rows.
 
     Raises:
@@ -42,7 +43,7 @@ def read_effects(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def check_model(env: Any, path: str | Path) -> None:
+def check_model(env: Any, path: str | os.PathLike[str]) -> None:
     """Refuse an `effects.yaml` that was made for another model than the environment's.
 
     The environment's model file must have the digest that the file names. Where the environment has no model file, its
@@ -67,7 +68,9 @@ def check_model(env: Any, path: str | Path) -> None:
     for name in _TELLING:
         a, b = getattr(theirs, name), getattr(mine, name)
         if a.shape != b.shape or not np.allclose(a, b, rtol=1e-6, atol=1e-9):
-            raise InputError(f"{path} was made for {beside}, which differs from the environment's model in {name}; {advice}")
+            raise InputError(
+                f"{path} was made for {beside}, which differs from the environment's model in {name}; {advice}"
+            )
 
 
 def _digest(file: Path) -> str:

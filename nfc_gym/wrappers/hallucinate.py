@@ -1,9 +1,9 @@
 """`Hallucinate`: a policy that chooses, within a posterior's uncertainty, the world in its favour.
 
 The Box action grows by pi_h in [-1, 1], and the world is mean + beta L pi_h (see `nfc_gym.wrappers.belief`). Mass and
-ground do not change in mid-stride: what the first action of an episode says of psi and delta_e holds until its end; delta_s
-follows each action. Until that first action the world is the posterior's mean, which also is what the agent is told of
-psi (`psi_belief`) throughout: it is trained to believe the mean, as it will on the robot.
+ground do not change in mid-stride: what the first action of an episode says of psi and delta_e holds until its end;
+delta_s follows each action. Until that first action the world is the posterior's mean, which also is what the agent is
+told of psi (`psi_belief`) throughout: it is trained to believe the mean, as it will on the robot.
 """
 
 import copy
@@ -85,8 +85,9 @@ class Hallucinate(_Hallucinating, EnvWrapper):
       space: psi of an environment that has none of its own, as for `RandomizePsi`.
       mode, components: of delta_s, as for `ResidualDynamics`; entries that are no physical state are left out.
 
-    Where the posterior speaks of delta_e, the first step begins the episode again from the same draws, on the ground that
-    was asked for. The action's layout is (own, psi, modes, delta_s): `belief` has the sizes; `fidelity` is what holds.
+    Where the posterior speaks of delta_e, the first step begins the episode again from the same draws, on the ground
+    that was asked for. The action's layout is (own, psi, modes, delta_s): `belief` has the sizes; `fidelity` is what
+    holds.
     """
 
     def __init__(
@@ -106,7 +107,14 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         psi = None if sampled.psi is None else space_of(env, sim.nominal, space, ())
         self.belief, self.beta = Belief(sampled, psi, modes), float(beta)
         super().__init__(
-            env, posterior=posterior, beta=beta, modes=modes, samples=samples, space=space, mode=mode, components=components
+            env,
+            posterior=posterior,
+            beta=beta,
+            modes=modes,
+            samples=samples,
+            space=space,
+            mode=mode,
+            components=components,
         )
         self.sim = sim
         self.own = int(np.prod(env.action_space.shape or (0,)))
@@ -169,8 +177,8 @@ class Hallucinate(_Hallucinating, EnvWrapper):
 class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
     """The same around a vector environment on `mujoco.batch`: each simulation holds what its own first action said.
 
-    delta_e cannot be chosen by an action there, since the batch is built anew for other terrains: a posterior that speaks of
-    it is refused (draw residual terrains between roll-outs with `VectorResidualTerrain`).
+    delta_e cannot be chosen by an action there, since the batch is built anew for other terrains: a posterior that
+    speaks of it is refused (draw residual terrains between roll-outs with `VectorResidualTerrain`).
     """
 
     def __init__(
@@ -186,7 +194,7 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
         sampled = drawn(posterior, samples)
         if sampled.delta_e is not None:
             raise InputError(
-                "VectorHallucinate: the posterior speaks of delta_e, which no action can choose in a vector environment; "
+                "VectorHallucinate: the posterior speaks of delta_e, which no action of a vector environment can choose: "
                 "give one of psi and delta_s, and put VectorResidualTerrain around for the ground"
             )
         sim = batch_simulation_of(env, "Hallucinate")

@@ -34,7 +34,8 @@ def camera_of(noise: Camera | None) -> terrain.DepthCamera:
     unknown = [k for k in noise if k not in known]
     if unknown:
         raise InputError(f"PerceiveTerrain: a depth camera has no {unknown[0]!r}; it has: {', '.join(known)}")
-    return terrain.DepthCamera(**{k: tuple(v) if isinstance(v, list) else v for k, v in noise.items()})
+    settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in noise.items()}
+    return terrain.DepthCamera(**settings)
 
 
 def with_map(space: gym.Space) -> spaces.Dict:
@@ -60,8 +61,8 @@ class PerceiveTerrain(EnvWrapper):
     """Gives the observation the key `elevation` as a depth camera on the base would make it.
 
     Args:
-      env: a MuJoCo environment with a floating base. The ground that is seen is the environment's `perceived` terrain where
-        it has one, else its model's heightfield or plane as they were at first. A plain observation becomes
+      env: a MuJoCo environment with a floating base. The ground that is seen is the environment's `perceived` terrain
+        where it has one, else its model's heightfield or plane as they were at first. A plain observation becomes
         `{"observation": ..., "elevation": ...}`.
       noise: a `terrain.DepthCamera`, or its settings by name: mount, field of view, range, noise, drift. Its rate and
         window say how often an image is taken and how long it is remembered.

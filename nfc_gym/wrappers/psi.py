@@ -28,12 +28,13 @@ class Prior:
 
     Args:
       space: what psi is.
-      distribution: a fraction f in (0, 1]: uniform between nominal - f (nominal - low) and nominal + f (high - nominal);
-        name -> (low, high): uniform, the rest nominal; or samples of psi: an array (d,) or (n, d), a posterior, a path.
+      distribution: a fraction f in (0, 1]: uniform between nominal - f (nominal - low) and nominal + f (high -
+        nominal); name -> (low, high): uniform, the rest nominal; or samples of psi: an array (d,) or (n, d), a
+        posterior, a path.
 
     Raises:
-      InputError: a fraction outside (0, 1], a name that the space lacks, bounds that are not ordered, a source of another
-        width.
+      InputError: a fraction outside (0, 1], a name that the space lacks, bounds that are not ordered, a source of
+        another width.
     """
 
     def __init__(self, space: ParameterSpace, distribution: Distribution) -> None:
@@ -85,7 +86,8 @@ def space_of(env: Any, model: mujoco.MjModel, space: Space | None, names: Sequen
     if isinstance(space, ParameterSpace):
         return space
     return ParameterSpace(
-        model, [_mass(model, p) if isinstance(p, str) else Parameter(**{**p, "of": tuple(p.get("of", ()))}) for p in space]
+        model,
+        [_mass(model, p) if isinstance(p, str) else Parameter(**{**p, "of": tuple(p.get("of", ()))}) for p in space],
     )
 
 
@@ -148,8 +150,8 @@ class RandomizePsi(EnvWrapper):
         model is edited, always from nominal, with inertias and derived constants following.
       distribution: see `Prior`; default the whole prior. With a mapping of body names and bounds in kg, an environment
         without psi needs no `space`.
-      space: psi of an environment that has none: a `ParameterSpace`, tables with the attributes of `Parameter`, or names of
-        bodies, whose masses then have a prior of half to one and a half times their nominal value.
+      space: psi of an environment that has none: a `ParameterSpace`, tables with the attributes of `Parameter`, or
+        names of bodies, whose masses then have a prior of half to one and a half times their nominal value.
 
     `reset(options={"psi": vector | {name: value}})` overrides the draw. `psi` and `psi_space` read back what holds.
     """

@@ -48,7 +48,7 @@ class _Recording:
 
     def _command(self) -> None:
         sim, self._physics_step = self.sim, 0
-        time = sim.bind("time")
+        time: Any = sim.bind("time")
         for row, tape in self.tapes.items():
             at = (row,) if sim.shape else ()
             tape.command(time[at] if at else time, sim.qpos[at], sim.qvel[at], sim.commanded[at])
@@ -111,8 +111,8 @@ class RecordLog(_Recording, EnvWrapper):
 class VectorRecordLog(_Recording, VectorEnvWrapper):
     """The same around a vector environment on `mujoco.batch`, a file for each episode of each simulation.
 
-    Made for tens of simulations: samples are taken row by row. On rough ground, whose pool holds many maps, no one model
-    is that of all logs: it is refused.
+    Made for tens of simulations: samples are taken row by row. On rough ground, whose pool holds many maps, no one
+    model is that of all logs: it is refused.
     """
 
     def __init__(self, env: VectorEnv, path: Path, model_file: Path | None = None) -> None:

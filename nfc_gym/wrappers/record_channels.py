@@ -92,7 +92,9 @@ def model_text(env: Any, model: mujoco.MjModel, given: str | None) -> str:
     compiled = spec.compile()
     sizes = [(m.nq, m.nv, m.nu, m.nbody, m.nsensordata) for m in (compiled, model)]
     if sizes[0] != sizes[1]:
-        raise InputError(f"RecordLog: {file} has (nq, nv, nu, nbody, nsensordata) = {sizes[0]}, the environment {sizes[1]}")
+        raise InputError(
+            f"RecordLog: {file} has (nq, nv, nu, nbody, nsensordata) = {sizes[0]}, the environment {sizes[1]}"
+        )
     called = names(compiled)
     for objects, wanted in (
         (spec.actuators, called.actuators),

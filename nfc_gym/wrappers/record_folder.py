@@ -51,8 +51,8 @@ class LogFolder:
         file = self.folder / "model.xml"
         if self.count and file.is_file() and file.read_text(encoding="utf-8") != text:
             raise InputError(
-                f"RecordLog: {self.folder} holds logs of another model, or of the same on other ground: record into another "
-                'folder, or hold the ground by reset(options={"terrain_id": ...})'
+                f"RecordLog: {self.folder} holds logs of another model, or of the same on other ground: record into "
+                'another folder, or hold the ground by reset(options={"terrain_id": ...})'
             )
         write_whole(file, text)
         self.text = text

@@ -34,5 +34,6 @@ class Tape:
 
     def record(self) -> dict[str, Array]:
         """`time` (T,), and `qpos`, `qvel`, `ctrl`, `sensordata`, (T, ...) each."""
-        whole = len(self.rows["sensordata"]) or len(self.time)  # a simulation that came apart never made its last reading
+        # A simulation that came apart never made its last reading.
+        whole = len(self.rows["sensordata"]) or len(self.time)
         return {"time": np.array(self.time[:whole]), **{k: np.array(v[:whole]) for k, v in self.rows.items()}}

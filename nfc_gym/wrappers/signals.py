@@ -44,7 +44,9 @@ class Channel:
             raise InputError(f"PerturbSignals: {key!r} is no Box of numbers: {space}")
         unknown = [k for k in fault if k not in Fault.__dataclass_fields__]
         if unknown:
-            raise InputError(f"PerturbSignals: {key}: no {unknown[0]!r}; there are: {', '.join(Fault.__dataclass_fields__)}")
+            raise InputError(
+                f"PerturbSignals: {key}: no {unknown[0]!r}; there are: {', '.join(Fault.__dataclass_fields__)}"
+            )
         self.fault = Fault(**fault)
         if int(self.fault.delay) != self.fault.delay or self.fault.delay < 0:
             raise InputError(f"PerturbSignals: {key}: delay counts control steps, 0 or more, got {self.fault.delay}")
@@ -58,9 +60,15 @@ class Channel:
 
     def _wide(self, key: str, space: spaces.Box, name: str) -> NDArray[np.float64]:
         value = np.asarray(getattr(self.fault, name), float)
-        if value.shape not in ((), space.shape) or not np.isfinite(value).all() or (name != "bias" and (value < 0).any()):
+        if (
+            value.shape not in ((), space.shape)
+            or not np.isfinite(value).all()
+            or (name != "bias" and (value < 0).any())
+        ):
             sign = "" if name == "bias" else ", none below 0"
-            raise InputError(f"PerturbSignals: {key}: {name} is a finite number or {space.shape} of them{sign}, got {value}")
+            raise InputError(
+                f"PerturbSignals: {key}: {name} is a finite number or {space.shape} of them{sign}, got {value}"
+            )
         return value
 
     def begin(self, first: NDArray[np.bool_] | None, rng: np.random.Generator) -> None:
@@ -108,7 +116,9 @@ def channels(noise: Noise, observed: gym.Space, acted: gym.Space, batch: tuple[i
     Raises:
       InputError: a key that is neither `action` nor of the observation, or a fault that is none.
     """
-    known: dict[str, gym.Space] = dict(observed.items()) if isinstance(observed, spaces.Dict) else {OBSERVATION: observed}
+    known: dict[str, gym.Space] = (
+        dict(observed.items()) if isinstance(observed, spaces.Dict) else {OBSERVATION: observed}
+    )
     known[ACTION] = acted
     for key in noise:
         if key not in known:
@@ -144,8 +154,8 @@ class PerturbSignals(_Perturbing, EnvWrapper):
 
     Args:
       env: the environment.
-      noise: signal -> `Fault` as a mapping: `{"proprio": {"sd": 0.01, "delay": 1}, "action": {"bias": 0.05}}`. Signals are
-        the keys of a Dict observation, `observation` where it is a Box, and `action` (the motors).
+      noise: signal -> `Fault` as a mapping: `{"proprio": {"sd": 0.01, "delay": 1}, "action": {"bias": 0.05}}`. Signals
+        are the keys of a Dict observation, `observation` where it is a Box, and `action` (the motors).
 
     Results stay inside the spaces. All zeros change nothing.
     """

@@ -1,11 +1,11 @@
 """The physics beneath an environment, as the wrappers around it share it.
 
-All wrappers of one environment meet in one `Simulation`: model edits start from the same nominal model, forces add up, and
-whoever acts at each physics step is called there in the order in which the wrappers were put on, innermost first.
+All wrappers of one environment meet in one `Simulation`: model edits start from the same nominal model, forces add up,
+and whoever acts at each physics step is called there in the order in which the wrappers were put on, innermost first.
 
 What the hooks need is a place between two physics steps. An environment that keeps lists called `substep_hooks` and
 `after_hooks` offers it itself; Gymnasium's `MujocoEnv` (and whatever holds one, as the mazes of gymnasium-robotics do)
-is stepped here in place of its own `_step_mujoco_simulation`, and gymnasium-robotics' robots in place of `_mujoco_step`.
+is stepped here in place of its own `_step_mujoco_simulation`.
 """
 
 import copy
@@ -91,11 +91,8 @@ class Simulation:
         """Length of a control step, s."""
         env = self.env
         skip = getattr(env, "frame_skip", None) or getattr(self.owner, "frame_skip", None)
-        skip = skip or getattr(env, "n_substeps", None)
         if not skip:
-            raise InputError(
-                f"{type(env).__name__} says neither `frame_skip` nor `n_substeps`: its control step is unknown"
-            )
+            raise InputError(f"{type(env).__name__} does not say its `frame_skip`: its control step is unknown")
         return float(self.model.opt.timestep) * int(skip)
 
     @property
@@ -107,8 +104,8 @@ class Simulation:
 class SingleSimulation(Simulation):
     """One environment with `model` and `data`.
 
-    An environment with `fields` (a `ModelFields` of its model, brought back to nominal at each of its resets) has its own
-    psi: edits are then made right after a reset. Any other's model is edited right before.
+    An environment with `fields` (a `ModelFields` of its model, brought back to nominal at each of its resets) has its
+    own psi: edits are then made right after a reset. Any other's model is edited right before.
     """
 
     def __init__(self, env: Any) -> None:
@@ -180,9 +177,9 @@ class SingleSimulation(Simulation):
         if not how or (after and how == "substep_hooks" and not hasattr(owner, "after_hooks")):
             place = "after the last physics step" if how else "between physics steps"
             raise InputError(
-                f"{who} acts {place}, and {type(self.env).__name__} has no place for that: it needs `substep_hooks` and "
-                "`after_hooks`, lists of callables that it calls with itself before every mj_step and after the last "
-                "one of a control step, or to be stepped by gymnasium's MujocoEnv"
+                f"{who} acts {place}, and {type(self.env).__name__} has no place for that: it needs `substep_hooks` "
+                "and `after_hooks`, lists of callables that it calls with itself before every mj_step and after "
+                "a control step's last, or to be stepped by gymnasium's MujocoEnv"
             )
         if self.attached:
             return
@@ -256,17 +253,6 @@ class SingleSimulation(Simulation):
                     original(self.ctrl.copy(), 1)
             if plain:  # as the original does after its steps
                 mujoco.mj_rnePostConstraint(model, data)
-        self._end()
-
-    def run_robot(self, original: Callable[..., None], action: Any, frames: int) -> None:
-        """A control step in place of gymnasium-robotics' `_mujoco_step`."""
-        self._begin()
-        if not self.on_substep:
-            original(action)
-        else:
-            for _ in range(frames):
-                self._substep()
-                mujoco.mj_step(self.env.model, self.data)
         self._end()
 
 

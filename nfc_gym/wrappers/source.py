@@ -53,7 +53,7 @@ class Draws:
 
 def _sampler(source: Any, part: str, who: str) -> Sampler:
     if isinstance(source, str | os.PathLike):
-        return load_source(source)
+        return load_source(os.fspath(source))
     if isinstance(source, Sampler) and not isinstance(source, np.ndarray):
         return source
     try:

@@ -1,11 +1,13 @@
-"""Where physics steps of environments written by others can be met: in place of the method that makes them."""
+"""Where the physics steps of environments written by others can be met: in place of the method that makes them."""
 
 from collections.abc import Iterable
 from typing import Any
 
+_METHOD = "_step_mujoco_simulation"  # of gymnasium's MujocoEnv: (command, physics steps)
+
 
 class Stepped:
-    """Takes the place of a method of one environment, and is pickled as that method."""
+    """Takes the place of that method of one environment, and is pickled as that method."""
 
     def __init__(self, owner: Any, name: str, simulation: Any) -> None:
         self.owner, self.name, self.simulation = owner, name, simulation
@@ -16,11 +18,9 @@ class Stepped:
     def __reduce__(self) -> tuple[Any, ...]:
         return getattr, (self.owner, self.name)
 
-    def __call__(self, *args: Any) -> None:
-        if self.name == "_mujoco_step":
-            self.simulation.run_robot(self.original, args[0], int(self.owner.n_substeps))
-        else:
-            self.simulation.run(self.original, self.plain, *args)
+    def __call__(self, ctrl: Any, n_frames: int) -> None:
+        """A control step, with the simulation's hooks in it."""
+        self.simulation.run(self.original, self.plain, ctrl, n_frames)
 
 
 def stepper_of(env: Any) -> tuple[Any, str] | None:
@@ -29,9 +29,6 @@ def stepper_of(env: Any) -> tuple[Any, str] | None:
         return env, "substep_hooks"
     held: Iterable[Any] = (env, *vars(env).values())
     for thing in held:
-        if getattr(thing, "data", None) is not env.data:
-            continue
-        for name in ("_step_mujoco_simulation", "_mujoco_step"):
-            if callable(getattr(thing, name, None)):
-                return thing, name
+        if getattr(thing, "data", None) is env.data and callable(getattr(thing, _METHOD, None)):
+            return thing, _METHOD
     return None

@@ -28,8 +28,8 @@ _FOOTPRINT = 1.0  # m around a start within which the ground must not rise into 
 class Ground:
     """The heightfield beneath an environment, to which residuals are added.
 
-    An environment with a `heightfield` of its own takes them by `reset(options={"terrain_residual": ...})`. Of any other
-    the model's only heightfield is written, and the start in `init_qpos` rises with the ground around it.
+    An environment with a `heightfield` of its own takes them by `reset(options={"terrain_residual": ...})`. Of any
+    other the model's only heightfield is written, and the start in `init_qpos` rises with the ground around it.
 
     Attributes:
       shape: (rows, columns).
@@ -44,7 +44,9 @@ class Ground:
         model = sim.model
         names = names_of(model, mujoco.mjtObj.mjOBJ_HFIELD, model.nhfield)
         if len(names) != 1 or not names[0]:
-            found = f"its model has {len(names)} of them: {', '.join(map(repr, names))}" if names else "it stands on none"
+            found = (
+                f"its model has {len(names)} of them: {', '.join(map(repr, names))}" if names else "it stands on none"
+            )
             raise InputError(
                 f"{who} needs an environment on one named heightfield, and {type(base).__name__} is none: {found}"
                 + ("; use its Rough variant" if hasattr(base, "psi_space") and not names else "")
@@ -91,12 +93,16 @@ def read_ground(model: mujoco.MjModel, who: str) -> terrain.Heightfield:
     if model.nhfield == 0:
         planes = np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (model.geom_bodyid == 0))
         if len(planes) != 1:
-            raise InputError(f"{who}: the model has no heightfield and {len(planes)} planes; want one of either as ground")
+            raise InputError(
+                f"{who}: the model has no heightfield and {len(planes)} planes; want one of either as ground"
+            )
         return terrain.Heightfield(np.full(terrain.SHAPE, model.geom_pos[planes[0], 2], np.float32))
     rows, cols = int(model.hfield_nrow[0]), int(model.hfield_ncol[0])
     geoms = np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)) & (model.geom_dataid == 0))
     if model.nhfield > 1 or len(geoms) != 1:
-        raise InputError(f"{who}: the model has {model.nhfield} heightfields, {len(geoms)} geoms of the first; want one each")
+        raise InputError(
+            f"{who}: the model has {model.nhfield} heightfields, {len(geoms)} geoms of the first; want one each"
+        )
     x, y, z = model.geom_pos[geoms[0]]
     half_x, half_y, span, _ = model.hfield_size[0]
     resolution = 2 * half_x / (cols - 1)
@@ -140,8 +146,9 @@ class ResidualTerrain(EnvWrapper):
 class VectorResidualTerrain(VectorEnvWrapper):
     """The same around a vector environment on `mujoco.batch`, whose simulations choose from a pool of maps.
 
-    Each map of the pool gets a residual of its own at every `reset` of all environments, for which the batch is built anew
-    (tens of ms for 1000 simulations); with a single sample, only at the first. Autoresets choose among the maps as before.
+    Each map of the pool gets a residual of its own at every `reset` of all environments, for which the batch is built
+    anew (tens of ms for 1000 simulations); with a single sample, only at the first. Autoresets choose among the maps
+    as before.
     """
 
     def __init__(self, env: VectorEnv, source: Source) -> None:
@@ -166,8 +173,8 @@ class VectorResidualTerrain(VectorEnvWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw residuals where all environments are reset, then reset."""
-        everyone = (options or {}).get("reset_mask") is None or bool(np.all(options["reset_mask"]))  # type: ignore[index]
-        rng = self.stream(seed)
+        mask = (options or {}).get("reset_mask")
+        everyone, rng = mask is None or bool(np.all(mask)), self.stream(seed)
         if self._delta is None or (everyone and not self._constant):
             self._delta = self.draws.draw(len(self.perceived), rng)
             truth = [(m.heights + d).astype(np.float32) for m, d in zip(self.perceived, self._delta, strict=True)]

@@ -2,7 +2,7 @@
 
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import mujoco
@@ -37,14 +37,17 @@ STATELESS = ZOO.replace(' dyntype="filterexact" dynprm=".05"', "")
 class FakeEnv(MujocoEnv, EzPickle):
     """A model given as text, stepped as Gymnasium steps its own; observes qpos and qvel."""
 
-    metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 50}
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
+        "render_fps": 50,
+    }
 
     def __init__(self, xml: str = CUBE, frame_skip: int = 4, **kwargs: Any) -> None:
         EzPickle.__init__(self, xml, frame_skip, **kwargs)
         folder = Path(tempfile.mkdtemp())
         (folder / "fake.xml").write_text(xml)
         model = mujoco.MjModel.from_xml_string(xml)
-        self.metadata = {**self.metadata, "render_fps": int(round(1 / (model.opt.timestep * frame_skip)))}
+        self.metadata = {**self.metadata, "render_fps": round(1 / (model.opt.timestep * frame_skip))}
         box = spaces.Box(-np.inf, np.inf, (model.nq + model.nv,), np.float64)
         super().__init__(str(folder / "fake.xml"), frame_skip, box, **kwargs)
         self.start = (self.init_qpos, self.init_qvel)

@@ -89,7 +89,10 @@ def test_null_is_no_wrapper_bit_for_bit(family: str) -> None:
 
 
 def test_hidden_states_begin_anew_with_each_episode() -> None:
-    effects = [make("delay", "push", {"delay": 0.05}), make("thermal", "push", {"fade": 0.3, "time_constant": 0.1, "reference": 1})]
+    effects = [
+        make("delay", "push", {"delay": 0.05}),
+        make("thermal", "push", {"fade": 0.3, "time_constant": 0.1, "reference": 1}),
+    ]
     env = ApplyEffects(ZooEnv(), effects)
     first, second = roll(env, 8), roll(env, 8)
     same(first, second)

@@ -17,7 +17,10 @@ from nfc_gym.wrappers.belief import Belief
 
 SPACE = ParameterSpace(
     FakeEnv().model,
-    [Parameter("cube", "body_mass", ("cube",), "kg", 0.5, 2.0), Parameter("pole", "body_mass", ("pole",), "kg", 0.2, 1.0)],
+    [
+        Parameter("cube", "body_mass", ("cube",), "kg", 0.5, 2.0),
+        Parameter("pole", "body_mass", ("pole",), "kg", 0.2, 1.0),
+    ],
 )
 
 

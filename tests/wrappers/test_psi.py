@@ -82,7 +82,10 @@ def test_nominal_is_no_wrapper_bit_for_bit() -> None:
 
 def test_spec_and_pickle(tmp_path: Path) -> None:
     Fidelity(psi=np.array([[0.2], [0.3]])).save(tmp_path / "psi.npz")
-    for arguments in ({"distribution": {"torso": [0.1, 0.4]}}, {"distribution": tmp_path / "psi.npz", "space": ["torso"]}):
+    for arguments in (
+        {"distribution": {"torso": [0.1, 0.4]}},
+        {"distribution": tmp_path / "psi.npz", "space": ["torso"]},
+    ):
         env = RandomizePsi(gym.make("Ant-v5"), **arguments)
         expected = roll(env, 4)
         same(roll(pickle.loads(pickle.dumps(env)), 4), expected)

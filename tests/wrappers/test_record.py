@@ -67,8 +67,12 @@ def test_columns_are_what_the_simulation_was(tmp_path: Path) -> None:
 
 
 def test_an_accelerometer_shows_the_command_of_its_own_step(tmp_path: Path) -> None:
-    xml = "<mujoco><option timestep='.005' gravity='0 0 0'/><worldbody><body><joint name='x' type='slide' axis='1 0 0'/>"
-    xml += "<geom size='.1' mass='2'/><site name='s'/></body></worldbody><actuator><motor name='m' joint='x'/></actuator>"
+    xml = (
+        "<mujoco><option timestep='.005' gravity='0 0 0'/><worldbody><body><joint name='x' type='slide' axis='1 0 0'/>"
+    )
+    xml += (
+        "<geom size='.1' mass='2'/><site name='s'/></body></worldbody><actuator><motor name='m' joint='x'/></actuator>"
+    )
     xml += "<sensor><accelerometer name='a' site='s'/></sensor></mujoco>"
     for frames in (1, 4):
         env = RecordLog(FakeEnv(xml, frames), tmp_path / str(frames))
@@ -183,7 +187,11 @@ def test_rows_of_a_vector_environment_have_files_of_their_own(mode, tmp_path: Pa
             env.reset(options={"reset_mask": ended | truncated})
     env.close()
     files = sorted((tmp_path / "many").glob("*.parquet"))
-    assert [len(read_table(f)["time"]) for f in files] == [5, 5, *[3 if mode is gym.vector.AutoresetMode.NEXT_STEP else 4] * 2]
+    assert [len(read_table(f)["time"]) for f in files] == [
+        5,
+        5,
+        *[3 if mode is gym.vector.AutoresetMode.NEXT_STEP else 4] * 2,
+    ]
     for row in range(2):
         single = RecordLog(gym.make("nfc_gym/JackalFlat-v0", context=[]), tmp_path / f"one{row}")
         single.reset(seed=7 + row)

@@ -14,7 +14,10 @@ class Counting(gym.Env):
     """Observes how many steps were made, tenfold beside it, and what action came."""
 
     observation_space = spaces.Dict(
-        {"count": spaces.Box(-np.inf, np.inf, (2,), np.float64), "action": spaces.Box(-np.inf, np.inf, (1,), np.float32)}
+        {
+            "count": spaces.Box(-np.inf, np.inf, (2,), np.float64),
+            "action": spaces.Box(-np.inf, np.inf, (1,), np.float32),
+        }
     )
     action_space = spaces.Box(-1, 1, (1,), np.float32)
 

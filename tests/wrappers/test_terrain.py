@@ -28,7 +28,10 @@ RAMP = """
 
 
 def test_the_simulator_gets_the_residual_and_the_policy_does_not() -> None:
-    bare, env = gym.make("nfc_gym/JackalRough-v0", **ROUGH), ResidualTerrain(gym.make("nfc_gym/JackalRough-v0", **ROUGH), BOWL)
+    bare, env = (
+        gym.make("nfc_gym/JackalRough-v0", **ROUGH),
+        ResidualTerrain(gym.make("nfc_gym/JackalRough-v0", **ROUGH), BOWL),
+    )
     seen, _ = bare.reset(seed=3)
     told, _ = env.reset(seed=3)
     base, plain = env.unwrapped, bare.unwrapped
@@ -74,7 +77,8 @@ def test_heightfields_of_others_are_written_and_the_start_rises() -> None:
 def test_what_lies_on_the_ground_lies_higher() -> None:
     """A ball in a trough comes to rest higher by the residual there."""
     trough = RAMP.replace(
-        RAMP.split('elevation="')[1].split('"')[0], " ".join(str(abs(j - 10) / 10) for i in range(21) for j in range(21))
+        RAMP.split('elevation="')[1].split('"')[0],
+        " ".join(str(abs(j - 10) / 10) for i in range(21) for j in range(21)),
     )
     heights = []
     for env in (FakeEnv(trough), ResidualTerrain(FakeEnv(trough), 0.25 * np.ones((21, 21)))):

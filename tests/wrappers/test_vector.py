@@ -36,7 +36,11 @@ ID = "nfc_gym/JackalFlat-v0"
 NV = 10
 SLIP = {"family": "slip", "where": "ground", "parameters": {"lateral": 0.4, "longitudinal": 0.1, "creep": 2.0}}
 DELAY = {"family": "delay", "where": "front_left", "parameters": {"delay": 0.017}}
-HEAT = {"family": "thermal", "where": "rear_right", "parameters": {"fade": 0.4, "time_constant": 0.1, "reference": 10.0}}
+HEAT = {
+    "family": "thermal",
+    "where": "rear_right",
+    "parameters": {"fade": 0.4, "time_constant": 0.1, "reference": 10.0},
+}
 DRY = {"family": "coulomb", "where": "rear_left_wheel", "parameters": {"level": 0.3}}
 LOAD = {"family": "payload", "where": "base", "parameters": {"mass": 3.0, "x": 0.1, "y": 0.0, "z": 0.1}}
 EFFECTS = [SLIP, DELAY, HEAT, DRY, LOAD]
@@ -180,7 +184,9 @@ def test_residual_terrain_reaches_the_simulator_but_not_the_map() -> None:
         for _ in range(8):
             observation, *_ = both.step(np.full((N, 2), 0.5))
     assert np.isfinite(observation["proprio"]).all()
-    two = VectorResidualTerrain(gym.make_vec("nfc_gym/JackalRough-v0", **arguments), np.arange(5.0)[:, None, None] * np.ones((256, 256)))
+    two = VectorResidualTerrain(
+        gym.make_vec("nfc_gym/JackalRough-v0", **arguments), np.arange(5.0)[:, None, None] * np.ones((256, 256))
+    )
     drawn = set()
     for _ in range(4):
         two.reset()

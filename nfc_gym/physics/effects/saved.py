@@ -25,14 +25,17 @@ def to_row(effect: Effect, theta: Array) -> dict[str, Any]:
 
 
 def from_row(row: Mapping[str, Any]) -> tuple[Effect, Array]:
-    """An effect and its values from a row: `family`, `where`, `parameters`, and `each` or `own_values` where it has some.
+    """An effect and its values from a row: `family`, `where`, `parameters`, and `each` or `own_values` where it has
+    some.
 
     Raises:
       InputError: a key is missing, or the family, a parameter or a value is none.
     """
     missing = [k for k in ("family", "where", "parameters") if k not in row]
     if missing:
-        raise InputError(f"an effect needs the keys family, where, parameters; {missing[0]!r} is missing in {dict(row)}")
+        raise InputError(
+            f"an effect needs the keys family, where, parameters; {missing[0]!r} is missing in {dict(row)}"
+        )
     try:
         if not (row.get("each") or row.get("own_values")):
             return build(row["family"], row["where"], row["parameters"])
@@ -46,5 +49,7 @@ def from_row(row: Mapping[str, Any]) -> tuple[Effect, Array]:
     except (TypeError, KeyError, ValueError) as e:
         if isinstance(e, InputError):
             raise
-        raise InputError(f"effect {row['family']!r} of {row['where']!r}: a parameter's value is no number ({e})") from None
+        raise InputError(
+            f"effect {row['family']!r} of {row['where']!r}: a parameter's value is no number ({e})"
+        ) from None
     return each(members), np.concatenate(thetas)
