@@ -1,6 +1,7 @@
 """The legged robots stand, fall without gaining energy, feel their weight at the feet, and are alike on both sides."""
 
 import itertools
+import tomllib
 
 import mujoco
 import numpy as np
@@ -27,6 +28,10 @@ def load(robot: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
+def names_of_psi(robot: str) -> list[str]:
+    return [p["name"] for p in tomllib.loads((assets.path(robot).parent / "psi.toml").read_text())["parameter"]]
+
+
 def other_side(robot: str, name: str) -> str:
     """The name of an element's mirror image."""
     left, right = {"ant": ("_left", "_right"), "humanoid": ("left_", "right_"), "quadruped": ("L_", "R_")}[robot]
@@ -48,6 +53,20 @@ def mirror(robot: str, model: mujoco.MjModel, q: NDArray, v: NDArray) -> tuple[N
         mq[twin.qposadr[0]] = sign(robot, name) * q[model.jnt_qposadr[j]]
         mv[twin.dofadr[0]] = sign(robot, name) * v[model.jnt_dofadr[j]]
     return mq, mv
+
+
+def test_psi_is_in_the_documented_order() -> None:
+    """Masses from the torso outwards, then stiffnesses; the Humanoid's in the order of its bodies and joints."""
+    corners = ("front_left", "front_right", "rear_left", "rear_right")
+    ant = ["torso_mass", *(f"{c}_{part}_mass" for part in ("hip", "leg", "foot") for c in corners)]
+    ant += [f"{c}_{joint}_stiffness" for joint in ("hip", "ankle") for c in corners]
+    assert names_of_psi("ant") == ant
+    legs = ("FL", "FR", "RL", "RR")
+    quadruped = ["base_mass", *(f"{leg}_{part}_mass" for part in ("thigh", "shank") for leg in legs)]
+    assert names_of_psi("quadruped") == quadruped + [f"{leg}_hip_stiffness" for leg in legs]
+    model, _ = load("humanoid")
+    humanoid = [f"{model.body(i).name}_mass" for i in range(1, model.nbody)]
+    assert names_of_psi("humanoid") == humanoid + [f"{model.joint(i).name}_stiffness" for i in range(1, model.njnt)]
 
 
 @pytest.mark.parametrize("robot", WALKERS)
