@@ -65,7 +65,7 @@ class Components:
             self._named(model, list(names))
         self.to = np.array([t for t, _ in self.pairs], np.intp)
         self.of = np.array([i for _, i in self.pairs], np.intp)
-        self.direct = not self.vectors and size == len(self.pairs) and bool((self.of == np.arange(size)).all())
+        self.direct = names is None  # velocities, or all of the tangent vector, in its order
 
     def _plain(self, size: int) -> None:
         if size not in (self.nv, 2 * self.nv):
@@ -105,6 +105,12 @@ class Components:
         key = (body, match["bq"], match["own"] is not None)
         qpos, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         self.vectors.setdefault(key, _Vector(match["bq"], key[2], qpos, dof, {})).places[axis] = i
+
+    def velocity(self, qpos: Array, delta_s: Array) -> Array:
+        """The velocities (..., nv) alone."""
+        if self.direct:
+            return delta_s[..., -self.nv :]
+        return self.tangent(qpos, delta_s)[..., self.nv :]
 
     def tangent(self, qpos: Array, delta_s: Array) -> Array:
         """Tangent vector (..., 2 nv), positions then velocities, of delta_s (..., size) at configuration (..., nq)."""

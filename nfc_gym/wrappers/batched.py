@@ -105,7 +105,7 @@ class BatchSimulation(Simulation):
         self.commanded = np.array(self.ctrl)
         for hook in self.on_control:
             hook()
-        if self.on_substep:
+        if self.pushed and self.on_substep:
             self._held[0][...] = self.qfrc_applied
             self._held[1][...] = self.xfrc_applied
 
@@ -114,8 +114,9 @@ class BatchSimulation(Simulation):
         self.qfrc_applied[...], self.xfrc_applied[...] = self._held
 
     def _end(self) -> None:
-        self.qfrc_applied[...] = 0
-        self.xfrc_applied[...] = 0
+        if self.pushed:
+            self.qfrc_applied[...] = 0
+            self.xfrc_applied[...] = 0
         for hook in self.on_after:
             hook()
 

@@ -75,6 +75,16 @@ class Belief:
         self.modes = left.T @ spread / np.where(scale > 0, scale, 1)[:, None]
         return left * scale
 
+    def held_part(self, h: Array, beta: float) -> Array:
+        """What the held entries of h (..., held) alone make of delta_s, (..., s): to be given to `follow`."""
+        h = np.minimum(np.maximum(h, -1.0), 1.0)
+        return self.mean[self.held :] + beta * (self.root[self.held :, : self.held] * h[..., None, :]).sum(-1)
+
+    def follow(self, held: Array, h: Array, beta: float) -> Array:
+        """delta_s (..., s) from `held_part` and the other entries of h (..., s): what `at` gives, at a step's price."""
+        h = np.minimum(np.maximum(h, -1.0), 1.0)
+        return held + beta * (self.root[self.held :, self.held :] * h[..., None, :]).sum(-1)
+
     def at(self, h: Array, beta: float) -> Fidelity:
         """The fidelity at mean + beta L h, h (..., size) clipped to [-1, 1]."""
         h = np.minimum(np.maximum(h, -1.0), 1.0)

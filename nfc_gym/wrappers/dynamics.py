@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.residual import Components
-from nfc_gym.physics.state import Inertia, Tangent
+from nfc_gym.physics.state import Inertia, move
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.simulation import Simulation, simulation_of
@@ -38,28 +38,45 @@ class Injection:
 
     def __init__(self, sim: Simulation, components: Components, mode: Mode, noise: Array) -> None:
         self.sim, self.components, self.mode, self.noise = sim, components, mode, noise
+        self.noisy, self.steady = bool(noise.shape[1]), components.direct and not noise.shape[1]
+        self.duration, self.observing = sim.duration(), bool(components.observed.size)
         self.bias = self.delta = np.zeros((*sim.shape, components.size))
         self.rng: np.random.Generator = np.random.default_rng(0)
-        self.duration = sim.duration()
         sim.bind("M")
-        self.inertia, self.tangent = Inertia(sim.model), Tangent(sim.model)
+        self.inertia = Inertia(sim.model)
         sim.on_control.append(self.begin)
-        if mode == "state":
+        if mode == "force":
+            sim.pushed = True
+        else:
             sim.on_after.append(self.add)
+
+    @property
+    def bias(self) -> Array:
+        """(..., s) what holds for an episode; to be set, not to be written into."""
+        return self._bias
+
+    @bias.setter
+    def bias(self, value: Array) -> None:
+        self._bias = value
+        if self.steady:  # the acceleration is the same in every step
+            self._acceleration = np.ascontiguousarray(value[..., -self.components.nv :]) / self.duration
 
     def begin(self) -> None:
         """Draw the step's noise, and push."""
-        self.delta = self.bias
-        if self.noise.shape[1]:
-            self.delta = self.bias + self.rng.standard_normal((*self.sim.shape, self.noise.shape[1])) @ self.noise.T
+        self.delta = self._bias
+        if self.noisy:
+            self.delta = self._bias + self.rng.standard_normal((*self.sim.shape, self.noise.shape[1])).dot(self.noise.T)
         if self.mode == "force":
-            velocity = self.components.tangent(self.sim.qpos, self.delta)[..., self.components.nv :]
-            self.sim.qfrc_applied[...] += self.inertia.times(self.sim.bind("M"), velocity) / self.duration
+            sim = self.sim
+            if not self.steady:
+                self._acceleration = self.components.velocity(sim.qpos, self.delta) / self.duration
+            applied = sim.qfrc_applied
+            applied += self.inertia.times(sim.bind("M"), self._acceleration)
 
     def add(self) -> None:
         """Add positions and velocities outright."""
         step, nv = self.components.tangent(self.sim.qpos, self.delta), self.components.nv
-        self.sim.qpos[...] = self.tangent.integrate(self.sim.qpos, step[..., :nv])
+        move(self.sim.model, self.sim.qpos, np.ascontiguousarray(step[..., :nv]))
         self.sim.qvel[...] += step[..., nv:]
 
     def observe(self, values: Array) -> Array:
@@ -118,7 +135,7 @@ class _Observing:
     key: str | None
 
     def _observed(self, observation: Any) -> Any:
-        if not self.injection.components.observed.size:
+        if not self.injection.observing:
             return observation
         if self.key is None:
             return self.injection.observe(observation)

@@ -85,6 +85,7 @@ class Application:
             sim.attach("ApplyEffects")
             sim.on_control.append(self._begin)
             sim.on_substep.append(self._act)
+            sim.pushed = sim.pushed or bool(self.acting.pushing)
         sim.senses += [
             lambda channel, series, step, e=e, t=t: e.sense(channel, series, t, step)
             for e, t in zip(self.effects, values, strict=True)

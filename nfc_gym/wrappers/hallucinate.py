@@ -124,20 +124,27 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         if self.ground is not None and self.belief.shape != self.ground.shape:
             raise InputError(f"Hallucinate: delta_e has shape {self.belief.shape}, the ground {self.ground.shape}")
         self.injection = injection_of(env, sim, self.belief, mode, components)
-        self._held: Array | None = None
+        self._h = np.zeros(self.belief.size)
+        self._chosen = False
+        self._made = self.belief.held_part(self._h[: self.belief.held], self.beta)
         self._again: tuple[Any, ...] = ()
-        self.fidelity = self.belief.at(np.zeros(self.belief.size), self.beta)
+
+    @property
+    def fidelity(self) -> Fidelity:
+        """What holds now: psi and delta_e as the episode's first action has chosen them, delta_s as the last one did."""
+        return self.belief.at(self._h, self.beta)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in the posterior's mean."""
-        self._held = None
+        self._chosen = False
         state = copy.deepcopy(self.env.unwrapped.np_random.bit_generator.state) if seed is None else None
         self._again = (seed, options, state)
-        self.fidelity = self.belief.at(np.zeros(self.belief.size), self.beta)
+        self._h = np.zeros(self.belief.size)
         return self._begin(seed, options)
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
         world = self.fidelity
+        self._made = self.belief.held_part(self._h[: self.belief.held], self.beta)
         if self.psi is not None and world.psi is not None:
             mean = self.belief.at(np.zeros(self.belief.size), self.beta).psi
             if self.psi.own:
@@ -152,15 +159,13 @@ class Hallucinate(_Hallucinating, EnvWrapper):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step in the world that the action asks for."""
-        h = np.asarray(action[self.own :], float)
-        first = self._held is None
-        if self._held is None:
-            self._held = h[: self.belief.held].copy()
-        self.fidelity = self.belief.at(np.concatenate([self._held, h[self.belief.held :]]), self.beta)
-        if first:
+        held, h = self.belief.held, np.asarray(action[self.own :], float)
+        if not self._chosen:
+            self._h, self._chosen = h.copy(), True
             self._enter()
-        if self.injection is not None and self.fidelity.delta_s is not None:
-            self.injection.bias = self.fidelity.delta_s
+        if self.injection is not None:
+            self._h[held:] = h[held:]
+            self.injection.bias = self.belief.follow(self._made, h[held:], self.beta)
         return self.env.step(action[: self.own])
 
     def _enter(self) -> None:
@@ -170,8 +175,11 @@ class Hallucinate(_Hallucinating, EnvWrapper):
             if state is not None:
                 self.env.unwrapped.np_random.bit_generator.state = state
             self._begin(seed, options)
-        elif self.psi is not None and self.fidelity.psi is not None:
-            self.psi.write(self.fidelity.psi)
+            return
+        self._made = self.belief.held_part(self._h[: self.belief.held], self.beta)
+        psi = self.fidelity.psi
+        if self.psi is not None and psi is not None:
+            self.psi.write(psi)
 
 
 class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
@@ -194,7 +202,7 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
         sampled = drawn(posterior, samples)
         if sampled.delta_e is not None:
             raise InputError(
-                "VectorHallucinate: the posterior speaks of delta_e, which no action of a vector environment can choose: "
+                "VectorHallucinate: the posterior speaks of delta_e, which no action of a vector environment can choose; "
                 "give one of psi and delta_s, and put VectorResidualTerrain around for the ground"
             )
         sim = batch_simulation_of(env, "Hallucinate")

@@ -38,6 +38,7 @@ class Simulation:
       shape: leading batch shape, () or (n,).
       commanded: (..., nu) what the environment sent to the actuators in this control step, before any effect.
       started: which simulations are in the first control step of an episode: a bool, or (n,) bool.
+      pushed: whether any hook applies forces, which are then taken back after each control step.
       on_control: called once a control step, before its first physics step.
       on_substep: called before every physics step.
       on_after: called after the last physics step of a control step, before anything is observed.
@@ -61,6 +62,7 @@ class Simulation:
         self.edits: list[tuple[int, Callable[[ModelFields], None]]] = []
         self.senses: list[Callable[[str, Array, float], Array]] = []
         self.commanded = np.zeros(0)
+        self.pushed = False
         self.attached = False
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
@@ -206,13 +208,15 @@ class SingleSimulation(Simulation):
         if data.time < self._time:  # the clock of an episode that was begun by whomever went back
             self.started = True
         self.commanded = self.ctrl.copy()
-        self._base[0][:] = self.qfrc_applied
-        self._base[1][:] = self.xfrc_applied
+        if self.pushed:
+            self._base[0][:] = self.qfrc_applied
+            self._base[1][:] = self.xfrc_applied
         for hook in self.on_control:
             hook()
         self.started, self._inside = False, True
-        self._held[0][:] = self.qfrc_applied
-        self._held[1][:] = self.xfrc_applied
+        if self.pushed and self.on_substep:
+            self._held[0][:] = self.qfrc_applied
+            self._held[1][:] = self.xfrc_applied
 
     def restore_forces(self) -> None:
         """See `Simulation`."""
@@ -223,8 +227,9 @@ class SingleSimulation(Simulation):
             hook()
 
     def _end(self) -> None:
-        self.qfrc_applied[:] = self._base[0]
-        self.xfrc_applied[:] = self._base[1]
+        if self.pushed:
+            self.qfrc_applied[:] = self._base[0]
+            self.xfrc_applied[:] = self._base[1]
         for hook in self.on_after:
             hook()
         self._time = self.data.time
