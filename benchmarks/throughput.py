@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the policies' libraries: the cores are the simulations'
@@ -119,7 +120,8 @@ def vector(table: Table, ids: list[str], sizes: list[int], turns: int) -> None:
             def same_state(env=env, raw=raw, nominal=nominal) -> None:
                 raw.state[...] = nominal.state[...] = env.batch.state
 
-            took = race({"ours": ours, "raw": lambda: bare(raw), "nominal": lambda: bare(nominal)}, turns, same_state)
+            contestants = {"ours": ours, "raw": partial(bare, raw), "nominal": partial(bare, nominal)}
+            took = race(contestants, turns, same_state)
             work, goal = n * chunk, 0.90 if env.rough else 0.95
             table.add(f"{name} n={n}: vector environment", work / took["ours"], "steps/s", baseline=work / took["raw"])
             table.add(
@@ -223,7 +225,8 @@ def ant(table: Table, sizes: list[int], turns: int) -> None:
             table.add(f"Ant-v5 {forces} contact forces, n={n}: ours", work / took["ours"], "steps/s")
             for peer in took.keys() - {"ours"}:
                 least = None if peer != "EnvPool" else 1.05 if n >= 1024 else 1.3 if n == 16 else None
-                table.add(f"Ant-v5 {forces} contact forces, n={n}: ours over {peer}", took[peer] / took["ours"], "ratio",
+                name = f"Ant-v5 {forces} contact forces, n={n}: ours over {peer}"
+                table.add(name, took[peer] / took["ours"], "ratio",
                           baseline=work / took[peer], at_least=least)  # fmt: skip
             for env in envs.values():
                 env.close()
