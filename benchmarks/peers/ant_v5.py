@@ -2,8 +2,8 @@
 
 `AntV5` leaves out the contact forces (78 of 105 observed values, and a cost), which is an option of Ant-v5 itself;
 `AntV5Contact` has them. Gymnasium calls `mj_rnePostConstraint` after `mj_step`, which finds the forces of the last
-stage of the last physics step's Runge-Kutta scheme. A batch has no such call, but with a force sensor `Batch.forward` finds
-them; so the simulations go back to that stage for one evaluation more, the 21st of a control step.
+stage of the last physics step's Runge-Kutta scheme. A batch has no such call, but with a force sensor its `forward`
+finds them; so the simulations go back to that stage for one evaluation more, the 21st of a control step.
 """
 
 from pathlib import Path

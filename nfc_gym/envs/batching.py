@@ -25,7 +25,7 @@ def seeds_of(seed: int | Sequence[int | None] | None, n: int) -> list[int | None
     """A seed for each of n environments: s gives s, s + 1, ...; None leaves a generator as it is."""
     if seed is None:
         return [None] * n
-    seeds = [int(seed) + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
+    seeds: list[int | None] = [int(seed) + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
     if len(seeds) != n:
         raise InputError(f"seed holds {len(seeds)} seeds, want one for each of {n} environments")
     return seeds

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from math import isfinite
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from nfc_gym.envs import scene
@@ -53,7 +52,7 @@ class RobotEnv(gymnasium.Env):
       screen: what renders; its `camera` may be changed between pictures.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(
         self,
@@ -84,7 +83,7 @@ class RobotEnv(gymnasium.Env):
         self._map: NDArray[np.float32] | None = None
         self._age = 0
         self.observation_space = self._observe.space
-        self.action_space: spaces.Box = box(kind.action_size, bound=1.0)
+        self.action_space = box(kind.action_size, bound=1.0)
 
         self._shape = (kind.action_size,)
         self._home = rest_key(self.model)
@@ -116,9 +115,7 @@ class RobotEnv(gymnasium.Env):
 
     # ---- Gymnasium's interface ------------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Any, dict[str, NDArray]]:
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode.
 
         Args:
@@ -148,7 +145,7 @@ class RobotEnv(gymnasium.Env):
             self.render()
         return self._observation(), _leaves(nothing_yet(self.robot, view))
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, NDArray]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control step of `frame_skip` physics steps.
 
         Args:
@@ -267,7 +264,7 @@ class RobotEnv(gymnasium.Env):
         self._view.task, self._view.now, self._view.before = saved["view"]
 
 
-def _leaves(info: dict[str, Any]) -> dict[str, NDArray]:
+def _leaves(info: dict[str, Any]) -> dict[str, NDArray | np.float64]:
     """Numpy leaves: float64 scalars, and flags as arrays of shape (), as Gymnasium's vectors want them."""
     return {k: np.asarray(v) if isinstance(v, _FLAG) else np.float64(v) for k, v in info.items()}
 

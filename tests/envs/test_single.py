@@ -1,9 +1,5 @@
 """The single environment: terrain, elevation maps, hooks, pictures."""
 
-import os
-
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported, where there is no display
-
 from typing import Any
 
 import gymnasium
