@@ -94,7 +94,8 @@ class Observer:
 
 def broken(view: View) -> NDArray[np.bool_]:
     """(*B,) whether a simulation has come apart: NaN or an absurd speed."""
-    return ~(np.vecdot(view.qvel, view.qvel) < FASTEST * FASTEST)
+    speed = view.qvel
+    return np.logical_not((speed @ speed if speed.ndim == 1 else np.vecdot(speed, speed)) < FASTEST * FASTEST)
 
 
 def outcome(
