@@ -11,6 +11,7 @@ place of the time that passes: for machines that are busy with other things, whe
 """
 
 import argparse
+import importlib.util
 import json
 import multiprocessing
 import os
@@ -200,6 +201,9 @@ def asynchronous(table: Table, n: int, turns: int) -> None:
 
 def ant(table: Table, sizes: list[int], turns: int) -> None:
     """Ant-v5: our engine, EnvPool and Gymnasium on the same MJCF, frame skip, observation and reward."""
+    if importlib.util.find_spec("imageio") is None:
+        print("Ant-v5: Gymnasium's needs gymnasium[mujoco], its rows are left out")
+        return
     table.add(
         "Ant-v5: largest difference to Gymnasium's, contact forces included", ant_difference(), "abs", at_most=1e-9
     )
@@ -275,6 +279,8 @@ def single(table: Table, ids: list[str], turns: int) -> None:
     """A single environment's step over the bare physics of the same model, from the same states."""
     for name in ids:
         ours = not name.startswith("Ant-v5")
+        if not ours and importlib.util.find_spec("imageio") is None:
+            continue
         env = gymnasium.make(f"nfc_gym/{name}-v0", context=["psi"]) if ours else gymnasium.make(name)
         env.reset(seed=SEED)
         model, data = env.unwrapped.model, env.unwrapped.data
