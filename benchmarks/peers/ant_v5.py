@@ -1,9 +1,9 @@
 """Gymnasium's Ant-v5 on this package's engine: the same MJCF, frame skip, observation and reward, equal to 1e-9.
 
 `AntV5` leaves out the contact forces (78 of 105 observed values, and a cost), which is an option of Ant-v5 itself;
-`AntV5Contact` has them. Gymnasium calls `mj_rnePostConstraint` after `mj_step`, which finds the forces of the last stage of
-the last physics step's Runge-Kutta scheme. A batch has no such call, but a force sensor makes `Batch.forward` compute them;
-so the simulations go back to that stage for one evaluation more, the 21st of a control step.
+`AntV5Contact` has them. Gymnasium calls `mj_rnePostConstraint` after `mj_step`, which finds the forces of the last
+stage of the last physics step's Runge-Kutta scheme. A batch has no such call, but with a force sensor its `forward`
+finds them; so the simulations go back to that stage for one evaluation more, the 21st of a control step.
 """
 
 from pathlib import Path

@@ -4,14 +4,13 @@ import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym import assets
-from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
@@ -73,7 +72,8 @@ class Robot(ABC):
       draws: how many uniform numbers in [0, 1) an episode's start is made of.
       reads: derived `MjData` fields that the laws read (`sensordata`, `xpos`, ...).
       arrived: distance from a goal that counts as there [m].
-      goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward; set by `of`.
+      goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward; set by
+        `Settings.robot`.
       terms: names of the robot's own reward terms of this task, set by the constructor.
       home: (nq,) position of the keyframe `home`, the model's own where it has none.
       frame_skip: physics steps a control step.
@@ -121,19 +121,6 @@ class Robot(ABC):
     def space(cls, model: mujoco.MjModel) -> ParameterSpace:
         """psi bound to a model."""
         return ParameterSpace(model, cls.parameters())
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, task: str | None, goal_conditioned: bool, reward_type: str) -> Self:
-        """The robot with a task: None is the default one; `InputError` where it has none of that name, or no goals."""
-        if task is not None and task not in cls.tasks:
-            raise InputError(f"{cls.name} has no task {task!r}; it has: {', '.join(cls.tasks)}")
-        if reward_type not in GOAL_REWARDS:
-            raise InputError(f"reward_type is {reward_type!r}, want one of: {', '.join(GOAL_REWARDS)}")
-        if goal_conditioned and not cls.place_size:
-            raise InputError(f"goal_conditioned: the {cls.name} has no goals to reach")
-        robot = cls(model, task or cls.tasks[0])
-        robot.goal_conditioned = reward_type if goal_conditioned else None
-        return robot
 
     # ---- the laws -------------------------------------------------------------------------------------------------
 

@@ -18,44 +18,41 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
+from nfc_gym.envs.batching import Ids, ids_of, masked, rows_of, seeds_of, terrain_ids
 from nfc_gym.envs.contract import (
     FLAT,
     Observer,
     box,
     broken,
-    checked_context,
     checked_options,
     nothing_yet,
     outcome,
     psi_of,
-    refresh_period,
     rest_key,
     robot_class,
     seen_psi,
     wrong_action,
 )
-from nfc_gym.envs.render import Camera, Pictures
+from nfc_gym.envs.look import HeldMaps
 from nfc_gym.envs.robot import Robot
-from nfc_gym.envs.rotations import yaw
-from nfc_gym.envs.terrains import Pool
+from nfc_gym.envs.screen import Screen
+from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.view import View
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.terrain import Heightfield, elevation, surface
-from nfc_gym.terrain.egocentric import SIZE
-
-Ids = NDArray[np.intp]
+from nfc_gym.terrain import Heightfield, surface
 
 
 class RobotVectorEnv(VectorEnv):
     """Robots on flat ground or rough terrain, stepped together.
 
     Args:
-      robot, rough, task, goal_conditioned, reward_type, context, elevation_hz, difficulty, terrain_seed, terrain_pool,
-        terrain_kind, render_mode, width, height, camera: as `RobotEnv`.
+      robot, rough: as `RobotEnv`.
       num_envs: n.
       max_episode_steps: control steps after which an episode is truncated; None is never.
       autoreset_mode: `AutoresetMode` or its value.
       nthread: threads of the batch; 0 takes every core.
+      render_mode: None or `rgb_array`.
+      settings: the attributes of `Settings`.
 
     Attributes:
       model, batch: the nominal model, and the simulations.
@@ -76,47 +73,31 @@ class RobotVectorEnv(VectorEnv):
         max_episode_steps: int | None = 1000,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         nthread: int = 0,
-        task: str | None = None,
-        goal_conditioned: bool = False,
-        reward_type: str = "sparse",
-        context: Sequence[str] = ("psi", "elevation"),
-        elevation_hz: float | None = None,
-        difficulty: float = 0.5,
-        terrain_seed: int = 0,
-        terrain_pool: int = 64,
-        terrain_kind: str | None = None,
         render_mode: str | None = None,
-        width: int = 640,
-        height: int = 480,
-        camera: Camera = "track",
+        **settings: Any,
     ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise InputError(f"render_mode is {render_mode!r}; a vector environment has None and 'rgb_array'")
-        kind = robot_class(robot)
-        self.num_envs, self.rough, self.frame_skip = int(num_envs), bool(rough), kind.frame_skip
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.render_mode, self.camera, self._size = render_mode, camera, (width, height)
-        self._pictures: Pictures | None = None
+        self._kind, self._nthread = robot_class(robot), nthread
+        self._given = Settings.of(self._kind, settings)
+        self.screen = Screen(render_mode, (None, "rgb_array"), self._given)
+        self.num_envs, self.rough, self.render_mode = int(num_envs), bool(rough), render_mode
+        self.frame_skip, self.autoreset_mode = self._kind.frame_skip, AutoresetMode(autoreset_mode)
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.after_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
-        self._kind, self._nthread = kind, nthread
-        self._task = task, goal_conditioned, reward_type
         self._horizon = np.iinfo(np.int64).max if max_episode_steps is None else int(max_episode_steps)
-        context = checked_context(context)
 
-        pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
+        pool = self._given.pool
         self._build([pool.map(k) for k in range(pool.size)] if rough else [])
         fps = round(1 / self.dt)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps, "autoreset_mode": self.autoreset_mode}
-        self._period = refresh_period(elevation_hz, fps)
-        self._observe = Observer(self.robot, len(self.psi_space), context)
+        self._elevation = HeldMaps(self.num_envs, self._given.refresh_period(fps))
+        self._observe = Observer(self.robot, len(self.psi_space), self._given.context)
         self.single_observation_space = self._observe.space
-        self.single_action_space = box(kind.action_size, bound=1.0)
+        self.single_action_space = box(self._kind.action_size, bound=1.0)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
-        self._limit = np.ones((self.num_envs, kind.action_size))
+        self._limit = np.ones((self.num_envs, self._kind.action_size))
 
     def _build(self, maps: Sequence[Heightfield], perceived: Sequence[Heightfield] | None = None) -> None:
         """Compile the scene and start a batch of it; every simulation then waits for its first reset."""
@@ -126,7 +107,7 @@ class RobotVectorEnv(VectorEnv):
             scene.write(self.model, k, heightfield.heights)
         self._maps, self._perceived = list(maps), list(maps if perceived is None else perceived)
         self._stack = np.stack([m.heights for m in maps]) if maps else np.zeros((0, 2, 2), np.float32)
-        self.robot = self._kind.of(self.model, *self._task)
+        self.robot = self._given.robot(self.model)
         self.psi_space = self._kind.space(self.model)
         self.batch = Batch(self.model, n, self._nthread)
         self.fields = ModelFields(self.batch)
@@ -140,7 +121,6 @@ class RobotVectorEnv(VectorEnv):
         self._steps = np.zeros(n, np.int64)
         self._waiting = np.ones(n, bool)  # for a reset
         self._fresh = True  # nothing was reset yet
-        self._elevation: NDArray[np.float32] | None = None
 
     # ---- what may be read back ------------------------------------------------------------------------------------
 
@@ -165,11 +145,14 @@ class RobotVectorEnv(VectorEnv):
         return tuple(self._maps)
 
     @property
-    def perceived(self) -> tuple[Heightfield, ...]:
-        """(n) the map that each simulation's `elevation` is taken from."""
-        if not self.rough:
-            return (FLAT,) * self.num_envs
-        return tuple(self._perceived[k] for k in self._terrain)
+    def heightfield(self) -> list[Heightfield]:
+        """n terrains that are simulated; zeros on flat ground."""
+        return [self._maps[k] for k in self._terrain] if self.rough else [FLAT] * self.num_envs
+
+    @property
+    def perceived(self) -> list[Heightfield]:
+        """n terrains that `elevation` is taken from: the simulated ones, unless `set_terrains` was told others."""
+        return [self._perceived[k] for k in self._terrain] if self.rough else [FLAT] * self.num_envs
 
     @property
     def mjcf(self) -> str:
@@ -212,27 +195,16 @@ class RobotVectorEnv(VectorEnv):
         for key in ("heightfield", "perceived", "terrain_residual"):
             if key in given:
                 raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
-        mask = given.pop("reset_mask", None)
-        if mask is None:
-            ids = np.arange(n)
-        else:
-            mask = np.asarray(mask)
-            if mask.shape != (n,) or mask.dtype != bool or not mask.any():
-                raise InputError(f"reset_mask is {mask.dtype} {mask.shape}; want ({n},) bool with at least one True")
-            ids = np.flatnonzero(mask)
-            if self._fresh and len(ids) < n:
-                raise InputError("reset_mask: the first reset must be of all environments")
-        if seed is not None:
-            seeds = [seed + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
-            if len(seeds) != n:
-                raise InputError(f"seed holds {len(seeds)} seeds, want one for each of {n} environments")
-            for i in ids:
-                if seeds[i] is not None:
-                    self._generators[i] = seeding.np_random(int(seeds[i]))[0]
-        self._begin(ids, {key: _rows(value, ids, n) for key, value in given.items()})
+        ids = ids_of(given.pop("reset_mask", None), n)
+        if self._fresh and len(ids) < n:
+            raise InputError("reset_mask: the first reset must be of all environments")
+        for i, own in enumerate(seeds_of(seed, n)):
+            if own is not None and i in ids:
+                self._generators[i] = seeding.np_random(own)[0]
+        self._begin(ids, {key: rows_of(value, ids, n) for key, value in given.items()})
         self._view.now = self.robot.derive(self._view)
         info = nothing_yet(self.robot, self._view)
-        return self._observation(), _masked(info, np.isin(np.arange(n), ids))
+        return self._observation(), masked(info, np.isin(np.arange(n), ids))
 
     def step(self, actions: Any) -> tuple[Any, NDArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """One control step of every environment.
@@ -267,7 +239,7 @@ class RobotVectorEnv(VectorEnv):
             rewards, ended = np.where(resetting, 0.0, rewards), ended & ~resetting
         truncated = self._steps >= self._horizon
         done = ended | truncated
-        info = _masked(info, np.ones(self.num_envs, bool))
+        info = masked(info, np.ones(self.num_envs, bool))
         self._waiting = done.copy()
         again = self.autoreset_mode is AutoresetMode.SAME_STEP and done.any()
         obs = self._restart(done, info) if again else self._observation()
@@ -277,20 +249,16 @@ class RobotVectorEnv(VectorEnv):
         """A picture (height, width, 3) of every environment."""
         if self.render_mode is None:
             return None
-        if self._pictures is None:
-            self._pictures = Pictures(self.model, *self._size)
         frames = []
         for i in range(self.num_envs):
             model, data = self.batch.get_model(i), self.batch.get_data(i)
             mujoco.mj_forward(model, data)
-            frames.append(self._pictures.render(model, data, self.camera))
+            frames.append(self.screen.render(model, data))
         return tuple(frames)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free what rendering holds."""
-        if self._pictures is not None:
-            self._pictures.close()
-        self._pictures = None
+        self.screen.close()
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 
@@ -310,7 +278,7 @@ class RobotVectorEnv(VectorEnv):
         self._psi[ids], self._seen[ids] = psi, seen_psi(self.psi_space, belief)
         if self._chosen is not None:
             chosen = given.get("terrain_id", (u[:, 0] * len(self._maps)).astype(np.intp))
-            self._terrain[ids] = _terrain_ids(chosen, k, len(self._maps))
+            self._terrain[ids] = terrain_ids(chosen, k, len(self._maps))
             self._chosen[ids] = self._terrain[ids]
         self.batch.reset(ids, self._home, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         start = self.robot.begin(u[:, 1:], lambda xy: self._ground(xy, self._terrain[ids]))
@@ -339,7 +307,7 @@ class RobotVectorEnv(VectorEnv):
         new = nothing_yet(self.robot, self._view)
         info.update({key: np.where(done, new[key], value) for key, value in before.items()})
         ended = {key: value * done for key, value in before.items()}  # zero where no episode ended
-        info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": _masked(ended, done.copy())}
+        info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": masked(ended, done.copy())}
         info["_final_info"] = done.copy()
         return self._observation()
 
@@ -382,52 +350,9 @@ class RobotVectorEnv(VectorEnv):
         if rows is not None:
             obs = obs[rows] if self._observe.plain else {k: v[rows] for k, v in obs.items()}
         if self._observe.elevation:
-            obs["elevation"] = self._around(rows)
+            perceived = self._perceived if self.rough else None
+            obs["elevation"] = self._elevation.around(self._view.qpos, perceived, self._terrain, self._steps, rows)
         return obs
-
-    def _around(self, rows: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-        """Elevation maps, fresh arrays; those that are not due are copies of the last ones."""
-        if self._period == 1:
-            return self._look(np.arange(self.num_envs) if rows is None else np.flatnonzero(rows))
-        if self._elevation is None:
-            self._elevation = np.empty((self.num_envs, SIZE, SIZE), np.float32)
-        due = self._steps % self._period == 0
-        due = np.flatnonzero(due if rows is None else due & rows)
-        if len(due):
-            self._elevation[due] = self._look(due)
-        return self._elevation.copy() if rows is None else self._elevation[rows]
-
-    def _look(self, ids: Ids) -> NDArray[np.float32]:
-        qpos = self._view.qpos[ids]
-        if self.rough:
-            return elevation([self._perceived[k] for k in self._terrain[ids]], qpos[:, :3], yaw(qpos[:, 3:7]))
-        out = np.empty((len(ids), SIZE, SIZE), np.float32)
-        out[...] = -qpos[:, 2, None, None].astype(np.float32)
-        return out
-
-
-def _rows(value: Any, ids: Ids, n: int) -> Any:
-    """Reset options of n environments, for some of them: (n, ...) arrays are cut, anything else holds for each."""
-    if isinstance(value, Mapping):
-        return {k: np.asarray(v)[ids] if np.shape(v) == (n,) else v for k, v in value.items()}
-    return np.asarray(value)[ids] if np.shape(value)[:1] == (n,) and np.ndim(value) != 1 else np.asarray(value)
-
-
-def _terrain_ids(chosen: Any, k: int, maps: int) -> Ids:
-    """(k,) map of each environment."""
-    chosen = np.asarray(chosen)
-    if chosen.shape not in ((), (k,)) or (chosen != chosen.astype(np.intp)).any():
-        raise InputError(
-            f"terrain_id has shape {chosen.shape} and type {chosen.dtype}; want whole numbers () or ({k},)"
-        )
-    if (chosen < 0).any() or (chosen >= maps).any():
-        raise InputError(f"terrain_id reaches from {chosen.min()} to {chosen.max()}, want 0 to {maps - 1}")
-    return np.broadcast_to(chosen.astype(np.intp), (k,))
-
-
-def _masked(info: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Gymnasium's vector form of `info`: beside each key its mask, `_key`, of the environments that it is of."""
-    return info | {"_" + key: mask for key in info}
 
 
 def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotVectorEnv:

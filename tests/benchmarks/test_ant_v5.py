@@ -11,6 +11,7 @@ import pytest
 from nfc_gym.envs.single import RobotEnv
 from nfc_gym.envs.vector import RobotVectorEnv
 
+pytest.importorskip("imageio", reason="Gymnasium's own MuJoCo environments need gymnasium[mujoco]")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 from peers.ant_v5 import AntV5, AntV5ContactVectorEnv
 

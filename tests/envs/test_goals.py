@@ -76,7 +76,7 @@ def test_figure_eight_is_followed() -> None:
     assert "reward/tracking" in info
     farthest, driven = 0.0, 0.0
     for _ in range(1000):
-        obs, reward, terminated, truncated, info = env.step(steer(4 * obs["goal"]))
+        obs, _, terminated, truncated, info = env.step(steer(4 * obs["goal"]))
         assert not terminated
         farthest = max(farthest, float(info["distance"]))
         driven += abs(float(obs["proprio"][4])) * 0.02

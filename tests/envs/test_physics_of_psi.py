@@ -36,7 +36,7 @@ def roll(envs: Any, action: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("stiffness", [2.0, 4.0, 9.0])
 @pytest.mark.parametrize("mass", [0.07, 0.15])
-def test_a_rotor_arm_swings_on_its_mount_with_the_period_of_its_mass_and_stiffness(mass: float, stiffness: float) -> None:
+def test_a_rotor_arm_swings_with_the_period_of_its_mass_and_stiffness(mass: float, stiffness: float) -> None:
     """In free fall, on a chassis too heavy to move, an arm is a torsion pendulum: I q'' = -k q - b q'."""
     env = gymnasium.make("nfc_gym/QuadcopterFlat-v0", context=["psi"]).unwrapped
     psi = {"base_mass": 1e7, "front_left_arm_mass": mass, "front_left_mount_stiffness": stiffness}
@@ -60,7 +60,7 @@ def test_a_rotor_arm_swings_on_its_mount_with_the_period_of_its_mass_and_stiffne
     q, v, expected = amplitude, 0.0, []
     for _ in angles:
         expected.append(q)
-        v = (v - DT * stiffness / inertia * q) / (1 + DT * damping / inertia)  # damping taken implicitly, as MuJoCo does
+        v = (v - DT * stiffness / inertia * q) / (1 + DT * damping / inertia)  # damping is taken implicitly
         q += DT * v
     np.testing.assert_allclose(angles, expected, atol=0.02 * amplitude)
     zeros = np.flatnonzero(np.diff(np.sign(angles)))
