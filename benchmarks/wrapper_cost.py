@@ -2,8 +2,9 @@
 
     python benchmarks/wrapper_cost.py [--quick] [--json FILE]
 
-Every wrapper is at null, so that the wrapped environment makes the bare one's motion and contacts to the bit, and both take
-turns in one run. A null costs what any other value does: nothing is skipped where a parameter is zero.
+Every wrapper is at null, so that the wrapped environment makes the bare one's motion and contacts to the bit, and both
+take turns in one run; seconds are those of the processor, since cores may be shared. A null costs what any other value
+does: nothing is skipped where a parameter is zero.
 """
 
 import argparse
@@ -83,7 +84,9 @@ def cases(name: str, folder: Path) -> dict[str, tuple[Wrap, float | None]]:
         "MonitorAnomaly": (lambda e: MonitorAnomaly(e, Silent()), STEP),
         "RecordLog": (lambda e: RecordLog(e, folder / name.replace("/", "_")), STEP),
         "ApplyEffects, a delay": (effect("delay", motor, delay=0.0), SUBSTEP),
-        "ApplyEffects, dry friction": (effect("coulomb", joint, level=0.0), SUBSTEP),
+        "ApplyEffects, dry friction (a model field)": (effect("coulomb", joint, level=0.0), SUBSTEP),
+        "ApplyEffects, Stribeck friction": (effect("stribeck", joint, level=0.0, rise=0.0, speed=0.1), SUBSTEP),
+        "ApplyEffects, a constant force": (effect("external_force", body, x=0.0, y=0.0, z=0.0), SUBSTEP),
         "ApplyEffects, linear drag": (effect("drag_linear", body, x=0.0, y=0.0, z=0.0), SUBSTEP),
     }
 
@@ -132,7 +135,8 @@ def steps(table: Table, name: str, count: int, turns: int, folder: Path) -> None
 
 def resets(table: Table, turns: int, count: int) -> None:
     name, kwargs = "nfc_gym/JackalRough-v0", {"terrain_pool": 1}
-    bare, wrapped = gymnasium.make(name, **kwargs), ResidualTerrain(gymnasium.make(name, **kwargs), np.zeros((256, 256)))
+    bare = gymnasium.make(name, **kwargs)
+    wrapped = ResidualTerrain(gymnasium.make(name, **kwargs), np.zeros((256, 256)))
     cost, alone = added(bare, wrapped, reset_seconds, 10 * turns)
     table.add(f"ResidualTerrain, a reset of {name}", cost, "us/reset", baseline=alone)
     actions = np.zeros((count, 2))
@@ -147,7 +151,8 @@ def resets(table: Table, turns: int, count: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="two environments, fewer turns")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="rows {name, value, unit, baseline, goal, holds, seeds}")
+    rows = "rows {name, value, unit, baseline, goal, holds, seeds}"
+    parser.add_argument("--json", type=Path, metavar="FILE", help=rows)
     args = parser.parse_args()
     count, turns = (200, 7) if args.quick else (500, 15)
     names = ["Ant-v5", "nfc_gym/JackalFlat-v0"] + ([] if args.quick else ["nfc_gym/AntFlat-v0"])

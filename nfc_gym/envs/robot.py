@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from nfc_gym import assets
 from nfc_gym.envs import scene
+from nfc_gym.envs.components import observed
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.terrain import Heightfield
@@ -154,6 +155,10 @@ class Robot(ABC):
     @abstractmethod
     def proprio(self, view: View) -> Sequence[NDArray]:
         """Parts (*B, k) whose concatenation is the observation `proprio` (*B, proprio_size)."""
+
+    def components(self, model: mujoco.MjModel) -> list[str]:
+        """What each entry of `proprio` is, see `nfc_gym.envs.components`; without more, none is known to be state."""
+        return observed(self.proprio_size)
 
     def goal(self, view: View) -> NDArray:
         """(*B, goal_size) the command in the robot's frame, where it is not part of `proprio`."""

@@ -106,6 +106,11 @@ class RobotEnv(gymnasium.Env):
         return self._psi.copy()
 
     @property
+    def proprio_components(self) -> list[str]:
+        """What each entry of `proprio` is, in the names of logs: how a residual of it reaches the state."""
+        return self.robot.components(self.model)
+
+    @property
     def mjcf(self) -> str:
         """The nominal model with the ground of the running episode, as MJCF that plain MuJoCo loads."""
         return self.robot.mjcf(self._terrain if self.rough else None)

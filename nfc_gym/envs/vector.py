@@ -155,6 +155,11 @@ class RobotVectorEnv(VectorEnv):
         return [self._perceived[k] for k in self._terrain] if self.rough else [FLAT] * self.num_envs
 
     @property
+    def proprio_components(self) -> list[str]:
+        """What each entry of `proprio` is, in the names of logs: how a residual of it reaches the state."""
+        return self.robot.components(self.model)
+
+    @property
     def mjcf(self) -> str:
         """The nominal model on the first map, as MJCF that plain MuJoCo loads."""
         return self.robot.mjcf(self._maps[0] if self.rough else None)

@@ -131,7 +131,7 @@ class Hallucinate(_Hallucinating, EnvWrapper):
 
     @property
     def fidelity(self) -> Fidelity:
-        """What holds now: psi and delta_e as the episode's first action has chosen them, delta_s as the last one did."""
+        """What holds now: psi and delta_e as the episode's first action has chosen them, delta_s as the last did."""
         return self.belief.at(self._h, self.beta)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -202,8 +202,8 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
         sampled = drawn(posterior, samples)
         if sampled.delta_e is not None:
             raise InputError(
-                "VectorHallucinate: the posterior speaks of delta_e, which no action of a vector environment can choose; "
-                "give one of psi and delta_s, and put VectorResidualTerrain around for the ground"
+                "VectorHallucinate: the posterior speaks of delta_e, which no action can choose where the batch is "
+                "built anew for other terrains; give one of psi and delta_s, and put VectorResidualTerrain around"
             )
         sim = batch_simulation_of(env, "Hallucinate")
         self.psi_space = None if sampled.psi is None else space_of(env, sim.nominal, None, ())
