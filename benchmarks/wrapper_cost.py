@@ -57,8 +57,7 @@ def effect(family: str, where: str, **parameters: float) -> Wrap:
 def hallucinated(env: Any) -> Any:
     """With a posterior of no width around nominal."""
     nv = env.unwrapped.model.nv
-    wrapped = Hallucinate(env, Fidelity(delta_s=np.zeros((2, nv))))
-    return gymnasium.wrappers.TransformAction(wrapped, lambda a: np.concatenate([a, np.zeros(nv)]), env.action_space)
+    return Hallucinate(env, Fidelity(delta_s=np.zeros((2, nv))))
 
 
 def cases(name: str, folder: Path) -> dict[str, tuple[Wrap, float | None]]:
@@ -92,7 +91,8 @@ def cases(name: str, folder: Path) -> dict[str, tuple[Wrap, float | None]]:
 
 
 def seconds(env: Any, actions: np.ndarray) -> float:
-    """Of one step on average; resets are not counted."""
+    """Of one step on average; resets are not counted. Actions are padded with zeros to what the environment takes."""
+    actions = np.pad(actions, ((0, 0), (0, env.action_space.shape[0] - actions.shape[1])))
     env.reset(seed=0)
     spent = 0.0
     for action in actions:

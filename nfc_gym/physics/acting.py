@@ -63,6 +63,7 @@ class Acting:
         self.memories: list[Any] = []
         self.derived: set[str] = set()
         self.fresh: NDArray[np.bool_] | None = None
+        self.shown: tuple[Context, Forces] | None = None
         self.base_friction = self.fields["dof_frictionloss"].copy() if self.rubbing else np.zeros(0)
 
     def restart(self, rows: NDArray[np.bool_] | None = None) -> None:
@@ -74,7 +75,7 @@ class Acting:
             self.memories.clear()
             self.derived.clear()
             rows = None
-        self.fresh = rows
+        self.fresh, self.shown = rows, None
         if self.rubbing:
             loss = self.fields["dof_frictionloss"]
             self.base_friction = loss.copy() if rows is None else np.where(rows[:, None], loss, self.base_friction)
@@ -96,20 +97,27 @@ class Acting:
         fresh, self.fresh = self.fresh, None
         if not (self.rubbing or self.pushing):
             return
-        engine = self.engine
         if fresh is not None and self.derived:
-            engine.forward(np.flatnonzero(fresh))
-        ctx = Context(self.model, self.dt, engine.qpos, engine.qvel, ctrl, exogenous, self._derived, self._nominal)
+            self.engine.forward(np.flatnonzero(fresh))
+        ctx, out = self._show(ctrl, exogenous)
         if self.rubbing:
             loss = self.fields["dof_frictionloss"]
             loss[...] = self.base_friction
             for i in self.rubbing:
                 dofs, level = self.effects[i].friction(ctx, self.thetas[i])
                 loss[..., dofs] += level
-        if self.pushing:
-            out = Forces(engine.qfrc_applied, engine.xfrc_applied)
-            for i in self.pushing:
-                self.effects[i].force(ctx, self.thetas[i], out)
+        for i in self.pushing:
+            self.effects[i].force(ctx, self.thetas[i], out)
+
+    def _show(self, ctrl: Array, exogenous: Mapping[str, Array]) -> tuple[Context, Forces]:
+        """What hooks read and where they write; the engine's arrays are live, and asked for once an episode."""
+        if self.shown is None:
+            engine = self.engine
+            state = (engine.qpos, engine.qvel, ctrl)
+            ctx = Context(self.model, self.dt, *state, exogenous, self._derived, self._nominal)
+            self.shown = ctx, Forces(engine.qfrc_applied, engine.xfrc_applied)
+        self.shown[0].ctrl, self.shown[0].exogenous = ctrl, exogenous
+        return self.shown
 
     def _derived(self, name: str) -> Array:
         """A field of `MjData`, computed for the state as it is where it is read for the first time.

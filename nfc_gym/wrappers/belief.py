@@ -76,14 +76,13 @@ class Belief:
         return left * scale
 
     def held_part(self, h: Array, beta: float) -> Array:
-        """What the held entries of h (..., held) alone make of delta_s, (..., s): to be given to `follow`."""
+        """What the held entries of h (..., held) alone make of delta_s, (..., s): see `lever`."""
         h = np.minimum(np.maximum(h, -1.0), 1.0)
         return self.mean[self.held :] + beta * (self.root[self.held :, : self.held] * h[..., None, :]).sum(-1)
 
-    def follow(self, held: Array, h: Array, beta: float) -> Array:
-        """delta_s (..., s) from `held_part` and the other entries of h (..., s): what `at` gives, at a step's price."""
-        h = np.minimum(np.maximum(h, -1.0), 1.0)
-        return held + beta * (self.root[self.held :, self.held :] * h[..., None, :]).sum(-1)
+    def lever(self, beta: float) -> Array:
+        """(s, s): with the other entries of h, `held_part` + `lever` h is the delta_s of `at`, at a step's price."""
+        return np.ascontiguousarray(beta * self.root[self.held :, self.held :])
 
     def at(self, h: Array, beta: float) -> Fidelity:
         """The fidelity at mean + beta L h, h (..., size) clipped to [-1, 1]."""

@@ -59,7 +59,7 @@ class Injection:
     def bias(self, value: Array) -> None:
         self._bias = value
         if self.steady:  # the acceleration is the same in every step
-            self._acceleration = np.ascontiguousarray(value[..., -self.components.nv :]) / self.duration
+            self._acceleration = value[..., -self.components.nv :] / self.duration
 
     def begin(self) -> None:
         """Draw the step's noise, and push."""

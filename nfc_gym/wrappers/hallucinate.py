@@ -125,7 +125,7 @@ class Hallucinate(_Hallucinating, EnvWrapper):
             raise InputError(f"Hallucinate: delta_e has shape {self.belief.shape}, the ground {self.ground.shape}")
         self.injection = injection_of(env, sim, self.belief, mode, components)
         self._h = np.zeros(self.belief.size)
-        self._chosen = False
+        self._chosen, self._lever = False, self.belief.lever(self.beta)
         self._made = self.belief.held_part(self._h[: self.belief.held], self.beta)
         self._again: tuple[Any, ...] = ()
 
@@ -165,7 +165,7 @@ class Hallucinate(_Hallucinating, EnvWrapper):
             self._enter()
         if self.injection is not None:
             self._h[held:] = h[held:]
-            self.injection.bias = self.belief.follow(self._made, h[held:], self.beta)
+            self.injection.bias = self._made + self._lever.dot(np.minimum(np.maximum(h[held:], -1.0), 1.0))
         return self.env.step(action[: self.own])
 
     def _enter(self) -> None:

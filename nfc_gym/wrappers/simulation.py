@@ -222,10 +222,6 @@ class SingleSimulation(Simulation):
         """See `Simulation`."""
         self.qfrc_applied[:], self.xfrc_applied[:] = self._held
 
-    def _substep(self) -> None:
-        for hook in self.on_substep:
-            hook()
-
     def _end(self) -> None:
         if self.pushed:
             self.qfrc_applied[:] = self._base[0]
@@ -240,7 +236,8 @@ class SingleSimulation(Simulation):
         if self._calls == 0:
             self._begin()
         self._calls = (self._calls + 1) % int(self.env.frame_skip)
-        self._substep()
+        for hook in self.on_substep:
+            hook()
 
     def run(self, original: Callable[..., None], plain: bool, ctrl: Array, frames: int) -> None:
         """A control step in place of `MujocoEnv._step_mujoco_simulation`."""
@@ -249,9 +246,10 @@ class SingleSimulation(Simulation):
         if not self.on_substep:
             original(self.commanded, frames)
         else:
-            model, data = self.env.model, self.data
+            model, data, hooks = self.env.model, self.data, self.on_substep
             for _ in range(frames):
-                self._substep()
+                for hook in hooks:
+                    hook()
                 if plain:
                     mujoco.mj_step(model, data)
                 else:
