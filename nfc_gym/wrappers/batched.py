@@ -1,6 +1,5 @@
 """The physics beneath a vector environment on `mujoco.batch`, as the wrappers around it share it."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -8,20 +7,25 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.wrappers.hooks import Hooks
 from nfc_gym.wrappers.simulation import ATTRIBUTE, Simulation
 
 Array = NDArray[np.float64]
 
 
 class BatchSimulation(Simulation):
-    """The simulations of a vector environment on `mujoco.batch` that offers `substep_hooks` and `reset_hooks`."""
+    """The simulations of a vector environment on `mujoco.batch` with hooks at physics steps and resets.
+
+    Attributes:
+      on_reset: called with the ids (k,) of the simulations about to begin an episode; may return reset options for them.
+    """
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
         self.shape = (int(env.num_envs),)
         self.pending = np.ones(self.shape, bool)
         self.started = np.ones(self.shape, bool)
-        self.on_reset: list[Callable[[NDArray[np.intp]], dict[str, Any] | None]] = []
+        self.on_reset = Hooks()
         self._bound: set[str] = set()
         self._calls = 0
         self._unedited = np.zeros(self.shape, bool)
@@ -68,17 +72,19 @@ class BatchSimulation(Simulation):
         self.pending[ids] = self._unedited[ids] = True
         self._calls = 0
         options: dict[str, Any] = {}
-        for hook in self.on_reset:
+        self.refresh()
+        for hook in self.on_reset.live():
             options |= hook(ids) or {}
         return options
 
     def edit_after(self) -> None:
-        """After a reset, or a step that has reset rows: edits on top of the psi that the environment has written."""
+        """After a reset, or a step that has reset rows: edits on top of the psi that the environment wrote."""
         ids = np.flatnonzero(self._unedited)
         self._unedited[:] = False
-        if len(ids) and self.edits:
+        edits = self.edits.live() if len(ids) else []
+        if edits:
             fields = self.fields_of(ids)
-            for _, edit in sorted(self.edits, key=lambda e: e[0]):
+            for edit in edits:
                 edit(fields)
             fields.commit()
 

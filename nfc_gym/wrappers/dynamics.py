@@ -44,11 +44,11 @@ class Injection:
         self.rng: np.random.Generator = np.random.default_rng(0)
         sim.bind("M")
         self.inertia = Inertia(sim.model)
-        sim.on_control.append(self.begin)
+        sim.on_control.add(self.begin)
         if mode == "force":
             sim.pushed = True
         else:
-            sim.on_after.append(self.add)
+            sim.on_after.add(self.add)
 
     @property
     def bias(self) -> Array:
@@ -213,7 +213,7 @@ class VectorResidualDynamics(_Observing, VectorEnvWrapper):
         self.key = box_key(env.single_observation_space, key, bound.size) if bound.observed.size else None
         sim.attach("ResidualDynamics", after=mode == "state")
         self.injection = Injection(sim, bound, mode, root)
-        sim.on_reset.append(self._draw)
+        sim.on_reset.add(self._draw)
 
     @property
     def delta_s(self) -> Array:

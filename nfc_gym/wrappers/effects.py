@@ -80,17 +80,21 @@ class Application:
         dt = float(sim.nominal.opt.timestep)
         self.acting = Acting(sim.nominal, self.effects, self.thetas, sim.fields, sim, dt)
         if any(overrides(e, "model") for e in self.effects):
-            sim.edits.append((1, self._edit))
+            sim.edits.add(self._edit, rank=1)
         if self.acting.commanding or self.acting.rubbing or self.acting.pushing:
             sim.attach("ApplyEffects")
-            sim.on_control.append(self._begin)
-            sim.on_substep.append(self._act)
+            sim.on_control.add(self._begin)
+            sim.on_substep.add(self._act)
             sim.pushed = sim.pushed or bool(self.acting.pushing)
-        sim.senses += [
-            lambda channel, series, step, e=e, t=t: e.sense(channel, series, t, step)
-            for e, t in zip(self.effects, values, strict=True)
-            if overrides(e, "sense")
-        ]
+        self.values = values
+        if any(overrides(e, "sense") for e in self.effects):
+            sim.senses.add(self.sense)
+
+    def sense(self, channel: str, series: Array, interval: float) -> Array:
+        """What a channel's sensor reports of its true series (T, k)."""
+        for effect, theta in zip(self.effects, self.values, strict=True):
+            series = effect.sense(channel, series, theta, interval)
+        return series
 
     def _edit(self, fields: ModelFields) -> None:
         for effect, theta in zip(self.effects, self.thetas, strict=True):

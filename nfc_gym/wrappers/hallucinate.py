@@ -216,7 +216,7 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
         self.injection = injection_of(env, sim, self.belief, mode, components)
         self._held = np.zeros((env.num_envs, self.belief.held))
         self.fidelity = self.belief.at(np.zeros((env.num_envs, self.belief.size)), self.beta)
-        sim.on_reset.append(self._mean)
+        sim.on_reset.add(self._mean)
 
     def _mean(self, ids: NDArray[np.intp]) -> dict[str, Any]:
         self._held[ids] = 0
@@ -250,7 +250,7 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
         fields = self.sim.fields_of(ids)
         fields.restore()
         self.psi_space.write(fields, psi)
-        for _, edit in self.sim.edits:
+        for edit in self.sim.edits.live():
             edit(fields)
         fields.commit()
         self.sim.forward(ids)

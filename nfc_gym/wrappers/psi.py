@@ -113,7 +113,7 @@ class Psi:
         self.own = getattr(env.unwrapped, "psi_space", None) is space
         self.value = space.nominal.copy()
         if not self.own:
-            sim.edits.append((0, self._edit))
+            sim.edits.add(self._edit)
 
     def _edit(self, fields: ModelFields) -> None:
         self.space.write(fields, self.value)
@@ -186,7 +186,7 @@ class VectorRandomizePsi(VectorEnvWrapper):
         self.sim = batch_simulation_of(env, "RandomizePsi")
         self.psi_space = space_of(env, self.sim.nominal, None, ())
         self.prior = Prior(self.psi_space, distribution)
-        self.sim.on_reset.append(self._draw)
+        self.sim.on_reset.add(self._draw)
 
     def _draw(self, ids: NDArray[np.intp]) -> dict[str, Any]:
         return {"psi": self.prior.draw(len(ids), self.stream(None))}

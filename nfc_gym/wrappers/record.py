@@ -40,11 +40,11 @@ class _Recording:
         self.log = LogFolder(self.env, sim, path, None if model_file is None else os.fspath(model_file))
         self.sensing = int(sim.nominal.nsensordata) > 0
         sim.attach("RecordLog", after=self.sensing)
-        sim.on_control.append(self._command)
+        sim.on_control.add(self._command)
         if self.sensing:
             sim.bind("sensordata")
-            sim.on_substep.append(self._feel)
-            sim.on_after.append(self._feel)
+            sim.on_substep.add(self._feel)
+            sim.on_after.add(self._feel)
 
     def _command(self) -> None:
         sim, self._physics_step = self.sim, 0
@@ -120,7 +120,7 @@ class VectorRecordLog(_Recording, VectorEnvWrapper):
         if len(getattr(env.unwrapped, "maps", ())) > 1:
             raise InputError("VectorRecordLog: each simulation stands on another map of the pool; use terrain_pool=1")
         self.sim = batch_simulation_of(env, "RecordLog")
-        self.sim.on_reset.append(self._begin)
+        self.sim.on_reset.add(self._begin)
         self._wire(path, model_file)
 
     def _begin(self, ids: NDArray[np.intp]) -> None:

@@ -66,7 +66,7 @@ class LogFolder:
         table |= {name: record["ctrl"][:, i] for i, name in enumerate(self.controls)}
         for column in self.columns:
             series = values(column, record)
-            for sense in self.sim.senses:
+            for sense in self.sim.senses.live():
                 series = sense(column.name, series, self.sim.duration())
             wide = pa.FixedSizeListArray.from_arrays(np.ascontiguousarray(series).reshape(-1), column.size)
             table[column.name] = series[:, 0] if column.size == 1 else wide

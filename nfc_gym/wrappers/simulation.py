@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.wrappers.hooks import Hooks, refresh
 from nfc_gym.wrappers.stepping import Stepped, stepper_of
 
 Array = NDArray[np.float64]
-Hook = Callable[[], None]
 ATTRIBUTE = "_nfc_simulation"  # of an unwrapped environment
 
 
@@ -42,6 +42,8 @@ class Simulation:
       on_control: called once a control step, before its first physics step.
       on_substep: called before every physics step.
       on_after: called after the last physics step of a control step, before anything is observed.
+      edits: called with `ModelFields` at an episode's beginning, psi's with rank 0, effects' with rank 1.
+      senses: (channel, values (T, k), interval in s) -> what the channel's sensor reports.
     """
 
     shape: tuple[int, ...] = ()
@@ -56,14 +58,15 @@ class Simulation:
 
     def __init__(self, env: Any) -> None:
         self.env = env
-        self.on_control: list[Hook] = []
-        self.on_substep: list[Hook] = []
-        self.on_after: list[Hook] = []
-        self.edits: list[tuple[int, Callable[[ModelFields], None]]] = []
-        self.senses: list[Callable[[str, Array, float], Array]] = []
+        self.on_control, self.on_substep, self.on_after = Hooks(), Hooks(), Hooks()
+        self.edits, self.senses = Hooks(), Hooks()
         self.commanded = np.zeros(0)
         self.pushed = False
         self.attached = False
+
+    def refresh(self) -> None:
+        """Forget the hooks of wrappers that are gone."""
+        refresh(self.on_control, self.on_substep, self.on_after)
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
         return _nothing, ()
@@ -118,7 +121,7 @@ class SingleSimulation(Simulation):
         self.nominal = self.fields.nominal_model
         self._steps: tuple[Any, str] | None = stepper_of(env)
         self._inside = False
-        self._calls = 0
+        self._calls = self._written = 0
         self._time = np.inf
         self.started = True
         self._look()
@@ -155,13 +158,15 @@ class SingleSimulation(Simulation):
 
     def edit_after(self) -> None:
         """After a reset: the edits that come on top of the psi that the environment itself has written."""
-        if self.own_fields and self.edits:
+        if self.own_fields:
             self._write()
 
     def _write(self) -> None:
-        for _, edit in sorted(self.edits, key=lambda e: e[0]):
+        edits = self.edits.live()
+        for edit in edits:
             edit(self.fields)
         self.fields.commit()
+        self._written = len(edits)
 
     # ---- stepping -------------------------------------------------------------------------------------------------
 
@@ -196,6 +201,9 @@ class SingleSimulation(Simulation):
     def begin_episode(self) -> None:
         """The next control step is the first of an episode."""
         self.started = True
+        self.refresh()
+        if len(self.edits.live()) < self._written:  # a wrapper that edited the model is gone
+            self.edit()
         self._inside, self._calls, self._time = False, 0, np.inf
 
     def _begin(self) -> None:
@@ -211,6 +219,8 @@ class SingleSimulation(Simulation):
         if self.pushed:
             self._base[0][:] = self.qfrc_applied
             self._base[1][:] = self.xfrc_applied
+        if self.started:
+            self.refresh()
         for hook in self.on_control:
             hook()
         self.started, self._inside = False, True

@@ -44,7 +44,7 @@ def _wrapped(pairs: list[tuple[Effect, np.ndarray]], seed: int) -> np.ndarray:
     base = env.unwrapped
     base.start = (qpos, qvel)
     states: list[np.ndarray] = []
-    env.sim.on_substep.append(lambda: states.append(base._observe()))
+    env.sim.on_substep.add(lambda: states.append(base._observe()))
     env.sim.attach("test")
     env.reset(seed=0)
     for action in ctrl:

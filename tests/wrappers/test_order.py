@@ -138,3 +138,25 @@ def test_noise_of_two_wrappers_of_a_kind_differs() -> None:
     env.reset(seed=0)
     outer, inner = env.rng.standard_normal(3), env.env.rng.standard_normal(3)
     assert (outer != inner).all()
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda e: ApplyEffects(e, PAYLOAD),
+        lambda e: ResidualDynamics(e, 0.1 * np.ones(14)),
+        lambda e: ResidualDynamics(e, 0.1 * np.ones(14), mode="state"),
+        lambda e: RandomizePsi(e, space=["torso"]),
+        lambda e: Hallucinate(e, PSI, space=["torso"]),
+    ],
+)
+def test_a_wrapper_that_was_thrown_away_acts_no_more(wrap: Any) -> None:
+    """Its environment goes on as if it had never been wrapped, alone or in another wrapper."""
+    env = gym.make("Ant-v5")
+    expected = roll(gym.make("Ant-v5"), 4)
+    wrapped: Any = wrap(env)
+    wrapped.reset(seed=1)
+    wrapped.step(np.zeros(wrapped.action_space.shape))
+    del wrapped
+    same(roll(ResidualDynamics(env, np.zeros(14)), 4), expected)
+    same(roll(ApplyEffects(env, []), 4), expected)
