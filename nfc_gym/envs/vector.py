@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
-from nfc_gym.envs.batching import Ids, ids_of, masked, rows_of, seeds_of
+from nfc_gym.envs.batching import Ids, final_info, ids_of, masked, rows_of, seeds_of, vector_options
 from nfc_gym.envs.contract import (
     Observer,
     box,
     broken,
-    checked_options,
     nothing_yet,
     outcome,
     robot_class,
@@ -92,8 +91,10 @@ class RobotVectorEnv(VectorEnv):
 
     def _build(self, maps: Sequence[Heightfield], perceived: Sequence[Heightfield] | None = None) -> None:
         """Start a batch; every simulation then waits for its first reset."""
-        n = self.num_envs
+        n, before = self.num_envs, self.__dict__.get("_sims")
         self._sims = Simulations(self._given, n, self._nthread, maps, maps if perceived is None else perceived)
+        if before is not None:
+            self._sims.generators = before.generators
         self._view = self._sims.view
         self._steps = np.zeros(n, np.int64)
         self._waiting = np.ones(n, bool)  # for a reset
@@ -188,10 +189,7 @@ class RobotVectorEnv(VectorEnv):
           InputError: as for `RobotEnv.reset`.
         """
         n = self.num_envs
-        given = checked_options(options, self.rough, ("reset_mask",))
-        for key in ("heightfield", "perceived"):
-            if key in given:
-                raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
+        given = vector_options(options, self.rough, ("reset_mask",))
         ids = ids_of(given.pop("reset_mask", None), n)
         if self._fresh and len(ids) < n:
             raise InputError("reset_mask: the first reset must be of all environments")
@@ -260,7 +258,7 @@ class RobotVectorEnv(VectorEnv):
     def _begin(self, ids: Ids, given: Mapping[str, Any]) -> None:
         """Begin episodes with options of leading shape (k,), and what the hooks add to them."""
         for hook in self.reset_hooks:
-            given = checked_options(hook(ids), self.rough) | given
+            given = vector_options(hook(ids), self.rough) | given
         self._sims.begin(ids, given)
         self._view.now = self.robot.derive(self._view)
         self._steps[ids] = 0
@@ -270,17 +268,8 @@ class RobotVectorEnv(VectorEnv):
     def _restart(self, done: NDArray[np.bool_], info: dict[str, Any]) -> Any:
         """Same-step autoreset: the last observations and infos of the ended episodes go into `info`."""
         last = self._observation(done)
-        ids = np.flatnonzero(done)
-        final = np.full(self.num_envs, None, object)
-        for row, i in enumerate(ids):
-            final[i] = {k: v[row] for k, v in last.items()} if isinstance(last, dict) else last[row]
-        before = {k: v for k, v in info.items() if not k.startswith("_")}
-        self._begin(ids, {})
-        new = nothing_yet(self.robot, self._view)
-        info.update({key: np.where(done, new[key], value) for key, value in before.items()})
-        ended = {key: value * done for key, value in before.items()}  # zero where no episode ended
-        info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": masked(ended, done.copy())}
-        info["_final_info"] = done.copy()
+        self._begin(np.flatnonzero(done), {})
+        info.update(final_info(last, info, nothing_yet(self.robot, self._view), done.copy()))
         return self._observation()
 
     def _advance(self, active: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -296,15 +285,18 @@ class RobotVectorEnv(VectorEnv):
         return unstable
 
     def _run(self, active: NDArray[np.bool_] | None) -> None:
+        if not self.substep_hooks:
+            self._physics(active, self.frame_skip)
+            return
+        for _ in range(self.frame_skip):
+            for hook in self.substep_hooks:
+                hook(self)
+            self._physics(active, 1)
+
+    def _physics(self, active: NDArray[np.bool_] | None, steps: int) -> None:
         try:
-            if not self.substep_hooks:
-                self.batch.step(active, nstep=self.frame_skip)
-                return
-            for _ in range(self.frame_skip):
-                for hook in self.substep_hooks:
-                    hook(self)
-                self.batch.step(active)
-        except SimulationError as error:  # the solver ran out of memory in some
+            self.batch.step(active, nstep=steps)
+        except SimulationError as error:  # the solver ran out of memory in some; the others went on
             self._view.qvel[error.ids] = np.nan
 
     def _observation(self, rows: NDArray[np.bool_] | None = None) -> Any:
