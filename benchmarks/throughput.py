@@ -397,7 +397,7 @@ def main() -> None:
     quick = args.quick
     global clock
     clock = processor_time if args.clock == "cpu" else time.perf_counter
-    turns = 7 if quick else 25
+    turns = 5 if quick else 25
     robots = ["Jackal"] if quick else ["Jackal", "Quadcopter", "Quadruped", "Ant", "Humanoid"]
     grounds = [f"{robot}{ground}" for robot in robots for ground in ("Flat", "Rough")]
     sizes = [16, 1024] if quick else [1, 16, 256, 1024]

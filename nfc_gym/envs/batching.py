@@ -7,8 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.envs.contract import checked_options
 
 Ids = NDArray[np.intp]
+
+
+def vector_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Checked reset options of a vector environment, which takes whole maps by `set_terrains` alone."""
+    given = checked_options(options, rough, more)
+    for key in ("heightfield", "perceived", "terrain_residual"):
+        if key in given:
+            raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
+    return given
 
 
 def ids_of(mask: Any, n: int) -> Ids:
@@ -53,3 +63,22 @@ def terrain_ids(chosen: Any, k: int, maps: int) -> Ids:
 def masked(info: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
     """Gymnasium's vector form of `info`: beside each key its mask, `_key`, of the environments that it is of."""
     return info | {"_" + key: mask for key in info}
+
+
+def final_info(last: Any, info: dict[str, Any], new: dict[str, Any], done: NDArray[np.bool_]) -> dict[str, Any]:
+    """What a same-step autoreset changes in `info`: the ended episodes' last words, and the new ones' first.
+
+    Args:
+      last: the last observations, (k, ...) or a dict of such, of the environments that are done.
+      info: of the step.
+      new: of the reset, for all.
+      done: (n,) whose episodes ended.
+    """
+    own = {key: value for key, value in info.items() if not key.startswith("_")}
+    observations = np.full(len(done), None, object)
+    for row, i in enumerate(np.flatnonzero(done)):
+        observations[i] = {k: v[row] for k, v in last.items()} if isinstance(last, dict) else last[row]
+    ended = {key: value * done for key, value in own.items()}  # zero where no episode ended
+    out: dict[str, Any] = {key: np.where(done, new[key], value) for key, value in own.items()}
+    out |= {"final_obs": observations, "final_info": masked(ended, done)}
+    return out | {"_final_obs": done, "_final_info": done}

@@ -1,6 +1,5 @@
 """`Robot`: a robot's task as pure functions over a `View`; the engines (`single`, `vector`) know nothing else of it."""
 
-import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from nfc_gym import assets
 from nfc_gym.envs import scene
 from nfc_gym.envs.components import observed
 from nfc_gym.envs.view import View
-from nfc_gym.physics.parameters import Parameter, ParameterSpace
+from nfc_gym.physics.parameters import Parameter, ParameterSpace, parameters_from_toml
 from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
@@ -115,8 +114,7 @@ class Robot(ABC):
     @classmethod
     def parameters(cls) -> list[Parameter]:
         """psi, in the paper's order, from the robot's `psi.toml`."""
-        rows = tomllib.loads(assets.path(cls.name).with_name("psi.toml").read_text())["parameter"]
-        return [Parameter(**{**row, "of": tuple(row.get("of", ()))}) for row in rows]
+        return parameters_from_toml(assets.path(cls.name).with_name("psi.toml"))
 
     @classmethod
     def space(cls, model: mujoco.MjModel) -> ParameterSpace:

@@ -18,28 +18,24 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
-from nfc_gym.envs.batching import Ids, ids_of, masked, rows_of, seeds_of, terrain_ids
+from nfc_gym.envs.batching import Ids, final_info, ids_of, masked, rows_of, seeds_of, vector_options
 from nfc_gym.envs.contract import (
-    FLAT,
     Observer,
     box,
     broken,
-    checked_options,
     nothing_yet,
     outcome,
-    psi_of,
-    rest_key,
     robot_class,
-    seen_psi,
     wrong_action,
 )
 from nfc_gym.envs.look import HeldMaps
 from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.screen import Screen
 from nfc_gym.envs.settings import Settings
-from nfc_gym.envs.view import View
+from nfc_gym.envs.simulations import Simulations
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.terrain import Heightfield, surface
+from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.terrain import Heightfield
 
 
 class RobotVectorEnv(VectorEnv):
@@ -55,9 +51,6 @@ class RobotVectorEnv(VectorEnv):
       settings: the attributes of `Settings`.
 
     Attributes:
-      model, batch: the nominal model, and the simulations.
-      fields: `ModelFields` of the batch; what is written through it goes back to nominal at every reset.
-      psi_space: names, units, bounds and nominal values of psi.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
       after_hooks: called with this environment after the last physics step, before anything is observed.
       reset_hooks: called with the ids (k,) about to be reset, autoresets included; a returned dict of reset options,
@@ -96,28 +89,15 @@ class RobotVectorEnv(VectorEnv):
         self.single_action_space = box(self._kind.action_size, bound=1.0)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
         self._limit = np.ones((self.num_envs, self._kind.action_size))
 
     def _build(self, maps: Sequence[Heightfield], perceived: Sequence[Heightfield] | None = None) -> None:
-        """Compile the scene and start a batch of it; every simulation then waits for its first reset."""
-        n = self.num_envs
-        self.model = self._kind.compile(len(maps))
-        for k, heightfield in enumerate(maps):
-            scene.write(self.model, k, heightfield.heights)
-        self._maps, self._perceived = list(maps), list(maps if perceived is None else perceived)
-        self._stack = np.stack([m.heights for m in maps]) if maps else np.zeros((0, 2, 2), np.float32)
-        self.robot = self._given.robot(self.model)
-        self.psi_space = self._kind.space(self.model)
-        self.batch = Batch(self.model, n, self._nthread)
-        self.fields = ModelFields(self.batch)
-        # Which map a simulation stands on: one entry of `geom_dataid`.
-        self._chosen = self.batch.expand("geom_dataid")[:, self.model.geom(scene.GROUND).id] if maps else None
-        self._home = rest_key(self.model)
-        self._view = View(self.model, self.batch.bind, self._kind.reads, self._ground)
-        self._psi = np.tile(self.psi_space.nominal, (n, 1))
-        self._seen = np.zeros((n, len(self.psi_space)), np.float32)
-        self._terrain = np.zeros(n, np.intp)
+        """Start a batch; every simulation then waits for its first reset."""
+        n, before = self.num_envs, self.__dict__.get("_sims")
+        self._sims = Simulations(self._given, n, self._nthread, maps, maps if perceived is None else perceived)
+        if before is not None:
+            self._sims.generators = before.generators
+        self._view = self._sims.view
         self._steps = np.zeros(n, np.int64)
         self._waiting = np.ones(n, bool)  # for a reset
         self._fresh = True  # nothing was reset yet
@@ -130,29 +110,54 @@ class RobotVectorEnv(VectorEnv):
         return self.model.opt.timestep * self.frame_skip
 
     @property
+    def model(self) -> mujoco.MjModel:
+        """The nominal model; `set_terrains` replaces it, and the next three."""
+        return self._sims.model
+
+    @property
+    def batch(self) -> Batch:
+        """The simulations."""
+        return self._sims.batch
+
+    @property
+    def fields(self) -> ModelFields:
+        """Model fields of the batch; what is written through it goes back to nominal at every reset."""
+        return self._sims.fields
+
+    @property
+    def robot(self) -> Robot:
+        """The laws."""
+        return self._sims.robot
+
+    @property
+    def psi_space(self) -> ParameterSpace:
+        """Names, units, bounds and nominal values of psi."""
+        return self._sims.space
+
+    @property
     def psi(self) -> NDArray[np.float64]:
         """(n, d) psi of every simulation in physical units."""
-        return self._psi.copy()
+        return self._sims.psi.copy()
 
     @property
     def terrain_id(self) -> Ids:
-        """(n,) which map every simulation stands on."""
-        return self._terrain.copy()
+        """(n,) which of `maps` every simulation stands on."""
+        return self._sims.chosen.copy()
 
     @property
     def maps(self) -> tuple[Heightfield, ...]:
-        """The maps that `terrain_id` counts; none on flat ground."""
-        return tuple(self._maps)
+        """The maps to choose from; none on flat ground."""
+        return self._sims.maps
 
     @property
     def heightfield(self) -> list[Heightfield]:
         """n terrains that are simulated; zeros on flat ground."""
-        return [self._maps[k] for k in self._terrain] if self.rough else [FLAT] * self.num_envs
+        return self._sims.terrains(self._sims.maps)
 
     @property
     def perceived(self) -> list[Heightfield]:
         """n terrains that `elevation` is taken from: the simulated ones, unless `set_terrains` was told others."""
-        return [self._perceived[k] for k in self._terrain] if self.rough else [FLAT] * self.num_envs
+        return self._sims.terrains(self._sims.perceived)
 
     @property
     def proprio_components(self) -> list[str]:
@@ -162,7 +167,7 @@ class RobotVectorEnv(VectorEnv):
     @property
     def mjcf(self) -> str:
         """The nominal model on the first map, as MJCF that plain MuJoCo loads."""
-        return self.robot.mjcf(self._maps[0] if self.rough else None)
+        return self.robot.mjcf(self.maps[0] if self.rough else None)
 
     def set_terrains(self, maps: Sequence[Any], perceived: Sequence[Any] | None = None) -> None:
         """Other maps for the simulations to choose from; the batch is built anew, and must be reset before a step.
@@ -196,18 +201,14 @@ class RobotVectorEnv(VectorEnv):
           InputError: as for `RobotEnv.reset`.
         """
         n = self.num_envs
-        given = checked_options(options, self.rough, ("reset_mask",))
-        for key in ("heightfield", "perceived", "terrain_residual"):
-            if key in given:
-                raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
+        given = vector_options(options, self.rough, ("reset_mask",))
         ids = ids_of(given.pop("reset_mask", None), n)
         if self._fresh and len(ids) < n:
             raise InputError("reset_mask: the first reset must be of all environments")
         for i, own in enumerate(seeds_of(seed, n)):
             if own is not None and i in ids:
-                self._generators[i] = seeding.np_random(own)[0]
+                self._sims.generators[i] = seeding.np_random(own)[0]
         self._begin(ids, {key: rows_of(value, ids, n) for key, value in given.items()})
-        self._view.now = self.robot.derive(self._view)
         info = nothing_yet(self.robot, self._view)
         return self._observation(), masked(info, np.isin(np.arange(n), ids))
 
@@ -238,7 +239,6 @@ class RobotVectorEnv(VectorEnv):
         self._steps += 1
         if resetting is not None:
             self._begin(np.flatnonzero(resetting), {})
-            view.now = self.robot.derive(view)
             new = nothing_yet(self.robot, view)
             info = {key: np.where(resetting, new[key], value) for key, value in info.items()}
             rewards, ended = np.where(resetting, 0.0, rewards), ended & ~resetting
@@ -268,33 +268,11 @@ class RobotVectorEnv(VectorEnv):
     # ---- inside ---------------------------------------------------------------------------------------------------
 
     def _begin(self, ids: Ids, given: Mapping[str, Any]) -> None:
-        """Begin an episode in some environments; options have leading shape (k,). `view.now` is left to the caller."""
-        k, everyone = len(ids), len(ids) == self.num_envs
+        """Begin episodes with options of leading shape (k,), and what the hooks add to them."""
         for hook in self.reset_hooks:
-            more = checked_options(hook(ids), self.rough)
-            given = {**more, **given}
-        u = np.array([self._generators[i].random(1 + self.robot.draws) for i in ids])
-        psi = psi_of(self.psi_space, given.get("psi"), (k,))
-        belief = psi_of(self.psi_space, given["psi_belief"], (k,), "psi_belief") if "psi_belief" in given else psi
-        fields = self.fields if everyone else self.fields.rows(ids)
-        fields.restore()
-        self.psi_space.write(fields, psi)
-        fields.commit()
-        self._psi[ids], self._seen[ids] = psi, seen_psi(self.psi_space, belief)
-        if self._chosen is not None:
-            chosen = given.get("terrain_id", (u[:, 0] * len(self._maps)).astype(np.intp))
-            self._terrain[ids] = terrain_ids(chosen, k, len(self._maps))
-            self._chosen[ids] = self._terrain[ids]
-        self.batch.reset(ids, self._home, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        start = self.robot.begin(u[:, 1:], lambda xy: self._ground(xy, self._terrain[ids]))
-        self._view.qpos[ids], self._view.qvel[ids] = start.qpos, start.qvel
-        self.batch.forward(ids)
-        for name, value in start.task.items():
-            old = self._view.task.get(name)
-            # A new array: the old one may be in somebody's hands.
-            new = np.empty((self.num_envs, *value.shape[1:]), value.dtype) if old is None else old.copy()
-            new[ids] = value
-            self._view.task[name] = new
+            given = vector_options(hook(ids), self.rough) | given
+        self._sims.begin(ids, given)
+        self._view.now = self.robot.derive(self._view)
         self._steps[ids] = 0
         self._waiting[ids] = False
         self._fresh = False
@@ -302,18 +280,8 @@ class RobotVectorEnv(VectorEnv):
     def _restart(self, done: NDArray[np.bool_], info: dict[str, Any]) -> Any:
         """Same-step autoreset: the last observations and infos of the ended episodes go into `info`."""
         last = self._observation(done)
-        ids = np.flatnonzero(done)
-        final = np.full(self.num_envs, None, object)
-        for row, i in enumerate(ids):
-            final[i] = {k: v[row] for k, v in last.items()} if isinstance(last, dict) else last[row]
-        before = {k: v for k, v in info.items() if not k.startswith("_")}
-        self._begin(ids, {})
-        self._view.now = self.robot.derive(self._view)
-        new = nothing_yet(self.robot, self._view)
-        info.update({key: np.where(done, new[key], value) for key, value in before.items()})
-        ended = {key: value * done for key, value in before.items()}  # zero where no episode ended
-        info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": masked(ended, done.copy())}
-        info["_final_info"] = done.copy()
+        self._begin(np.flatnonzero(done), {})
+        info.update(final_info(last, info, nothing_yet(self.robot, self._view), done.copy()))
         return self._observation()
 
     def _advance(self, active: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -325,38 +293,34 @@ class RobotVectorEnv(VectorEnv):
         if not unstable.any():
             return None
         ids = np.flatnonzero(unstable)
-        self.batch.reset(ids, self._home)
+        self.batch.reset(ids, self._sims.rest)
         return unstable
 
     def _run(self, active: NDArray[np.bool_] | None) -> None:
-        try:
-            if not self.substep_hooks:
-                self.batch.step(active, nstep=self.frame_skip)
-                return
-            for _ in range(self.frame_skip):
-                for hook in self.substep_hooks:
-                    hook(self)
-                self.batch.step(active)
-            for hook in self.after_hooks:
+        if not self.substep_hooks:
+            self._physics(active, self.frame_skip)
+            return
+        for _ in range(self.frame_skip):
+            for hook in self.substep_hooks:
                 hook(self)
-        except SimulationError as error:  # the solver ran out of memory in some
-            self._view.qvel[error.ids] = np.nan
+            self._physics(active, 1)
+        for hook in self.after_hooks:
+            hook(self)
 
-    def _ground(self, xy: NDArray, which: Ids | None = None) -> NDArray[np.float64]:
-        if not self.rough:
-            return np.zeros(xy.shape[:-1])
-        which = self._terrain if which is None else which
-        which = which.reshape(which.shape + (1,) * (xy.ndim - 2))
-        return surface(self._stack, xy, self._maps[0].resolution, self._maps[0].origin, which)[0]
+    def _physics(self, active: NDArray[np.bool_] | None, steps: int) -> None:
+        try:
+            self.batch.step(active, nstep=steps)
+        except SimulationError as error:  # the solver ran out of memory in some; the others went on
+            self._view.qvel[error.ids] = np.nan
 
     def _observation(self, rows: NDArray[np.bool_] | None = None) -> Any:
         """Fresh observations of all environments, or of some."""
-        obs = self._observe(self._view, self._seen, None)
+        obs = self._observe(self._view, self._sims.seen, None)
         if rows is not None:
             obs = obs[rows] if self._observe.plain else {k: v[rows] for k, v in obs.items()}
         if self._observe.elevation:
-            perceived = self._perceived if self.rough else None
-            obs["elevation"] = self._elevation.around(self._view.qpos, perceived, self._terrain, self._steps, rows)
+            perceived = self._sims.perceived or None
+            obs["elevation"] = self._elevation.around(self._view.qpos, perceived, self._sims.chosen, self._steps, rows)
         return obs
 
 

@@ -191,8 +191,10 @@ def test_substep_hooks_see_every_physics_step() -> None:
 
 
 def test_terrains_are_replaced() -> None:
-    envs = vector("nfc_gym/JackalRough-v0")
+    """Heights simulated and perceived change; the environments' generators go on where they stood."""
+    envs, twin = vector("nfc_gym/JackalRough-v0"), vector("nfc_gym/JackalRough-v0")
     envs.reset(seed=0)
+    twin.reset(seed=0)
     maps = [terrain.Heightfield(np.full((256, 256), h, np.float32)) for h in (0.0, 0.5, 2.0)]
     seen = [np.full((256, 256), -1.0)] * 3
     envs.unwrapped.set_terrains(maps, seen)
@@ -211,6 +213,12 @@ def test_terrains_are_replaced() -> None:
         envs.reset(options={"terrain_id": 3})
     with pytest.raises(InputError, match="set_terrains"):
         envs.reset(options={"heightfield": maps[0].heights})
+    assert envs.unwrapped.heightfield[1] is maps[1]
+    envs.unwrapped.set_terrains(twin.unwrapped.maps)
+    envs.reset(seed=4)
+    envs.unwrapped.set_terrains(twin.unwrapped.maps)
+    twin.reset(seed=4)
+    same(envs.reset()[0], twin.reset()[0])
     with pytest.raises(InputError, match="use the Rough one"):
         vector("nfc_gym/JackalFlat-v0").unwrapped.set_terrains(maps)
 
