@@ -1,9 +1,9 @@
 """Gymnasium's Ant-v5 on this package's engine: the same MJCF, frame skip, observation and reward, equal to 1e-9.
 
 `AntV5` leaves out the contact forces (78 of 105 observed values, and a cost), which is an option of Ant-v5 itself;
-`AntV5Contact` has them. Gymnasium calls `mj_rnePostConstraint` after `mj_step`, which finds the forces of the last stage of
-the last physics step's Runge-Kutta scheme. A batch has no such call, but a force sensor makes `Batch.forward` compute them;
-so the simulations go back to that stage for one evaluation more, the 21st of a control step.
+`AntV5Contact` has them. Gymnasium calls `mj_rnePostConstraint` after `mj_step`, which finds the forces of the last
+stage of the last physics step's Runge-Kutta scheme. A batch has no such call, but with a force sensor its `forward`
+finds them; so the simulations go back to that stage for one evaluation more, the 21st of a control step.
 """
 
 from pathlib import Path
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.robot import Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import axes, to_robot
 from nfc_gym.envs.vector import RobotVectorEnv
 from nfc_gym.envs.view import View
 
@@ -23,6 +22,7 @@ MJCF = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "ant.xml
 NOISE = 0.1  # of the start: uniform for positions, standard normal times this for velocities
 HEALTHY = (0.2, 1.0)  # m, height of the torso
 CTRL_COST, CONTACT_COST = 0.5, 5e-4
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]  # of a cross product
 
 
 class Now(NamedTuple):
@@ -115,19 +115,25 @@ class AntV5ContactVectorEnv(RobotVectorEnv):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(AntV5Contact, context=(), **kwargs)
-        names = ("xpos", "xquat", "cvel", "subtree_com", "actuator_length", "actuator_velocity")
+        names = ("xpos", "xquat", "xmat", "cvel", "subtree_com", "actuator_length", "actuator_velocity")
         self._stage = {name: self.batch.bind(name) for name in names}
         self._gear = self.model.actuator_gear[:, 0].copy()
         self._hinges = self.model.actuator_trnid[:, 0] - 1  # actuators in the order of the file, not of the joints
+        # The sensor is looked at in the last evaluation alone: the others need no contact forces.
+        self._flags = self.batch.expand("opt.disableflags")
+        self._on = int(self.model.opt.disableflags)
+        self._off = self._on | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
     def _run(self, active: NDArray[np.bool_] | None) -> None:
         batch = self.batch
+        self._flags[...] = self._off
         batch.step(active, nstep=self.frame_skip - 1)
         warm = batch.qacc_warmstart.copy()
         batch.step(active)
         end = batch.state.copy()
         self._to_last_stage()
         batch.qacc_warmstart[...] = warm
+        self._flags[...] = self._on
         batch.forward(active)
         batch.state[...] = end
 
@@ -136,7 +142,8 @@ class AntV5ContactVectorEnv(RobotVectorEnv):
         stage, qpos, qvel = self._stage, self.batch.qpos, self.batch.qvel
         qpos[:, :3], qpos[:, 3:7] = stage["xpos"][:, 1], stage["xquat"][:, 1]
         qpos[:, 7 + self._hinges] = stage["actuator_length"] / self._gear
-        spin, speed = stage["cvel"][:, 1, :3], stage["cvel"][:, 1, 3:]
-        qvel[:, :3] = speed - np.cross(spin, stage["subtree_com"][:, 1] - stage["xpos"][:, 1])
-        qvel[:, 3:6] = to_robot(axes(stage["xquat"][:, 1]), spin)
+        spin, speed = stage["cvel"][:, 1, :3], stage["cvel"][:, 1, 3:]  # of the point at the centre of mass
+        arm = stage["subtree_com"][:, 1] - stage["xpos"][:, 1]
+        qvel[:, :3] = speed - (spin[:, _NEXT] * arm[:, _LAST] - spin[:, _LAST] * arm[:, _NEXT])
+        qvel[:, 3:6] = (spin[:, None] @ stage["xmat"][:, 1].reshape(-1, 3, 3))[:, 0]
         qvel[:, 6 + self._hinges] = stage["actuator_velocity"] / self._gear

@@ -16,8 +16,7 @@ from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.terrain import SHAPE, Heightfield
 from nfc_gym.terrain.egocentric import SIZE
 
-CONTEXT = ("psi", "elevation")
-OPTIONS = ("psi", "psi_belief", "heightfield", "perceived", "terrain_id")
+OPTIONS = ("psi", "psi_belief", "heightfield", "perceived", "terrain_id", "terrain_residual")
 FLAT = Heightfield(np.zeros(SHAPE, np.float32))
 
 
@@ -33,23 +32,6 @@ def robot_class(robot: str | type[Robot]) -> type[Robot]:
     return found
 
 
-def checked_context(context: Sequence[str]) -> tuple[str, ...]:
-    """A subset of `CONTEXT` in its order; another name raises `InputError`."""
-    if isinstance(context, str) or any(c not in CONTEXT for c in context):
-        raise InputError(f"context is {context!r}, want a sequence of: {', '.join(CONTEXT)}")
-    return tuple(c for c in CONTEXT if c in context)
-
-
-def refresh_period(elevation_hz: float | None, fps: int) -> int:
-    """Control steps between two elevation maps."""
-    if elevation_hz is None:
-        return 1
-    if not 0 < elevation_hz <= fps or not float(fps / elevation_hz).is_integer():
-        rates = ", ".join(f"{fps / k:g}" for k in (1, 2, 5, 10, 25, 50))
-        raise InputError(f"elevation_hz is {elevation_hz!r}, want {fps} divided by a whole number, such as {rates}")
-    return round(fps / elevation_hz)
-
-
 def box(*shape: int, bound: float = np.inf, dtype: type[np.floating] = np.float32) -> spaces.Box:
     """A `Box` with the same bound everywhere."""
     return spaces.Box(-bound, bound, shape, dtype)
@@ -61,12 +43,12 @@ class Observer:
     Args:
       robot: whose.
       psi_size: d.
-      context: a checked context.
+      context: of `psi` and `elevation`, those to observe.
 
     A goal-conditioned robot has `observation`, `achieved_goal` and `desired_goal` in place of `proprio` and `goal`.
     """
 
-    def __init__(self, robot: Robot, psi_size: int, context: tuple[str, ...]) -> None:
+    def __init__(self, robot: Robot, psi_size: int, context: Sequence[str]) -> None:
         goal_conditioned = robot.goal_conditioned is not None
         self._robot, self._goal_conditioned = robot, goal_conditioned
         self.psi, self.elevation = "psi" in context, "elevation" in context
@@ -112,7 +94,8 @@ class Observer:
 
 def broken(view: View) -> NDArray[np.bool_]:
     """(*B,) whether a simulation has come apart: NaN or an absurd speed."""
-    return ~(np.vecdot(view.qvel, view.qvel) < FASTEST * FASTEST)
+    speed = view.qvel
+    return np.logical_not((speed @ speed if speed.ndim == 1 else np.vecdot(speed, speed)) < FASTEST * FASTEST)
 
 
 def outcome(
@@ -161,7 +144,7 @@ def checked_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[
     for key in given:
         if key not in (*OPTIONS, *more):
             raise InputError(f"reset has no option {key!r}; it has: {', '.join((*OPTIONS, *more))}")
-        if not rough and key in ("heightfield", "perceived", "terrain_id"):
+        if not rough and key in ("heightfield", "perceived", "terrain_id", "terrain_residual"):
             raise InputError(f"option {key!r}: the ground of a Flat environment is a plane; use the Rough one")
     if "heightfield" in given and "terrain_id" in given:
         raise InputError("options 'heightfield' and 'terrain_id' both name the terrain: give one of them")

@@ -1,5 +1,7 @@
 """Pictures and a window of a simulation, in which a heightfield that changed at run time is seen to have changed."""
 
+import os
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -60,8 +62,18 @@ class _Shown:
         return out
 
 
+def _context(width: int, height: int) -> Any:
+    """An off-screen context: MuJoCo's choice, but EGL on Linux without a display, where that choice would fail."""
+    told = os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if told or not sys.platform.startswith("linux"):
+        return mujoco.GLContext(width, height)
+    from mujoco.egl import GLContext
+
+    return GLContext(width, height)
+
+
 class Pictures:
-    """Renders off screen (`MUJOCO_GL=egl` or `osmesa` where there is no display).
+    """Renders off screen; `MUJOCO_GL` (`egl`, `osmesa`, `glfw`) chooses by what.
 
     Args:
       model: the scene.
@@ -72,7 +84,7 @@ class Pictures:
         self._size = (height, width, 3)
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        self._gl = mujoco.GLContext(width, height)
+        self._gl = _context(width, height)
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)

@@ -1,20 +1,20 @@
 """`Robot`: a robot's task as pure functions over a `View`; the engines (`single`, `vector`) know nothing else of it."""
 
-import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym import assets
-from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
+from nfc_gym.envs.components import observed
 from nfc_gym.envs.view import View
-from nfc_gym.physics.parameters import Parameter, ParameterSpace
+from nfc_gym.physics.parameters import Parameter, ParameterSpace, parameters_from_toml
+from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
 Ground = Callable[[NDArray], Array]
@@ -72,7 +72,8 @@ class Robot(ABC):
       draws: how many uniform numbers in [0, 1) an episode's start is made of.
       reads: derived `MjData` fields that the laws read (`sensordata`, `xpos`, ...).
       arrived: distance from a goal that counts as there [m].
-      goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward; set by `of`.
+      goal_conditioned: None, or the kind of `goal_reward` that takes the place of the robot's own reward; set by
+        `Settings.robot`.
       terms: names of the robot's own reward terms of this task, set by the constructor.
       home: (nq,) position of the keyframe `home`, the model's own where it has none.
       frame_skip: physics steps a control step.
@@ -106,28 +107,19 @@ class Robot(ABC):
         return scene.build(assets.path(cls.name), maps)
 
     @classmethod
+    def mjcf(cls, ground: Heightfield | None) -> str:
+        """The scene on one map, or on a plane, as MJCF that plain MuJoCo loads."""
+        return scene.text(assets.path(cls.name), ground)
+
+    @classmethod
     def parameters(cls) -> list[Parameter]:
         """psi, in the paper's order, from the robot's `psi.toml`."""
-        rows = tomllib.loads(assets.path(cls.name).with_name("psi.toml").read_text())["parameter"]
-        return [Parameter(**{**row, "of": tuple(row.get("of", ()))}) for row in rows]
+        return parameters_from_toml(assets.path(cls.name).with_name("psi.toml"))
 
     @classmethod
     def space(cls, model: mujoco.MjModel) -> ParameterSpace:
         """psi bound to a model."""
         return ParameterSpace(model, cls.parameters())
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, task: str | None, goal_conditioned: bool, reward_type: str) -> Self:
-        """The robot with a task: None is the default one; `InputError` where it has none of that name, or no goals."""
-        if task is not None and task not in cls.tasks:
-            raise InputError(f"{cls.name} has no task {task!r}; it has: {', '.join(cls.tasks)}")
-        if reward_type not in GOAL_REWARDS:
-            raise InputError(f"reward_type is {reward_type!r}, want one of: {', '.join(GOAL_REWARDS)}")
-        if goal_conditioned and not cls.place_size:
-            raise InputError(f"goal_conditioned: the {cls.name} has no goals to reach")
-        robot = cls(model, task or cls.tasks[0])
-        robot.goal_conditioned = reward_type if goal_conditioned else None
-        return robot
 
     # ---- the laws -------------------------------------------------------------------------------------------------
 
@@ -161,6 +153,10 @@ class Robot(ABC):
     @abstractmethod
     def proprio(self, view: View) -> Sequence[NDArray]:
         """Parts (*B, k) whose concatenation is the observation `proprio` (*B, proprio_size)."""
+
+    def components(self, model: mujoco.MjModel) -> list[str]:
+        """What each entry of `proprio` is, see `nfc_gym.envs.components`; without more, none is known to be state."""
+        return observed(self.proprio_size)
 
     def goal(self, view: View) -> NDArray:
         """(*B, goal_size) the command in the robot's frame, where it is not part of `proprio`."""

@@ -1,41 +1,36 @@
 """`RobotEnv`: one robot in one simulation, a thin shell around the robot's laws."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from math import isfinite
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
 from nfc_gym.envs.contract import (
     FLAT,
     Observer,
     box,
     broken,
-    checked_context,
     checked_options,
     nothing_yet,
     outcome,
     psi_of,
-    refresh_period,
     rest_key,
     robot_class,
     seen_psi,
     wrong_action,
 )
-from nfc_gym.envs.render import Camera, Pictures, Window
+from nfc_gym.envs.look import look
 from nfc_gym.envs.robot import Robot
-from nfc_gym.envs.rotations import yaw
-from nfc_gym.envs.terrains import Pool
+from nfc_gym.envs.screen import Screen
+from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.view import View
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.terrain import Heightfield, elevation, surface
-from nfc_gym.terrain.egocentric import SIZE
+from nfc_gym.terrain import Heightfield, surface
 
 _FLAG = (bool, np.bool_)
 
@@ -46,73 +41,51 @@ class RobotEnv(gymnasium.Env):
     Args:
       robot: class of the robot, or `module:Class`.
       rough: heightfields in place of a plane.
-      task: one of the robot's tasks; None is its first.
-      goal_conditioned: `observation`, `achieved_goal`, `desired_goal` in place of `proprio` and `goal` (see `goals`).
-      reward_type: of a goal-conditioned environment, `sparse` (0 at the goal, else -1) or `dense` (minus the distance).
-      context: which of `psi` and `elevation` the observation holds; () gives a plain `Box`.
-      elevation_hz: how often the elevation map is renewed; None is every control step (50 Hz).
-      difficulty: of the terrain, in [0, 1].
-      terrain_seed, terrain_pool, terrain_kind: the pool of maps that episodes draw from; the default kind is the
-        robot's.
       render_mode: None, `rgb_array` or `human`.
-      width, height: of pictures.
-      camera: name of a camera of the robot's file, or a free one (`render.camera_of`).
+      settings: the attributes of `Settings`.
 
     Attributes:
       model, data: the simulation. Edits of the model last until the next reset where psi or `fields` touched them.
       fields: `ModelFields` of `model`; what is written through it goes back to nominal at every reset.
       psi_space: names, units, bounds and nominal values of psi.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
-      camera: as above; may be changed between pictures.
+      after_hooks: called with this environment after the last physics step, before anything is observed.
+      screen: what renders; its `camera` may be changed between pictures.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(
         self,
         robot: str | type[Robot],
         rough: bool = False,
         *,
-        task: str | None = None,
-        goal_conditioned: bool = False,
-        reward_type: str = "sparse",
-        context: Sequence[str] = ("psi", "elevation"),
-        elevation_hz: float | None = None,
-        difficulty: float = 0.5,
-        terrain_seed: int = 0,
-        terrain_pool: int = 64,
-        terrain_kind: str | None = None,
         render_mode: str | None = None,
-        width: int = 640,
-        height: int = 480,
-        camera: Camera = "track",
+        **settings: Any,
     ) -> None:
-        self._arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            modes = ", ".join(self.metadata["render_modes"])
-            raise InputError(f"render_mode is {render_mode!r}, want None or one of: {modes}")
+        self._arguments = {"robot": robot, "rough": rough, "render_mode": render_mode, **settings}
         kind = robot_class(robot)
-        self.rough = bool(rough)
+        given = Settings.of(kind, settings)
+        self.screen = Screen(render_mode, (None, *self.metadata["render_modes"]), given)
+        self.rough, self.render_mode = bool(rough), render_mode
         self.model = kind.compile(maps=1 if rough else 0)
         self.data = mujoco.MjData(self.model)
-        self.robot = kind.of(self.model, task, goal_conditioned, reward_type)
+        self.robot = given.robot(self.model)
         self.psi_space = kind.space(self.model)
         self.fields = ModelFields(self.model)
         self.frame_skip = kind.frame_skip
         self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         self.substep_hooks: list[Callable[[RobotEnv], None]] = []
-        self.camera, self.render_mode, self._size = camera, render_mode, (width, height)
-        self._pictures: Pictures | None = None
-        self._window: Window | None = None
+        self.after_hooks: list[Callable[[RobotEnv], None]] = []
 
-        self._pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
+        self._pool = given.pool
         self._terrain = self._perceived = FLAT
-        self._observe = Observer(self.robot, len(self.psi_space), checked_context(context))
-        self._period = refresh_period(elevation_hz, self.metadata["render_fps"])
+        self._observe = Observer(self.robot, len(self.psi_space), given.context)
+        self._period = given.refresh_period(self.metadata["render_fps"])
         self._map: NDArray[np.float32] | None = None
         self._age = 0
         self.observation_space = self._observe.space
-        self.action_space: spaces.Box = box(kind.action_size, bound=1.0)
+        self.action_space = box(kind.action_size, bound=1.0)
 
         self._shape = (kind.action_size,)
         self._home = rest_key(self.model)
@@ -133,6 +106,16 @@ class RobotEnv(gymnasium.Env):
         return self._psi.copy()
 
     @property
+    def proprio_components(self) -> list[str]:
+        """What each entry of `proprio` is, in the names of logs: how a residual of it reaches the state."""
+        return self.robot.components(self.model)
+
+    @property
+    def mjcf(self) -> str:
+        """The nominal model with the ground of the running episode, as MJCF that plain MuJoCo loads."""
+        return self.robot.mjcf(self._terrain if self.rough else None)
+
+    @property
     def heightfield(self) -> Heightfield:
         """The terrain that is simulated; zeros on flat ground."""
         return self._terrain
@@ -144,16 +127,15 @@ class RobotEnv(gymnasium.Env):
 
     # ---- Gymnasium's interface ------------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Any, dict[str, NDArray]]:
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode.
 
         Args:
           seed: of the environment's own generator, from which start, goal and terrain are drawn.
           options: `psi` and `psi_belief`: (d,) in physical units or a dict of names, the rest nominal (what the agent
             believes is by default the truth). On rough ground `heightfield`: (256, 256) m, or `terrain_id`: a map of
-            the pool; `perceived`: (256, 256) m, what `elevation` shows, by default the simulated terrain.
+            the pool; `perceived`: (256, 256) m, what `elevation` shows, by default that terrain; `terrain_residual`:
+            (256, 256) m, added to the simulated terrain alone.
 
         Raises:
           InputError: an unknown option or name, another shape, values that are not finite or physically impossible.
@@ -176,7 +158,7 @@ class RobotEnv(gymnasium.Env):
             self.render()
         return self._observation(), _leaves(nothing_yet(self.robot, view))
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, NDArray]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control step of `frame_skip` physics steps.
 
         Args:
@@ -205,22 +187,11 @@ class RobotEnv(gymnasium.Env):
 
     def render(self) -> NDArray[np.uint8] | None:
         """(height, width, 3) picture for `rgb_array`; brings the window up to date for `human`."""
-        if self.render_mode == "rgb_array":
-            if self._pictures is None:
-                self._pictures = Pictures(self.model, *self._size)
-            return self._pictures.render(self.model, self.data, self.camera)
-        if self.render_mode == "human":
-            if self._window is None:
-                self._window = Window(self.model, self.data, self.camera)
-            self._window.render(self.model)
-        return None
+        return self.screen.render(self.model, self.data)
 
     def close(self) -> None:
         """Free what rendering holds."""
-        for shown in (self._pictures, self._window):
-            if shown is not None:
-                shown.close()
-        self._pictures = self._window = None
+        self.screen.close()
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 
@@ -244,6 +215,8 @@ class RobotEnv(gymnasium.Env):
         else:
             self._terrain = self._pool.map(given.get("terrain_id", self._pool.draw(u)))
         self._perceived = scene.checked(given["perceived"], "perceived") if "perceived" in given else self._terrain
+        if "terrain_residual" in given:
+            self._terrain = scene.risen(self._terrain, given["terrain_residual"])
         scene.write(self.model, 0, self._terrain.heights)
 
     def _advance(self) -> None:
@@ -255,6 +228,8 @@ class RobotEnv(gymnasium.Env):
                 for hook in self.substep_hooks:
                     hook(self)
                 mujoco.mj_step(self.model, self.data)
+            for hook in self.after_hooks:
+                hook(self)
         except mujoco.FatalError:  # the solver ran out of memory, as happens where bodies are driven into one another
             self.data.qvel[:] = np.nan
 
@@ -275,11 +250,7 @@ class RobotEnv(gymnasium.Env):
     def _elevation(self) -> NDArray[np.float32]:
         """A fresh elevation map, or a copy of the last one between two refreshes."""
         if self._age % self._period == 0 or self._map is None:
-            qpos = self.data.qpos
-            if self.rough:
-                out = elevation(self._perceived, qpos[:3], yaw(qpos[3:7]))
-            else:
-                out = np.full((SIZE, SIZE), -qpos[2], np.float32)
+            out = look(self.data.qpos, self._perceived if self.rough else None)
             if self._period > 1:
                 self._map = out.copy()
             return out
@@ -310,7 +281,7 @@ class RobotEnv(gymnasium.Env):
         self._view.task, self._view.now, self._view.before = saved["view"]
 
 
-def _leaves(info: dict[str, Any]) -> dict[str, NDArray]:
+def _leaves(info: dict[str, Any]) -> dict[str, NDArray | np.float64]:
     """Numpy leaves: float64 scalars, and flags as arrays of shape (), as Gymnasium's vectors want them."""
     return {k: np.asarray(v) if isinstance(v, _FLAG) else np.float64(v) for k, v in info.items()}
 

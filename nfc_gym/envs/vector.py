@@ -18,49 +18,41 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs import scene
+from nfc_gym.envs.batching import Ids, final_info, ids_of, masked, rows_of, seeds_of, vector_options
 from nfc_gym.envs.contract import (
     Observer,
     box,
     broken,
-    checked_context,
-    checked_options,
     nothing_yet,
     outcome,
-    psi_of,
-    refresh_period,
-    rest_key,
     robot_class,
-    seen_psi,
     wrong_action,
 )
-from nfc_gym.envs.render import Camera, Pictures
+from nfc_gym.envs.look import HeldMaps
 from nfc_gym.envs.robot import Robot
-from nfc_gym.envs.rotations import yaw
-from nfc_gym.envs.terrains import Pool
-from nfc_gym.envs.view import View
+from nfc_gym.envs.screen import Screen
+from nfc_gym.envs.settings import Settings
+from nfc_gym.envs.simulations import Simulations
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.terrain import Heightfield, elevation, surface
-from nfc_gym.terrain.egocentric import SIZE
-
-Ids = NDArray[np.intp]
+from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.terrain import Heightfield
 
 
 class RobotVectorEnv(VectorEnv):
     """Robots on flat ground or rough terrain, stepped together.
 
     Args:
-      robot, rough, task, goal_conditioned, reward_type, context, elevation_hz, difficulty, terrain_seed, terrain_pool,
-        terrain_kind, render_mode, width, height, camera: as `RobotEnv`.
+      robot, rough: as `RobotEnv`.
       num_envs: n.
       max_episode_steps: control steps after which an episode is truncated; None is never.
       autoreset_mode: `AutoresetMode` or its value.
       nthread: threads of the batch; 0 takes every core.
+      render_mode: None or `rgb_array`.
+      settings: the attributes of `Settings`.
 
     Attributes:
-      model, batch: the nominal model, and the simulations.
-      fields: `ModelFields` of the batch; what is written through it goes back to nominal at every reset.
-      psi_space: names, units, bounds and nominal values of psi.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
+      after_hooks: called with this environment after the last physics step, before anything is observed.
       reset_hooks: called with the ids (k,) about to be reset, autoresets included; a returned dict of reset options,
         leading shape (k,), holds for those unless `reset` itself was given that option.
     """
@@ -74,70 +66,41 @@ class RobotVectorEnv(VectorEnv):
         max_episode_steps: int | None = 1000,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         nthread: int = 0,
-        task: str | None = None,
-        goal_conditioned: bool = False,
-        reward_type: str = "sparse",
-        context: Sequence[str] = ("psi", "elevation"),
-        elevation_hz: float | None = None,
-        difficulty: float = 0.5,
-        terrain_seed: int = 0,
-        terrain_pool: int = 64,
-        terrain_kind: str | None = None,
         render_mode: str | None = None,
-        width: int = 640,
-        height: int = 480,
-        camera: Camera = "track",
+        **settings: Any,
     ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise InputError(f"render_mode is {render_mode!r}; a vector environment has None and 'rgb_array'")
-        kind = robot_class(robot)
-        self.num_envs, self.rough, self.frame_skip = int(num_envs), bool(rough), kind.frame_skip
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.render_mode, self.camera, self._size = render_mode, camera, (width, height)
-        self._pictures: Pictures | None = None
+        self._kind, self._nthread = robot_class(robot), nthread
+        self._given = Settings.of(self._kind, settings)
+        self.screen = Screen(render_mode, (None, "rgb_array"), self._given)
+        self.num_envs, self.rough, self.render_mode = int(num_envs), bool(rough), render_mode
+        self.frame_skip, self.autoreset_mode = self._kind.frame_skip, AutoresetMode(autoreset_mode)
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
+        self.after_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
-        self._kind, self._nthread = kind, nthread
-        self._task = task, goal_conditioned, reward_type
         self._horizon = np.iinfo(np.int64).max if max_episode_steps is None else int(max_episode_steps)
-        context = checked_context(context)
 
-        pool = Pool(terrain_pool, terrain_seed, difficulty, terrain_kind or kind.terrain_kind, kind.terrain_scale)
+        pool = self._given.pool
         self._build([pool.map(k) for k in range(pool.size)] if rough else [])
         fps = round(1 / self.dt)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps, "autoreset_mode": self.autoreset_mode}
-        self._period = refresh_period(elevation_hz, fps)
-        self._observe = Observer(self.robot, len(self.psi_space), context)
+        self._elevation = HeldMaps(self.num_envs, self._given.refresh_period(fps))
+        self._observe = Observer(self.robot, len(self.psi_space), self._given.context)
         self.single_observation_space = self._observe.space
-        self.single_action_space = box(kind.action_size, bound=1.0)
+        self.single_action_space = box(self._kind.action_size, bound=1.0)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
-        self._limit = np.ones((self.num_envs, kind.action_size))
+        self._limit = np.ones((self.num_envs, self._kind.action_size))
 
     def _build(self, maps: Sequence[Heightfield], perceived: Sequence[Heightfield] | None = None) -> None:
-        """Compile the scene and start a batch of it; every simulation then waits for its first reset."""
-        n = self.num_envs
-        self.model = self._kind.compile(len(maps))
-        for k, heightfield in enumerate(maps):
-            scene.write(self.model, k, heightfield.heights)
-        self._maps, self._perceived = list(maps), list(maps if perceived is None else perceived)
-        self._stack = np.stack([m.heights for m in maps]) if maps else np.zeros((0, 2, 2), np.float32)
-        self.robot = self._kind.of(self.model, *self._task)
-        self.psi_space = self._kind.space(self.model)
-        self.batch = Batch(self.model, n, self._nthread)
-        self.fields = ModelFields(self.batch)
-        # Which map a simulation stands on: one entry of `geom_dataid`.
-        self._chosen = self.batch.expand("geom_dataid")[:, self.model.geom(scene.GROUND).id] if maps else None
-        self._home = rest_key(self.model)
-        self._view = View(self.model, self.batch.bind, self._kind.reads, self._ground)
-        self._psi = np.tile(self.psi_space.nominal, (n, 1))
-        self._seen = np.zeros((n, len(self.psi_space)), np.float32)
-        self._terrain = np.zeros(n, np.intp)
+        """Start a batch; every simulation then waits for its first reset."""
+        n, before = self.num_envs, self.__dict__.get("_sims")
+        self._sims = Simulations(self._given, n, self._nthread, maps, maps if perceived is None else perceived)
+        if before is not None:
+            self._sims.generators = before.generators
+        self._view = self._sims.view
         self._steps = np.zeros(n, np.int64)
         self._waiting = np.ones(n, bool)  # for a reset
         self._fresh = True  # nothing was reset yet
-        self._elevation: NDArray[np.float32] | None = None
 
     # ---- what may be read back ------------------------------------------------------------------------------------
 
@@ -147,19 +110,64 @@ class RobotVectorEnv(VectorEnv):
         return self.model.opt.timestep * self.frame_skip
 
     @property
+    def model(self) -> mujoco.MjModel:
+        """The nominal model; `set_terrains` replaces it, and the next three."""
+        return self._sims.model
+
+    @property
+    def batch(self) -> Batch:
+        """The simulations."""
+        return self._sims.batch
+
+    @property
+    def fields(self) -> ModelFields:
+        """Model fields of the batch; what is written through it goes back to nominal at every reset."""
+        return self._sims.fields
+
+    @property
+    def robot(self) -> Robot:
+        """The laws."""
+        return self._sims.robot
+
+    @property
+    def psi_space(self) -> ParameterSpace:
+        """Names, units, bounds and nominal values of psi."""
+        return self._sims.space
+
+    @property
     def psi(self) -> NDArray[np.float64]:
         """(n, d) psi of every simulation in physical units."""
-        return self._psi.copy()
+        return self._sims.psi.copy()
 
     @property
     def terrain_id(self) -> Ids:
-        """(n,) which map every simulation stands on."""
-        return self._terrain.copy()
+        """(n,) which of `maps` every simulation stands on."""
+        return self._sims.chosen.copy()
 
     @property
     def maps(self) -> tuple[Heightfield, ...]:
-        """The maps that `terrain_id` counts; none on flat ground."""
-        return tuple(self._maps)
+        """The maps to choose from; none on flat ground."""
+        return self._sims.maps
+
+    @property
+    def heightfield(self) -> list[Heightfield]:
+        """n terrains that are simulated; zeros on flat ground."""
+        return self._sims.terrains(self._sims.maps)
+
+    @property
+    def perceived(self) -> list[Heightfield]:
+        """n terrains that `elevation` is taken from: the simulated ones, unless `set_terrains` was told others."""
+        return self._sims.terrains(self._sims.perceived)
+
+    @property
+    def proprio_components(self) -> list[str]:
+        """What each entry of `proprio` is, in the names of logs: how a residual of it reaches the state."""
+        return self.robot.components(self.model)
+
+    @property
+    def mjcf(self) -> str:
+        """The nominal model on the first map, as MJCF that plain MuJoCo loads."""
+        return self.robot.mjcf(self.maps[0] if self.rough else None)
 
     def set_terrains(self, maps: Sequence[Any], perceived: Sequence[Any] | None = None) -> None:
         """Other maps for the simulations to choose from; the batch is built anew, and must be reset before a step.
@@ -193,31 +201,16 @@ class RobotVectorEnv(VectorEnv):
           InputError: as for `RobotEnv.reset`.
         """
         n = self.num_envs
-        given = checked_options(options, self.rough, ("reset_mask",))
-        for key in ("heightfield", "perceived"):
-            if key in given:
-                raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
-        mask = given.pop("reset_mask", None)
-        if mask is None:
-            ids = np.arange(n)
-        else:
-            mask = np.asarray(mask)
-            if mask.shape != (n,) or mask.dtype != bool or not mask.any():
-                raise InputError(f"reset_mask is {mask.dtype} {mask.shape}; want ({n},) bool with at least one True")
-            ids = np.flatnonzero(mask)
-            if self._fresh and len(ids) < n:
-                raise InputError("reset_mask: the first reset must be of all environments")
-        if seed is not None:
-            seeds = [seed + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
-            if len(seeds) != n:
-                raise InputError(f"seed holds {len(seeds)} seeds, want one for each of {n} environments")
-            for i in ids:
-                if seeds[i] is not None:
-                    self._generators[i] = seeding.np_random(int(seeds[i]))[0]
-        self._begin(ids, {key: _rows(value, ids, n) for key, value in given.items()})
-        self._view.now = self.robot.derive(self._view)
+        given = vector_options(options, self.rough, ("reset_mask",))
+        ids = ids_of(given.pop("reset_mask", None), n)
+        if self._fresh and len(ids) < n:
+            raise InputError("reset_mask: the first reset must be of all environments")
+        for i, own in enumerate(seeds_of(seed, n)):
+            if own is not None and i in ids:
+                self._sims.generators[i] = seeding.np_random(own)[0]
+        self._begin(ids, {key: rows_of(value, ids, n) for key, value in given.items()})
         info = nothing_yet(self.robot, self._view)
-        return self._observation(), _masked(info, np.isin(np.arange(n), ids))
+        return self._observation(), masked(info, np.isin(np.arange(n), ids))
 
     def step(self, actions: Any) -> tuple[Any, NDArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """One control step of every environment.
@@ -246,13 +239,12 @@ class RobotVectorEnv(VectorEnv):
         self._steps += 1
         if resetting is not None:
             self._begin(np.flatnonzero(resetting), {})
-            view.now = self.robot.derive(view)
             new = nothing_yet(self.robot, view)
             info = {key: np.where(resetting, new[key], value) for key, value in info.items()}
             rewards, ended = np.where(resetting, 0.0, rewards), ended & ~resetting
         truncated = self._steps >= self._horizon
         done = ended | truncated
-        info = _masked(info, np.ones(self.num_envs, bool))
+        info = masked(info, np.ones(self.num_envs, bool))
         self._waiting = done.copy()
         again = self.autoreset_mode is AutoresetMode.SAME_STEP and done.any()
         obs = self._restart(done, info) if again else self._observation()
@@ -262,51 +254,25 @@ class RobotVectorEnv(VectorEnv):
         """A picture (height, width, 3) of every environment."""
         if self.render_mode is None:
             return None
-        if self._pictures is None:
-            self._pictures = Pictures(self.model, *self._size)
         frames = []
         for i in range(self.num_envs):
             model, data = self.batch.get_model(i), self.batch.get_data(i)
             mujoco.mj_forward(model, data)
-            frames.append(self._pictures.render(model, data, self.camera))
+            frames.append(self.screen.render(model, data))
         return tuple(frames)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free what rendering holds."""
-        if self._pictures is not None:
-            self._pictures.close()
-        self._pictures = None
+        self.screen.close()
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 
     def _begin(self, ids: Ids, given: Mapping[str, Any]) -> None:
-        """Begin an episode in some environments; options have leading shape (k,). `view.now` is left to the caller."""
-        k, everyone = len(ids), len(ids) == self.num_envs
+        """Begin episodes with options of leading shape (k,), and what the hooks add to them."""
         for hook in self.reset_hooks:
-            more = checked_options(hook(ids), self.rough)
-            given = {**more, **given}
-        u = np.array([self._generators[i].random(1 + self.robot.draws) for i in ids])
-        psi = psi_of(self.psi_space, given.get("psi"), (k,))
-        belief = psi_of(self.psi_space, given["psi_belief"], (k,), "psi_belief") if "psi_belief" in given else psi
-        fields = self.fields if everyone else self.fields.rows(ids)
-        fields.restore()
-        self.psi_space.write(fields, psi)
-        fields.commit()
-        self._psi[ids], self._seen[ids] = psi, seen_psi(self.psi_space, belief)
-        if self._chosen is not None:
-            chosen = given.get("terrain_id", (u[:, 0] * len(self._maps)).astype(np.intp))
-            self._terrain[ids] = _terrain_ids(chosen, k, len(self._maps))
-            self._chosen[ids] = self._terrain[ids]
-        self.batch.reset(ids, self._home, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        start = self.robot.begin(u[:, 1:], lambda xy: self._ground(xy, self._terrain[ids]))
-        self._view.qpos[ids], self._view.qvel[ids] = start.qpos, start.qvel
-        self.batch.forward(ids)
-        for name, value in start.task.items():
-            old = self._view.task.get(name)
-            # A new array: the old one may be in somebody's hands.
-            new = np.empty((self.num_envs, *value.shape[1:]), value.dtype) if old is None else old.copy()
-            new[ids] = value
-            self._view.task[name] = new
+            given = vector_options(hook(ids), self.rough) | given
+        self._sims.begin(ids, given)
+        self._view.now = self.robot.derive(self._view)
         self._steps[ids] = 0
         self._waiting[ids] = False
         self._fresh = False
@@ -314,18 +280,8 @@ class RobotVectorEnv(VectorEnv):
     def _restart(self, done: NDArray[np.bool_], info: dict[str, Any]) -> Any:
         """Same-step autoreset: the last observations and infos of the ended episodes go into `info`."""
         last = self._observation(done)
-        ids = np.flatnonzero(done)
-        final = np.full(self.num_envs, None, object)
-        for row, i in enumerate(ids):
-            final[i] = {k: v[row] for k, v in last.items()} if isinstance(last, dict) else last[row]
-        before = {k: v for k, v in info.items() if not k.startswith("_")}
-        self._begin(ids, {})
-        self._view.now = self.robot.derive(self._view)
-        new = nothing_yet(self.robot, self._view)
-        info.update({key: np.where(done, new[key], value) for key, value in before.items()})
-        ended = {key: value * done for key, value in before.items()}  # zero where no episode ended
-        info |= {"final_obs": final, "_final_obs": done.copy(), "final_info": _masked(ended, done.copy())}
-        info["_final_info"] = done.copy()
+        self._begin(np.flatnonzero(done), {})
+        info.update(final_info(last, info, nothing_yet(self.robot, self._view), done.copy()))
         return self._observation()
 
     def _advance(self, active: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -337,80 +293,35 @@ class RobotVectorEnv(VectorEnv):
         if not unstable.any():
             return None
         ids = np.flatnonzero(unstable)
-        self.batch.reset(ids, self._home)
+        self.batch.reset(ids, self._sims.rest)
         return unstable
 
     def _run(self, active: NDArray[np.bool_] | None) -> None:
-        try:
-            if not self.substep_hooks:
-                self.batch.step(active, nstep=self.frame_skip)
-                return
-            for _ in range(self.frame_skip):
-                for hook in self.substep_hooks:
-                    hook(self)
-                self.batch.step(active)
-        except SimulationError as error:  # the solver ran out of memory in some
-            self._view.qvel[error.ids] = np.nan
+        if not self.substep_hooks:
+            self._physics(active, self.frame_skip)
+            return
+        for _ in range(self.frame_skip):
+            for hook in self.substep_hooks:
+                hook(self)
+            self._physics(active, 1)
+        for hook in self.after_hooks:
+            hook(self)
 
-    def _ground(self, xy: NDArray, which: Ids | None = None) -> NDArray[np.float64]:
-        if not self.rough:
-            return np.zeros(xy.shape[:-1])
-        which = self._terrain if which is None else which
-        which = which.reshape(which.shape + (1,) * (xy.ndim - 2))
-        return surface(self._stack, xy, self._maps[0].resolution, self._maps[0].origin, which)[0]
+    def _physics(self, active: NDArray[np.bool_] | None, steps: int) -> None:
+        try:
+            self.batch.step(active, nstep=steps)
+        except SimulationError as error:  # the solver ran out of memory in some; the others went on
+            self._view.qvel[error.ids] = np.nan
 
     def _observation(self, rows: NDArray[np.bool_] | None = None) -> Any:
         """Fresh observations of all environments, or of some."""
-        obs = self._observe(self._view, self._seen, None)
+        obs = self._observe(self._view, self._sims.seen, None)
         if rows is not None:
             obs = obs[rows] if self._observe.plain else {k: v[rows] for k, v in obs.items()}
         if self._observe.elevation:
-            obs["elevation"] = self._around(rows)
+            perceived = self._sims.perceived or None
+            obs["elevation"] = self._elevation.around(self._view.qpos, perceived, self._sims.chosen, self._steps, rows)
         return obs
-
-    def _around(self, rows: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-        """Elevation maps, fresh arrays; those that are not due are copies of the last ones."""
-        if self._period == 1:
-            return self._look(np.arange(self.num_envs) if rows is None else np.flatnonzero(rows))
-        if self._elevation is None:
-            self._elevation = np.empty((self.num_envs, SIZE, SIZE), np.float32)
-        due = self._steps % self._period == 0
-        due = np.flatnonzero(due if rows is None else due & rows)
-        if len(due):
-            self._elevation[due] = self._look(due)
-        return self._elevation.copy() if rows is None else self._elevation[rows]
-
-    def _look(self, ids: Ids) -> NDArray[np.float32]:
-        qpos = self._view.qpos[ids]
-        if self.rough:
-            return elevation([self._perceived[k] for k in self._terrain[ids]], qpos[:, :3], yaw(qpos[:, 3:7]))
-        out = np.empty((len(ids), SIZE, SIZE), np.float32)
-        out[...] = -qpos[:, 2, None, None].astype(np.float32)
-        return out
-
-
-def _rows(value: Any, ids: Ids, n: int) -> Any:
-    """Reset options of n environments, for some of them: (n, ...) arrays are cut, anything else holds for each."""
-    if isinstance(value, Mapping):
-        return {k: np.asarray(v)[ids] if np.shape(v) == (n,) else v for k, v in value.items()}
-    return np.asarray(value)[ids] if np.shape(value)[:1] == (n,) and np.ndim(value) != 1 else np.asarray(value)
-
-
-def _terrain_ids(chosen: Any, k: int, maps: int) -> Ids:
-    """(k,) map of each environment."""
-    chosen = np.asarray(chosen)
-    if chosen.shape not in ((), (k,)) or (chosen != chosen.astype(np.intp)).any():
-        raise InputError(
-            f"terrain_id has shape {chosen.shape} and type {chosen.dtype}; want whole numbers () or ({k},)"
-        )
-    if (chosen < 0).any() or (chosen >= maps).any():
-        raise InputError(f"terrain_id reaches from {chosen.min()} to {chosen.max()}, want 0 to {maps - 1}")
-    return np.broadcast_to(chosen.astype(np.intp), (k,))
-
-
-def _masked(info: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Gymnasium's vector form of `info`: beside each key its mask, `_key`, of the environments that it is of."""
-    return info | {"_" + key: mask for key in info}
 
 
 def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotVectorEnv:

@@ -124,6 +124,8 @@ def _read_npz(path: Path) -> Table:
             if twice:
                 raise InputError(f"{path}: column {twice[0]!r} appears more than once")
             return {name: archive[name] for name in names}
+    except InputError:
+        raise
     except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError) as e:
         if "allow_pickle" in str(e):
             why = "holds Python objects, which are not opened; save plain numbers (astype(float))"

@@ -41,6 +41,8 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
     except yaml.MarkedYAMLError as e:
         line = f":{e.problem_mark.line + 1}" if e.problem_mark else ""
         raise InputError(f"{path}{line}: not valid YAML: {e.problem or e.context}") from None
+    except InputError:
+        raise
     except (yaml.YAMLError, RecursionError, ValueError) as e:
         raise InputError(f"{path}: not valid YAML: {e}") from None
 

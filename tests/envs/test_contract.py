@@ -51,7 +51,7 @@ def play(env: gymnasium.Env, seed: int, steps: int) -> list[Any]:
 
 
 def test_ten_ids() -> None:
-    assert IDS == sorted(f"nfc_gym/{r}{g}-v0" for r in SIZES for g in ("Flat", "Rough"))
+    assert sorted(f"nfc_gym/{r}{g}-v0" for r in SIZES for g in ("Flat", "Rough")) == IDS
 
 
 @pytest.mark.parametrize("name", IDS)

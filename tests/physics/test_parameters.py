@@ -96,6 +96,33 @@ def test_single_model_equals_the_batch(seed: int) -> None:
         np.testing.assert_array_equal(mine.opt.gravity, theirs.opt.gravity)
 
 
+@pytest.mark.parametrize("rows", [[1], [0, 2]])
+def test_some_rows_of_a_batch_are_written_as_all_would_be_and_leave_the_others(rows: list[int]) -> None:
+    """Edits of other fields go back to nominal in those rows too, and derived constants follow there alone."""
+    psi, other = SPACE.sample(np.random.default_rng(0), 3), SPACE.sample(np.random.default_rng(1), 3)
+    some, whole = (ModelFields(Batch(MODEL, 3, 1), MODEL) for _ in range(2))
+    for fields in (some, whole):
+        SPACE.write(fields, psi)
+        fields["body_ipos"][..., 1, 2] += 0.1
+        fields.commit()
+    part = some.rows(np.array(rows))
+    part.restore()
+    SPACE.write(part, other[rows])
+    part.commit()
+    mixed = psi.copy()
+    mixed[rows] = other[rows]
+    whole.restore()
+    SPACE.write(whole, mixed)
+    lifted = np.setdiff1d(np.arange(3), rows)
+    whole["body_ipos"][lifted, 1, 2] += 0.1
+    whole.commit()
+    for i in range(3):
+        mine, theirs = some._target.get_model(i), whole._target.get_model(i)
+        for name in ("body_mass", "body_inertia", "body_ipos", "geom_friction", "geom_solref", "dof_damping",
+                     "actuator_gainprm", "body_invweight0", "dof_M0", "body_subtreemass"):  # fmt: skip
+            np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=f"{name} of {i}")
+
+
 def test_normalise_maps_the_box_and_inverts() -> None:
     np.testing.assert_allclose(SPACE.normalise(SPACE.low), -1)
     np.testing.assert_allclose(SPACE.normalise(SPACE.high), 1)

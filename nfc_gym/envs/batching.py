@@ -1,0 +1,84 @@
+"""Options and infos of a vector environment: for all, for each, for some."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.envs.contract import checked_options
+
+Ids = NDArray[np.intp]
+
+
+def vector_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Checked reset options of a vector environment, which takes whole maps by `set_terrains` alone."""
+    given = checked_options(options, rough, more)
+    for key in ("heightfield", "perceived", "terrain_residual"):
+        if key in given:
+            raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
+    return given
+
+
+def ids_of(mask: Any, n: int) -> Ids:
+    """Which of n environments a reset mask names; None is all."""
+    if mask is None:
+        return np.arange(n)
+    mask = np.asarray(mask)
+    if mask.shape != (n,) or mask.dtype != bool or not mask.any():
+        raise InputError(f"reset_mask is {mask.dtype} {mask.shape}; want ({n},) bool with at least one True")
+    return np.flatnonzero(mask)
+
+
+def seeds_of(seed: int | Sequence[int | None] | None, n: int) -> list[int | None]:
+    """A seed for each of n environments: s gives s, s + 1, ...; None leaves a generator as it is."""
+    if seed is None:
+        return [None] * n
+    seeds: list[int | None] = [int(seed) + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
+    if len(seeds) != n:
+        raise InputError(f"seed holds {len(seeds)} seeds, want one for each of {n} environments")
+    return seeds
+
+
+def rows_of(value: Any, ids: Ids, n: int) -> Any:
+    """Reset options of n environments, for some of them: (n, ...) arrays are cut, anything else holds for each."""
+    if isinstance(value, Mapping):
+        return {k: np.asarray(v)[ids] if np.shape(v) == (n,) else v for k, v in value.items()}
+    return np.asarray(value)[ids] if np.shape(value)[:1] == (n,) and np.ndim(value) != 1 else np.asarray(value)
+
+
+def terrain_ids(chosen: Any, k: int, maps: int) -> Ids:
+    """(k,) map of each environment."""
+    chosen = np.asarray(chosen)
+    if chosen.shape not in ((), (k,)) or (chosen != chosen.astype(np.intp)).any():
+        raise InputError(
+            f"terrain_id has shape {chosen.shape} and type {chosen.dtype}; want whole numbers () or ({k},)"
+        )
+    if (chosen < 0).any() or (chosen >= maps).any():
+        raise InputError(f"terrain_id reaches from {chosen.min()} to {chosen.max()}, want 0 to {maps - 1}")
+    return np.broadcast_to(chosen.astype(np.intp), (k,))
+
+
+def masked(info: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Gymnasium's vector form of `info`: beside each key its mask, `_key`, of the environments that it is of."""
+    return info | {"_" + key: mask for key in info}
+
+
+def final_info(last: Any, info: dict[str, Any], new: dict[str, Any], done: NDArray[np.bool_]) -> dict[str, Any]:
+    """What a same-step autoreset changes in `info`: the ended episodes' last words, and the new ones' first.
+
+    Args:
+      last: the last observations, (k, ...) or a dict of such, of the environments that are done.
+      info: of the step.
+      new: of the reset, for all.
+      done: (n,) whose episodes ended.
+    """
+    own = {key: value for key, value in info.items() if not key.startswith("_")}
+    observations = np.full(len(done), None, object)
+    for row, i in enumerate(np.flatnonzero(done)):
+        observations[i] = {k: v[row] for k, v in last.items()} if isinstance(last, dict) else last[row]
+    ended = {key: value * done for key, value in own.items()}  # zero where no episode ended
+    out: dict[str, Any] = {key: np.where(done, new[key], value) for key, value in own.items()}
+    out |= {"final_obs": observations, "final_info": masked(ended, done)}
+    return out | {"_final_obs": done, "_final_info": done}

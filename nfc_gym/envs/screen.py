@@ -1,0 +1,50 @@
+"""`Screen`: what an environment's render mode shows, made when it is first asked for."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.envs.render import Camera, Pictures, Window
+
+
+class Screen:
+    """Pictures or a window, by render mode.
+
+    Args:
+      mode: one of `modes`.
+      modes: those that the environment has.
+      settings: `width`, `height` and `camera` are used.
+
+    Attributes:
+      camera: may be changed between pictures.
+    """
+
+    def __init__(self, mode: str | None, modes: tuple[str | None, ...], settings: Any) -> None:
+        if mode not in modes:
+            raise InputError(f"render_mode is {mode!r}, want None or one of: {', '.join(filter(None, modes))}")
+        self.camera: Camera = settings.camera
+        self._mode, self._size = mode, (settings.width, settings.height)
+        self._pictures: Pictures | None = None
+        self._window: Window | None = None
+
+    def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8] | None:
+        """A picture (height, width, 3), or None where a window was brought up to date, or nothing is shown."""
+        if self._mode == "rgb_array":
+            if self._pictures is None:
+                self._pictures = Pictures(model, *self._size)
+            return self._pictures.render(model, data, self.camera)
+        if self._mode == "human":
+            if self._window is None:
+                self._window = Window(model, data, self.camera)
+            self._window.render(model)
+        return None
+
+    def close(self) -> None:
+        """Free the graphics context, close the window."""
+        for shown in (self._pictures, self._window):
+            if shown is not None:
+                shown.close()
+        self._pictures = self._window = None
