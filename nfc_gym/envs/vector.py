@@ -214,7 +214,7 @@ class RobotVectorEnv(VectorEnv):
           ResetNeeded: an environment was not reset (after its episode, where autoreset is off).
         """
         actions = np.asarray(actions, np.float64)
-        if actions.shape != self._limit.shape or not np.isfinite(actions.sum()):
+        if actions.shape != self._limit.shape or not np.isfinite(actions).all():
             raise wrong_action(actions, self._limit.shape)
         resetting = self._waiting.copy() if self._waiting.any() else None
         if resetting is not None and (self._fresh or self.autoreset_mode is not AutoresetMode.NEXT_STEP):
