@@ -258,7 +258,7 @@ class RobotVectorEnv(VectorEnv):
     def _begin(self, ids: Ids, given: Mapping[str, Any]) -> None:
         """Begin episodes with options of leading shape (k,), and what the hooks add to them."""
         for hook in self.reset_hooks:
-            given = vector_options(hook(ids), self.rough) | given
+            given = {**vector_options(hook(ids), self.rough), **given}
         self._sims.begin(ids, given)
         self._view.now = self.robot.derive(self._view)
         self._steps[ids] = 0
