@@ -1,6 +1,20 @@
-"""Plain data that every other part of the package may import: logs and errors. Needs numpy alone."""
+"""Plain data that every other part may import: logs, fidelities, posteriors, errors. Needs numpy alone."""
 
 from nfc_gym.core.errors import InputError, MissingExtra, NfcError, SimulationUnstable
+from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.log import Channel, Log
+from nfc_gym.core.posterior import Posterior, Sampler, load_source, register_loader
 
-__all__ = ["Channel", "InputError", "Log", "MissingExtra", "NfcError", "SimulationUnstable"]
+__all__ = [
+    "Channel",
+    "Fidelity",
+    "InputError",
+    "Log",
+    "MissingExtra",
+    "NfcError",
+    "Posterior",
+    "Sampler",
+    "SimulationUnstable",
+    "load_source",
+    "register_loader",
+]

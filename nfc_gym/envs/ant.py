@@ -1,7 +1,9 @@
 """Ant: four legs of two joints each, eight motors; it runs towards a target."""
 
+import mujoco
 from numpy.typing import NDArray
 
+from nfc_gym.envs.components import joints, observed, torso
 from nfc_gym.envs.runner import Runner, Weights
 from nfc_gym.envs.view import View
 
@@ -24,6 +26,10 @@ class Ant(Runner):
         energy=0.0005,  # 240 W, about what it takes to run, costs 0.12
         limits=0.05,  # resting on all four ankles' stops costs 0.2
     )
+
+    def components(self, model: mujoco.MjModel) -> list[str]:
+        """See `Robot`."""
+        return [*torso(model), *joints(model, "pos"), *joints(model, "vel"), *observed(24)]
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Torso 12, joint positions 8 (rad), joint velocities 8 (rad/s), force and torque of each foot 24 (N, N m)."""

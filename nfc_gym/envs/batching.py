@@ -15,7 +15,7 @@ Ids = NDArray[np.intp]
 def vector_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[str, ...] = ()) -> dict[str, Any]:
     """Checked reset options of a vector environment, which takes whole maps by `set_terrains` alone."""
     given = checked_options(options, rough, more)
-    for key in ("heightfield", "perceived"):
+    for key in ("heightfield", "perceived", "terrain_residual"):
         if key in given:
             raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
     return given

@@ -16,7 +16,7 @@ from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.terrain import SHAPE, Heightfield
 from nfc_gym.terrain.egocentric import SIZE
 
-OPTIONS = ("psi", "psi_belief", "heightfield", "perceived", "terrain_id")
+OPTIONS = ("psi", "psi_belief", "heightfield", "perceived", "terrain_id", "terrain_residual")
 FLAT = Heightfield(np.zeros(SHAPE, np.float32))
 
 
@@ -144,7 +144,7 @@ def checked_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[
     for key in given:
         if key not in (*OPTIONS, *more):
             raise InputError(f"reset has no option {key!r}; it has: {', '.join((*OPTIONS, *more))}")
-        if not rough and key in ("heightfield", "perceived", "terrain_id"):
+        if not rough and key in ("heightfield", "perceived", "terrain_id", "terrain_residual"):
             raise InputError(f"option {key!r}: the ground of a Flat environment is a plane; use the Rough one")
     if "heightfield" in given and "terrain_id" in given:
         raise InputError("options 'heightfield' and 'terrain_id' both name the terrain: give one of them")

@@ -1,7 +1,9 @@
 """Humanoid: sixteen bodies and twenty-one joints, each with a motor; it runs towards a target."""
 
+import mujoco
 from numpy.typing import NDArray
 
+from nfc_gym.envs.components import joints, observed, torso
 from nfc_gym.envs.runner import Runner, Weights
 from nfc_gym.envs.view import View
 
@@ -24,6 +26,10 @@ class Humanoid(Runner):
         energy=0.0002,  # 1 kW, about what it takes to run, costs 0.2
         limits=0.25,  # both knees stretched to the stop cost 0.5: it is to walk on bent ones
     )
+
+    def components(self, model: mujoco.MjModel) -> list[str]:
+        """See `Robot`."""
+        return [*torso(model), *joints(model, "pos"), *joints(model, "vel"), *observed(21 + 12 + 21)]
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Torso 12, joint positions, velocities, torques 21 each (rad, rad/s, N m), feet 12 (N, N m), action 21."""

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.envs.components import base, observed
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, axes, components, root, to_robot, turned
@@ -128,6 +129,11 @@ class Jackal(Robot):
         """Tipped over, or off the map."""
         x, y = components(view.qpos[..., :2])
         return (view.now.frame.zz < TIPPED) | (x * x > EDGE * EDGE) | (y * y > EDGE * EDGE)
+
+    def components(self, model: mujoco.MjModel) -> list[str]:
+        """See `Robot`."""
+        motion = [*base(model, "quat", "wxyz"), *base(model, "linvel@body"), *base(model, "angvel@body")]
+        return [*motion, *base(model, "pos"), *observed(2)]
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Quaternion, velocity and rates in the rover's own frame, position, last action."""

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.envs.components import base, joints, observed
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, axes, components, root, turned
@@ -121,6 +122,11 @@ class Quadcopter(Robot):
         share = np.minimum(np.maximum(share, 0.0), 1.0)  # of the way that is left
         ex, ey, ez = dx - share * ax, dy - share * ay, dz - share * az
         return root(ex * ex + ey * ey + ez * ez)
+
+    def components(self, model: mujoco.MjModel) -> list[str]:
+        """See `Robot`."""
+        pose = [*observed(3), *base(model, "quat", "wxyz")]
+        return [*pose, *base(model, "linvel"), *base(model, "angvel@body"), *joints(model, "pos")]
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Goal offset (world), then `_motion`."""

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.envs.components import base, joints, observed
 from nfc_gym.envs.robot import Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, axes, components, to_robot
 from nfc_gym.envs.spawn import place, spread, underside
@@ -129,6 +130,11 @@ class Quadruped(Robot):
         """Trunk or a thigh touches the ground, the trunk leans too far, or the robot has fallen off the map."""
         touched = np.maximum.reduce(view.sensordata[..., self.hull], -1) > TOUCHED
         return touched | (view.now.frame.zz < TILTED) | (view.qpos[..., 2] < FALLEN)
+
+    def components(self, model: mujoco.MjModel) -> list[str]:
+        """See `Robot`."""
+        motion = [*base(model, "linvel@body"), *base(model, "angvel@body")]
+        return [*motion, *observed(6), *joints(model, "pos"), *joints(model, "vel"), *observed(12)]
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Linear and angular velocity, down (own frame), command, joint positions and velocities, last action."""

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from nfc_gym import assets
 from nfc_gym.envs import scene
+from nfc_gym.envs.components import observed
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import Parameter, ParameterSpace, parameters_from_toml
+from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
 Ground = Callable[[NDArray], Array]
@@ -105,6 +107,11 @@ class Robot(ABC):
         return scene.build(assets.path(cls.name), maps)
 
     @classmethod
+    def mjcf(cls, ground: Heightfield | None) -> str:
+        """The scene on one map, or on a plane, as MJCF that plain MuJoCo loads."""
+        return scene.text(assets.path(cls.name), ground)
+
+    @classmethod
     def parameters(cls) -> list[Parameter]:
         """psi, in the paper's order, from the robot's `psi.toml`."""
         return parameters_from_toml(assets.path(cls.name).with_name("psi.toml"))
@@ -146,6 +153,10 @@ class Robot(ABC):
     @abstractmethod
     def proprio(self, view: View) -> Sequence[NDArray]:
         """Parts (*B, k) whose concatenation is the observation `proprio` (*B, proprio_size)."""
+
+    def components(self, model: mujoco.MjModel) -> list[str]:
+        """What each entry of `proprio` is, see `nfc_gym.envs.components`; without more, none is known to be state."""
+        return observed(self.proprio_size)
 
     def goal(self, view: View) -> NDArray:
         """(*B, goal_size) the command in the robot's frame, where it is not part of `proprio`."""

@@ -4,6 +4,7 @@ All heightfields of a scene have one size and one place, and that size leaves ro
 `HIGHEST`. So a map is changed by its data alone and chosen by `geom_dataid` alone, with nothing to recompute.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield
+from nfc_gym.terrain.model import HfieldAsset, asset
 
 GROUND = "ground"
 TIMESTEP = 0.005  # s, physics 200 Hz
@@ -26,6 +28,23 @@ def build(mjcf: Path, maps: int) -> mujoco.MjModel:
       mjcf: the robot; a ground of its own is replaced, light and sky are added where it has none.
       maps: how many heightfields, named `terrain_0`, ...; 0 gives a plane.
     """
+    rows, cols = SHAPE
+    size = ((cols - 1) * RESOLUTION / 2, (rows - 1) * RESOLUTION / 2, HIGHEST - LOWEST, SOLID)
+    flat = HfieldAsset(rows, cols, size, np.zeros(rows * cols, np.float32), (0, 0, LOWEST))
+    model = _describe(mjcf, [flat] * maps).compile()
+    for k in range(maps):
+        write(model, k, np.zeros(SHAPE, np.float32))
+    return model
+
+
+def text(mjcf: Path, ground: Heightfield | None) -> str:
+    """MJCF of the same scene on one map, or on a plane, for whoever simulates it outside this package."""
+    spec = _describe(mjcf, [] if ground is None else [asset(ground)])
+    spec.compile()
+    return spec.to_xml()
+
+
+def _describe(mjcf: Path, maps: Sequence[HfieldAsset]) -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_file(str(mjcf))
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -36,24 +55,14 @@ def build(mjcf: Path, maps: int) -> mujoco.MjModel:
         spec.delete(old)
     _light(spec)
     ground = dict(name=GROUND, material=GROUND, contype=1, conaffinity=1, friction=[1, 0.005, 0.0001])
+    for k, each in enumerate(maps):
+        spec.add_hfield(name=f"terrain_{k}", size=each.size, nrow=each.nrow, ncol=each.ncol, userdata=each.data)
     if maps:
-        half = [(n - 1) * RESOLUTION / 2 for n in reversed(SHAPE)]
-        for k in range(maps):
-            spec.add_hfield(
-                name=f"terrain_{k}",
-                size=[*half, HIGHEST - LOWEST, SOLID],
-                nrow=SHAPE[0],
-                ncol=SHAPE[1],
-                userdata=np.zeros(SHAPE).ravel(),
-            )
         kind = mujoco.mjtGeom.mjGEOM_HFIELD
-        spec.worldbody.add_geom(type=kind, hfieldname="terrain_0", pos=[0, 0, LOWEST], **ground)
+        spec.worldbody.add_geom(type=kind, hfieldname="terrain_0", pos=maps[0].pos, **ground)
     else:
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], **ground)
-    model = spec.compile()
-    for k in range(maps):
-        write(model, k, np.zeros(SHAPE, np.float32))
-    return model
+    return spec
 
 
 def _light(spec: mujoco.MjSpec) -> None:
@@ -99,6 +108,14 @@ def checked(heights: ArrayLike, name: str = "heightfield") -> Heightfield:
     if heights.resolution != here.resolution or heights.origin != here.origin:
         raise InputError(f"{name} is {heights!r}, want {here.resolution:g} m a cell from {here.origin}")
     return heights
+
+
+def risen(ground: Heightfield, residual: ArrayLike) -> Heightfield:
+    """Ground plus a residual (rows, columns) m; errors as `checked`."""
+    residual = np.asarray(residual, float)
+    if residual.shape != SHAPE:
+        raise InputError(f"terrain_residual has shape {residual.shape}, want {SHAPE} (rows along y, columns along x)")
+    return checked((ground.heights + residual).astype(np.float32), "the terrain with terrain_residual")
 
 
 def write(model: mujoco.MjModel, index: int, heights: NDArray[np.float32]) -> None:

@@ -49,6 +49,7 @@ class RobotEnv(gymnasium.Env):
       fields: `ModelFields` of `model`; what is written through it goes back to nominal at every reset.
       psi_space: names, units, bounds and nominal values of psi.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
+      after_hooks: called with this environment after the last physics step, before anything is observed.
       screen: what renders; its `camera` may be changed between pictures.
     """
 
@@ -75,6 +76,7 @@ class RobotEnv(gymnasium.Env):
         self.frame_skip = kind.frame_skip
         self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         self.substep_hooks: list[Callable[[RobotEnv], None]] = []
+        self.after_hooks: list[Callable[[RobotEnv], None]] = []
 
         self._pool = given.pool
         self._terrain = self._perceived = FLAT
@@ -104,6 +106,16 @@ class RobotEnv(gymnasium.Env):
         return self._psi.copy()
 
     @property
+    def proprio_components(self) -> list[str]:
+        """What each entry of `proprio` is, in the names of logs: how a residual of it reaches the state."""
+        return self.robot.components(self.model)
+
+    @property
+    def mjcf(self) -> str:
+        """The nominal model with the ground of the running episode, as MJCF that plain MuJoCo loads."""
+        return self.robot.mjcf(self._terrain if self.rough else None)
+
+    @property
     def heightfield(self) -> Heightfield:
         """The terrain that is simulated; zeros on flat ground."""
         return self._terrain
@@ -122,7 +134,8 @@ class RobotEnv(gymnasium.Env):
           seed: of the environment's own generator, from which start, goal and terrain are drawn.
           options: `psi` and `psi_belief`: (d,) in physical units or a dict of names, the rest nominal (what the agent
             believes is by default the truth). On rough ground `heightfield`: (256, 256) m, or `terrain_id`: a map of
-            the pool; `perceived`: (256, 256) m, what `elevation` shows, by default the simulated terrain.
+            the pool; `perceived`: (256, 256) m, what `elevation` shows, by default that terrain; `terrain_residual`:
+            (256, 256) m, added to the simulated terrain alone.
 
         Raises:
           InputError: an unknown option or name, another shape, values that are not finite or physically impossible.
@@ -202,17 +215,21 @@ class RobotEnv(gymnasium.Env):
         else:
             self._terrain = self._pool.map(given.get("terrain_id", self._pool.draw(u)))
         self._perceived = scene.checked(given["perceived"], "perceived") if "perceived" in given else self._terrain
+        if "terrain_residual" in given:
+            self._terrain = scene.risen(self._terrain, given["terrain_residual"])
         scene.write(self.model, 0, self._terrain.heights)
 
     def _advance(self) -> None:
         try:
-            if not self.substep_hooks:
+            if self.substep_hooks:
+                for _ in range(self.frame_skip):
+                    for hook in self.substep_hooks:
+                        hook(self)
+                    mujoco.mj_step(self.model, self.data)
+            else:
                 mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
-                return
-            for _ in range(self.frame_skip):
-                for hook in self.substep_hooks:
-                    hook(self)
-                mujoco.mj_step(self.model, self.data)
+            for hook in self.after_hooks:
+                hook(self)
         except mujoco.FatalError:  # the solver ran out of memory, as happens where bodies are driven into one another
             self.data.qvel[:] = np.nan
 

@@ -52,6 +52,7 @@ class RobotVectorEnv(VectorEnv):
 
     Attributes:
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
+      after_hooks: called with this environment after the last physics step, before anything is observed.
       reset_hooks: called with the ids (k,) about to be reset, autoresets included; a returned dict of reset options,
         leading shape (k,), holds for those unless `reset` itself was given that option.
     """
@@ -74,6 +75,7 @@ class RobotVectorEnv(VectorEnv):
         self.num_envs, self.rough, self.render_mode = int(num_envs), bool(rough), render_mode
         self.frame_skip, self.autoreset_mode = self._kind.frame_skip, AutoresetMode(autoreset_mode)
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
+        self.after_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
         self._horizon = np.iinfo(np.int64).max if max_episode_steps is None else int(max_episode_steps)
 
@@ -156,6 +158,16 @@ class RobotVectorEnv(VectorEnv):
     def perceived(self) -> list[Heightfield]:
         """n terrains that `elevation` is taken from: the simulated ones, unless `set_terrains` was told others."""
         return self._sims.terrains(self._sims.perceived)
+
+    @property
+    def proprio_components(self) -> list[str]:
+        """What each entry of `proprio` is, in the names of logs: how a residual of it reaches the state."""
+        return self.robot.components(self.model)
+
+    @property
+    def mjcf(self) -> str:
+        """The nominal model on the first map, as MJCF that plain MuJoCo loads."""
+        return self.robot.mjcf(self._sims.maps[0] if self.rough else None)
 
     def set_terrains(self, maps: Sequence[Any], perceived: Sequence[Any] | None = None) -> None:
         """Other maps for the simulations to choose from; the batch is built anew, and must be reset before a step.
@@ -275,6 +287,8 @@ class RobotVectorEnv(VectorEnv):
     def _advance(self, active: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         """Physics of one control step; returns which simulations came apart (and were put back to rest), None: none."""
         self._run(active)
+        for hook in self.after_hooks:
+            hook(self)
         unstable = broken(self._view)
         if active is not None:
             unstable &= active

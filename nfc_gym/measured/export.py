@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.fit import Fit
-from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.base import Effect, overrides
-from nfc_gym.physics.effects.each import Each, each
+from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.rollout import Plant
 
@@ -24,37 +23,15 @@ def pack(fitted: Fit) -> dict[str, Any]:
     psi, thetas = fitted.plant.split(fitted.x)
     return {
         "psi": dict(zip(fitted.plant.space.names, map(float, psi), strict=True)),
-        "effects": [_pack_effect(e, t) for e, t in zip(fitted.plant.effects, thetas, strict=True)],
-    }
-
-
-def _pack_effect(effect: Effect, theta: Array) -> dict[str, Any]:
-    return {
-        "family": effect.family,
-        "where": list(effect.where),
-        "each": isinstance(effect, Each),
-        "parameters": {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(effect.params, theta, strict=True)},
+        "effects": [to_row(e, t) for e, t in zip(fitted.plant.effects, thetas, strict=True)],
     }
 
 
 def unpack(data: dict[str, Any], plant: Plant) -> tuple[Plant, Array]:
     """The plant with its effects, and the full parameter vector (size,)."""
-    pairs = [unpack_effect(row) for row in data["effects"]]
+    pairs = [from_row(row) for row in data["effects"]]
     whole = plant.with_effects([e for e, _ in pairs])
     return whole, np.concatenate([plant.space.vector(data["psi"]), *(theta for _, theta in pairs)])
-
-
-def unpack_effect(row: dict[str, Any]) -> tuple[Effect, Array]:
-    """An effect and its parameters from their packed form."""
-    if not row["each"]:
-        return build(row["family"], row["where"], row["parameters"])
-    members, thetas = [], []
-    for place in row["where"]:
-        own = {k.rpartition("@")[0]: v for k, v in row["parameters"].items() if k.rpartition("@")[2] == place}
-        member, theta = build(row["family"], [place], own)
-        members.append(member)
-        thetas.append(theta)
-    return each(members), np.concatenate(thetas)
 
 
 def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array) -> tuple[str, list[Effect]]:

@@ -2,29 +2,15 @@
 
 import hashlib
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import write_whole
 
 _FOLDER = ".stages"
 OUTPUTS = ("report.json", "report.html", "model.xml", "effects.yaml", "fit.json")
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file so that it is either the old one or the whole new one, never half of it."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with open(part, "w", encoding="utf-8") as handle:
-            handle.write(text)
-            handle.flush()
-            os.fsync(handle.fileno())
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def digest(*files: Path, extra: str = "") -> str:

@@ -84,6 +84,11 @@ class ModelFields:
         self._scalars: set[str] = set()  # options of one model that are plain numbers: written back at `commit`
         self._dirty = False
 
+    @property
+    def count(self) -> int | None:
+        """How many simulations' fields these are; None for one model's own."""
+        return self._target.nsim if isinstance(self._target, Batch) else None
+
     def nominal(self, name: str) -> NDArray:
         """The field in the unedited model, without batch dimension."""
         return np.asarray(
@@ -142,6 +147,11 @@ class RowFields(ModelFields):
         self._target, self.nominal_model, self.batched = whole._target, whole.nominal_model, True
         self._arrays = {name: whole[name][ids] for name in whole._arrays}
         self._dirty = False
+
+    @property
+    def count(self) -> int | None:
+        """How many simulations' fields these are."""
+        return len(self._ids)
 
     def __getitem__(self, name: str) -> NDArray:
         """Copy of the simulations' values, (k, ...), to be written before `commit`."""

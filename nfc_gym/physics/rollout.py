@@ -14,7 +14,8 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from nfc_gym.physics.effects.base import Context, Effect, Forces, overrides
+from nfc_gym.physics.acting import Acting
+from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import ParameterSpace, resolve, write_field
 
@@ -181,27 +182,9 @@ class _Run:
         for effect, theta in zip(plant.effects, self.thetas, strict=True):
             q, v = effect.unsense(q, v, theta)
         self.batch.qpos[...], self.batch.qvel[...] = q, v
-        self.memories: list[Any] = []
-        self.commanding = [i for i, e in enumerate(plant.effects) if overrides(e, "action")]
-        self.rubbing = [i for i, e in enumerate(plant.effects) if overrides(e, "friction")]
-        self.pushing = [i for i, e in enumerate(plant.effects) if overrides(e, "force")]
-        if self.rubbing:
-            self.base_friction = self.fields["dof_frictionloss"].copy()
-        self.derived: set[str] = set()
+        self.acting = Acting(model, plant.effects, self.thetas, self.fields, self.batch, segments.dt)
         if sensors:
             self.batch.bind("sensordata")
-
-    def _derived(self, name: str) -> Array:
-        """A field of `MjData`.
-
-        A batch fills a derived field from the first call after its binding on, and it is zero until then. Whoever reads
-        one first therefore has it computed for the state as it is (`forward` leaves the solver's warm start alone).
-        """
-        array = self.batch.bind(name)
-        if name not in self.derived:
-            self.derived.add(name)
-            self.batch.forward()
-        return array
 
     def _tile(self, array: Array) -> Array:
         return np.broadcast_to(array, (self.count, *array.shape)).reshape(self.count * len(array), *array.shape[1:])
@@ -220,12 +203,7 @@ class _Run:
     def _command(self, k: int, exogenous: Mapping[str, Array]) -> Array:
         """Command of step k (negative in the history) after the effects on it."""
         ctrl = self._tile(self.segments.ctrl[:, self.segments.history + k])
-        for slot, i in enumerate(self.commanding):
-            effect, theta = self.plant.effects[i], self.thetas[i]
-            if len(self.memories) == slot:
-                self.memories.append(effect.state0(ctrl.shape[:-1], ctrl, theta, self.segments.dt))
-            ctrl, self.memories[slot] = effect.action(ctrl, theta, self.memories[slot], exogenous, self.segments.dt)
-        return ctrl
+        return self.acting.command(ctrl, exogenous)
 
     def _exogenous(self, k: int) -> dict[str, Array]:
         return {n: self._tile(s[:, self.segments.history + k]) for n, s in self.segments.exogenous.items()}
@@ -241,26 +219,6 @@ class _Run:
             wish = wish - self._tile(terms["damping"][:, at]) * self.batch.qvel[:, servo.dof]
             ctrl[:, servo.actuator] = self._tile(terms["supply"][:, at]) * np.clip(wish, -servo.limit, servo.limit)
         return ctrl
-
-    def _apply(self, ctx: Context) -> None:
-        """State-feedback friction and forces of the coming step."""
-        if self.rubbing:
-            loss = self.fields["dof_frictionloss"]
-            loss[...] = self.base_friction
-            for i in self.rubbing:
-                dofs, level = self.plant.effects[i].friction(ctx, self.thetas[i])
-                loss[:, dofs] += level
-        if self.pushing:
-            out = Forces(self.batch.qfrc_applied, self.batch.xfrc_applied)
-            out.qfrc[...] = 0
-            out.xfrc[...] = 0
-            for i in self.pushing:
-                self.plant.effects[i].force(ctx, self.thetas[i], out)
-
-    def _nominal(self, name: str) -> Array:
-        if name == "dof_frictionloss" and self.rubbing:
-            return self.base_friction
-        return self.fields[name]
 
     def roll(self) -> Trajectory:
         """Step through all segments at once."""
@@ -282,7 +240,7 @@ class _Run:
                 self._advance(0, first=k == 0)
             batch.qpos[...] = start
             batch.qacc_warmstart[...] = 0
-            self.derived.clear()
+            self.acting.derived.clear()
         for k in range(steps):
             qpos[k], qvel[k] = batch.qpos, batch.qvel
             self._advance(k, first=k == 0)
@@ -303,9 +261,10 @@ class _Run:
         # Without a history actuator states begin settled.
         if first and self.segments.history == 0 and self.segments.settle == 0:
             advance_activations(model, batch.ctrl, batch.act, self.segments.dt, settle=True)
-        if self.rubbing or self.pushing:
-            state = (batch.qpos, batch.qvel, batch.ctrl)
-            self._apply(Context(model, self.segments.dt, *state, exogenous, self._derived, self._nominal))
+        if self.acting.pushing:
+            batch.qfrc_applied[...] = 0
+            batch.xfrc_applied[...] = 0
+        self.acting.push(batch.ctrl, exogenous)
         batch.step()
 
     def _result(self, qpos: Array, qvel: Array, sensed: Array | None) -> Trajectory:

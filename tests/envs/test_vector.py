@@ -188,6 +188,10 @@ def test_substep_hooks_see_every_physics_step() -> None:
     for _ in range(3):
         same(envs.step(actions)[0], twin.step(actions)[0])
     np.testing.assert_allclose(times, 0.005 * np.arange(12), atol=1e-9)
+    envs.unwrapped.substep_hooks.clear()
+    envs.unwrapped.after_hooks.append(lambda env: times.append(float(env.batch.time[0])))
+    envs.step(actions)
+    assert times[12:] == pytest.approx([0.08])
 
 
 def test_terrains_are_replaced() -> None:

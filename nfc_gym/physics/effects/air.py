@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
 from nfc_gym.physics.effects.places import base_bodies, body_ids, sized
-from nfc_gym.physics.state import rotate, rotate_back
+from nfc_gym.physics.state import cross, rotate, rotate_back
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
@@ -24,11 +24,11 @@ def body_motion(ctx: Context, body: int) -> tuple[Array, Array]:
     if joint >= 0 and int(model.jnt_type[joint]) == _FREE:
         q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         quat = ctx.q[..., q + 3 : q + 7]
-        arm = np.cross(ctx.v[..., v + 3 : v + 6], ctx.nominal("body_ipos")[..., body, :])
+        arm = cross(ctx.v[..., v + 3 : v + 6], ctx.nominal("body_ipos")[..., body, :])
         return quat, ctx.v[..., v : v + 3] + rotate(quat, arm)
     spatial = ctx.data("cvel")[..., body, :]
     arm = ctx.data("xipos")[..., body, :] - ctx.data("subtree_com")[..., int(model.body_rootid[body]), :]
-    return ctx.data("xquat")[..., body, :], spatial[..., 3:] + np.cross(spatial[..., :3], arm)
+    return ctx.data("xquat")[..., body, :], spatial[..., 3:] + cross(spatial[..., :3], arm)
 
 
 def translating(model: mujoco.MjModel) -> list[str]:

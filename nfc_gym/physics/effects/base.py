@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.names import names as names_in
 
 Array = NDArray[np.float64]
 
@@ -268,8 +269,8 @@ def actuator_names(model: mujoco.MjModel) -> list[str]:
 
 
 def actuator_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
-    """Id of each named actuator, (n,)."""
-    known = actuator_names(model)
+    """Id of each named actuator, (n,); an unnamed one goes by the joint that it moves, as in logs of its model."""
+    known = names_in(model).actuators
     for name in names:
         if name not in known:
             raise InputError(f"the model has no actuator named {name!r}; it has: {', '.join(known)}")

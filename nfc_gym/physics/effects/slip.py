@@ -24,6 +24,7 @@ import numpy as np
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, groups
 from nfc_gym.physics.fields import ModelFields, names_of
+from nfc_gym.physics.state import cross
 
 _EPS = 0.02  # m/s: below it the patch is taken to stick
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -115,18 +116,18 @@ class Slip(Effect):
         com = ctx.data("xipos")[..., self.bodies, :]
         across = ctx.data("xaxis")[..., self.joints, :]
         across = _unit(across - (across * up).sum(-1, keepdims=True) * up)
-        ahead = _cross(across, up)
+        ahead = cross(across, up)
         arm = ctx.data("geom_xpos")[..., self.geoms, :] - com - self.radius[:, None] * up
         spatial = ctx.data("cvel")[..., self.bodies, :]
         from_root = com + arm - ctx.data("subtree_com")[..., self.roots, :]
-        velocity = spatial[..., 3:] + _cross(spatial[..., :3], from_root)
+        velocity = spatial[..., 3:] + cross(spatial[..., :3], from_root)
         lateral, along = (velocity * across).sum(-1), (velocity * ahead).sum(-1)
         normal = weight[..., None] * (ctx.nominal("body_mass") @ self.load)
         grip = self._friction(ctx) * normal / np.sqrt(lateral**2 + along**2 + _EPS**2)
         push = (grip * theta[..., 0:1] * lateral)[..., None] * across
         push += (grip * theta[..., 1:2] * along)[..., None] * ahead
         out.xfrc[..., self.bodies, :3] += push
-        out.xfrc[..., self.bodies, 3:] += _cross(arm, push)
+        out.xfrc[..., self.bodies, 3:] += cross(arm, push)
 
     def _friction(self, ctx: Context) -> Array:
         """Sliding friction of the wheels' contact with the ground: the geom of higher priority, else the larger."""
@@ -145,13 +146,6 @@ class Slip(Effect):
             return []
         places: Sequence[tuple[str, ...]] = [p for p in groups(named) if len(p) < len(named)] if named else []
         return [cls(("ground",), cls.PARAMS), *(cls(where, cls.PARAMS[:2]) for where in places)]
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product of (..., 3) arrays; `np.cross` takes several times as long on small ones."""
-    x, y, z = a[..., 0], a[..., 1], a[..., 2]
-    u, v, w = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
 
 
 def _unit(v: Array) -> Array:

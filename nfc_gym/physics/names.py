@@ -1,0 +1,40 @@
+"""What the objects of a model are called, also where its author gave them no name."""
+
+from dataclasses import dataclass
+
+import mujoco
+
+from nfc_gym.physics.fields import names_of
+
+_OBJ = mujoco.mjtObj
+
+
+@dataclass(frozen=True)
+class Names:
+    """Names of a model's objects, in the order of their ids, none of them empty."""
+
+    actuators: list[str]
+    joints: list[str]
+    bodies: list[str]
+    sensors: list[str]
+
+
+def names(model: mujoco.MjModel) -> Names:
+    """The model's own names; an unnamed actuator is called after the joint it moves, all else by kind and number."""
+    joints = _filled(names_of(model, _OBJ.mjOBJ_JOINT, model.njnt), "joint")
+    bodies = _filled(names_of(model, _OBJ.mjOBJ_BODY, model.nbody), "body")
+    actuators = names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nu)
+    for i, name in enumerate(actuators):
+        moves = int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+        joint = joints[int(model.actuator_trnid[i, 0])] if moves else ""
+        actuators[i] = name or (joint if joint not in actuators else "")
+    return Names(
+        _filled(actuators, "actuator"),
+        joints,
+        bodies,
+        _filled(names_of(model, _OBJ.mjOBJ_SENSOR, model.nsensor), "sensor"),
+    )
+
+
+def _filled(given: list[str], kind: str) -> list[str]:
+    return [name or f"{kind}_{i}" for i, name in enumerate(given)]

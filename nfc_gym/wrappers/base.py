@@ -1,0 +1,95 @@
+"""What all wrappers share: recorded arguments, pickling, random numbers, and the checks on what is wrapped."""
+
+import os
+from typing import Any
+from zlib import crc32
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv, VectorWrapper
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.wrappers.order import beneath, check_order, kind
+
+
+def _rebuild(cls: type, env: Any, kwargs: dict[str, Any]) -> Any:
+    return cls(env, **kwargs)
+
+
+class _Common(RecordConstructorArgs):
+    """The wrapper's own stream of random numbers, and pickling through the constructor.
+
+    The stream follows from the seed of `reset` and never draws from the environment's own generator, so that a wrapper
+    which changes nothing leaves the environment's draws as they are.
+    """
+
+    env: Any
+    arguments: dict[str, Any]
+    rng: np.random.Generator | None
+
+    def _open(self, env: Any, arguments: dict[str, Any]) -> None:
+        """To be called first by every constructor."""
+        self.arguments = arguments
+        RecordConstructorArgs.__init__(
+            self, _disable_deepcopy=True, **{k: self.recorded(k, v) for k, v in arguments.items()}
+        )
+        check_order(self, env)
+        self.rng = None
+        self._depth = sum(kind(w) == kind(self) for w in beneath(env))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (type(self), self.env, self.arguments)
+
+    def recorded(self, name: str, value: Any) -> Any:
+        """A constructor's argument as a spec keeps it: paths as text, the rest as it is."""
+        return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+    def writes(self, what: str) -> bool:
+        """Whether the wrapper writes what `order` says that only one may; some do so only with certain arguments."""
+        return True
+
+    def stream(self, seed: Any) -> np.random.Generator:
+        """The generator of the coming episode: anew from a seed, else as it goes on from the last episode."""
+        if seed is None and self.rng is not None:
+            return self.rng
+        if seed is None:  # never seeded: what the environment has, which makes itself a seed where it has none
+            seed = self.env.unwrapped.np_random_seed
+        if isinstance(seed, list | tuple):  # one a row: the first that is given counts
+            seed = next((s for s in seed if s is not None), None)
+        entropy = None if seed is None or seed < 0 else [int(seed), crc32(kind(self).encode()), self._depth]
+        self.rng = np.random.default_rng(entropy)
+        return self.rng
+
+
+class EnvWrapper(_Common, gym.Wrapper):
+    """Base of the wrappers around one environment."""
+
+    def __init__(self, env: gym.Env, **arguments: Any) -> None:
+        self.require(env)
+        self._open(env, arguments)
+        gym.Wrapper.__init__(self, env)
+
+    @classmethod
+    def require(cls, env: Any) -> None:
+        """Refuse a vector environment."""
+        if isinstance(env, VectorEnv):
+            raise InputError(
+                f"{cls.__name__} wraps one environment; around a vector environment use Vector{cls.__name__}"
+            )
+
+
+class VectorEnvWrapper(_Common, VectorWrapper):
+    """Base of their twins around a vector environment; all rows draw from one stream."""
+
+    def __init__(self, env: VectorEnv, **arguments: Any) -> None:
+        self.require(env)
+        self._open(env, arguments)
+        VectorWrapper.__init__(self, env)
+
+    @classmethod
+    def require(cls, env: Any) -> None:
+        """Refuse a single environment."""
+        if not isinstance(env, VectorEnv):
+            name = cls.__name__.removeprefix("Vector")
+            raise InputError(f"Vector{name} wraps a vector environment; around a single one use {name}")

@@ -1,0 +1,225 @@
+"""`ApplyEffects`: the effects that a model lacks, put into the simulation of any MuJoCo environment.
+
+The objects are those of the calibrator, and act through the same class at every physics step: an effect found in logs
+is the effect that a policy trains under, bit for bit.
+"""
+
+import copy
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.acting import Acting
+from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.saved import from_row, to_row
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
+from nfc_gym.wrappers.batched import batch_simulation_of
+from nfc_gym.wrappers.effects_file import check_model, read_effects
+from nfc_gym.wrappers.simulation import Simulation, simulation_of
+
+Array = NDArray[np.float64]
+Given = Sequence[tuple[Effect, Array] | Mapping[str, Any]] | str | os.PathLike[str]
+Signal = float | Callable[[Any], Any]
+
+
+def recorded(effects: Given) -> list[dict[str, Any]] | str:
+    """Effects as a spec keeps them: rows of plain data, or a path."""
+    if isinstance(effects, str | os.PathLike):
+        return os.fspath(effects)
+    return [to_row(*e) if isinstance(e, tuple) else dict(e) for e in effects]
+
+
+def bound(effects: Given, model: mujoco.MjModel) -> tuple[list[Effect], list[Array]]:
+    """Effects of their own, bound to a model, and their values.
+
+    Raises:
+      InputError: a row, a family, a place or a parameter that does not exist, or values of another number.
+    """
+    given = read_effects(effects)["effects"] if isinstance(effects, str | os.PathLike) else effects
+    pairs = [copy.deepcopy(e) if isinstance(e, tuple) else from_row(e) for e in given]
+    for effect, theta in pairs:
+        if np.shape(theta) != (len(effect.params),) or not np.isfinite(theta).all():
+            names = ", ".join(p.name for p in effect.params)
+            raise InputError(f"ApplyEffects: {effect.id} takes finite values of {names}, got {theta}")
+        effect.bind(model)
+    return [e for e, _ in pairs], [np.asarray(t, float) for _, t in pairs]
+
+
+def check_signals(effects: Sequence[Effect], exogenous: Mapping[str, Signal]) -> None:
+    """Refuse effects that read a signal which nobody gives."""
+    for effect in effects:
+        for name in effect.signals:
+            if name not in exogenous and name != "exo:time":
+                given = ", ".join(exogenous) or "none"
+                raise InputError(f"ApplyEffects: {effect.id} reads {name!r}: give it in `exogenous`; given: {given}")
+
+
+class Application:
+    """Effects wired into a simulation, one or a batch.
+
+    Args:
+      sim: the simulation.
+      given: as `ApplyEffects` takes them.
+      exogenous: as `ApplyEffects` takes them.
+    """
+
+    def __init__(self, sim: Simulation, given: Given, exogenous: Mapping[str, Signal] | None) -> None:
+        self.sim, self.exogenous = sim, dict(exogenous or {})
+        self.effects, values = bound(given, sim.nominal)
+        self.thetas = [np.broadcast_to(t, (*sim.shape, len(t))) for t in values]
+        check_signals(self.effects, self.exogenous)
+        self.reads = any(e.signals for e in self.effects)
+        dt = float(sim.nominal.opt.timestep)
+        self.acting = Acting(sim.nominal, self.effects, self.thetas, sim.fields, sim, dt)
+        if any(overrides(e, "model") for e in self.effects):
+            sim.edits.add(self._edit, rank=1)
+        if self.acting.commanding or self.acting.rubbing or self.acting.pushing:
+            sim.attach("ApplyEffects")
+            sim.on_control.add(self._begin)
+            sim.on_substep.add(self._act)
+            sim.pushed = sim.pushed or bool(self.acting.pushing)
+        self.values = values
+        if any(overrides(e, "sense") for e in self.effects):
+            sim.senses.add(self.sense)
+
+    def sense(self, channel: str, series: Array, interval: float) -> Array:
+        """What a channel's sensor reports of its true series (T, k)."""
+        for effect, theta in zip(self.effects, self.values, strict=True):
+            series = effect.sense(channel, series, theta, interval)
+        return series
+
+    def _edit(self, fields: ModelFields) -> None:
+        for effect, theta in zip(self.effects, self.thetas, strict=True):
+            # Values are the same in every simulation, so any that many as `fields` holds will do.
+            effect.model(fields, theta[: fields.count] if fields.batched else theta)
+
+    def _begin(self) -> None:
+        """Before a control step: forget the hidden states of episodes that begin."""
+        started = self.sim.started
+        if started is True:
+            self.acting.restart()
+        elif started is not False and started.any():
+            self.acting.fields = self.sim.fields
+            self.acting.restart(started)
+
+    def _act(self) -> None:
+        """One physics step's command, friction and forces."""
+        sim = self.sim
+        signals = self._signals() if self.reads else {}
+        if self.acting.commanding:
+            sim.ctrl[...] = self.acting.command(sim.commanded, signals)
+        if self.acting.pushing:
+            sim.restore_forces()
+        self.acting.push(sim.ctrl, signals)
+
+    def _signals(self) -> dict[str, Any]:
+        time = np.asarray(self.sim.bind("time"), float)
+        given = {n: np.asarray(s(time) if callable(s) else s, float) for n, s in self.exogenous.items()}
+        return {"exo:time": time, **{n: np.broadcast_to(v, self.sim.shape) for n, v in given.items()}}
+
+
+class ApplyEffects(EnvWrapper):
+    """Effects at work in an environment.
+
+    Args:
+      env: any MuJoCo environment.
+      effects: (effect, values) pairs, rows `{"family": ..., "where": ..., "parameters": {name: value}}`, or the path
+        of an `effects.yaml`. They act in this order.
+      exogenous: signals that effects read: name -> a number, or a function of the episode's time in s (`exo:time` is
+        given).
+
+    Commands are changed, dry friction and forces written before every physics step; model edits are made at each reset,
+    on top of psi; hidden states (delays, lags, heat) begin settled at an episode's first command. Effects on sensors
+    change what `RecordLog` records, not the observation, whose entries have no channel names.
+
+    Raises:
+      InputError: an unknown family, place or parameter, a signal that is missing, an environment that cannot be
+        stepped so.
+    """
+
+    def __init__(self, env: gym.Env, effects: Given, exogenous: Mapping[str, Signal] | None = None) -> None:
+        super().__init__(env, effects=effects, exogenous=exogenous)
+        self.sim = simulation_of(env, "ApplyEffects")
+        self.application = Application(self.sim, effects, exogenous)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects at work, bound to the environment's model."""
+        return tuple(self.application.effects)
+
+    @property
+    def thetas(self) -> tuple[Array, ...]:
+        """Their parameter values, (k,) each."""
+        return tuple(self.application.thetas)
+
+    @classmethod
+    def from_file(
+        cls,
+        env: gym.Env,
+        path: str | os.PathLike[str],
+        exogenous: Mapping[str, Signal] | None = None,
+        any_model: bool = False,
+    ) -> "ApplyEffects":
+        """The effects of an `effects.yaml`, for an environment whose model is the `model.xml` beside it.
+
+        Args:
+          env: the environment.
+          path: an `effects.yaml`.
+          exogenous: as for the constructor.
+          any_model: put them into another model too.
+
+        Raises:
+          InputError: the file is no `effects.yaml`, or was made for another model than the environment's.
+          MissingExtra: YAML cannot be read for want of the extra `measured`.
+        """
+        if not any_model:
+            check_model(env, os.fspath(path))
+        return cls(env, os.fspath(path), exogenous)
+
+    def recorded(self, name: str, value: Any) -> Any:
+        """See `EnvWrapper`."""
+        return recorded(value) if name == "effects" else super().recorded(name, value)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Edit the model from nominal, forget hidden states, reset."""
+        self.sim.edit()
+        self.sim.begin_episode()
+        result = self.env.reset(seed=seed, options=options)
+        self.sim.edit_after()
+        return result
+
+
+class VectorApplyEffects(VectorEnvWrapper):
+    """The same around a vector environment on `mujoco.batch`: each simulation has hidden states of its own.
+
+    Signals that are functions are given the episodes' times (n,).
+    """
+
+    def __init__(self, env: VectorEnv, effects: Given, exogenous: Mapping[str, Signal] | None = None) -> None:
+        super().__init__(env, effects=effects, exogenous=exogenous)
+        self.sim = batch_simulation_of(env, "ApplyEffects")
+        self.application = Application(self.sim, effects, exogenous)
+
+    def recorded(self, name: str, value: Any) -> Any:
+        """See `EnvWrapper`."""
+        return recorded(value) if name == "effects" else super().recorded(name, value)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset, and edit the models of the rows that were."""
+        result = self.env.reset(seed=seed, options=options)
+        self.sim.edit_after()
+        return result
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step, and edit the models of the rows that were reset meanwhile."""
+        result = self.env.step(actions)
+        self.sim.edit_after()
+        return result

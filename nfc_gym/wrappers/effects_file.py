@@ -1,0 +1,77 @@
+"""`effects.yaml`: what a model lacks and MJCF cannot say, and the model that it was found for."""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from nfc_gym.core.errors import InputError, MissingExtra
+
+# Fields by which a compiled model is known again where no file of it is at hand.
+_TELLING = (
+    "body_parentid", "body_mass", "body_inertia", "body_pos", "jnt_type", "jnt_axis", "dof_damping", "dof_armature",
+    "dof_frictionloss", "geom_type", "geom_size", "geom_friction", "actuator_gear", "actuator_gainprm",
+    "actuator_biasprm", "actuator_ctrlrange",
+)  # fmt: skip
+
+
+def read_effects(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """An `effects.yaml`: the keys `version`, `model_sha256` and `effects`, a list of rows.
+
+    Raises:
+      InputError: no such file, no YAML, another version, or keys that are missing.
+      MissingExtra: no YAML reader is installed.
+    """
+    try:
+        import yaml
+    except ImportError:
+        raise MissingExtra("reading effects.yaml needs pyyaml: pip install 'nfc_gym[measured]'") from None
+    path = Path(path)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read ({e.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as e:
+        raise InputError(f"{path}: is no YAML ({str(e).splitlines()[0]})") from None
+    if not isinstance(data, dict) or not isinstance(data.get("effects"), list):
+        raise InputError(f"{path}: an effects.yaml has the keys version, model_sha256 and effects (a list)")
+    if data.get("version") != 1:
+        raise InputError(f"{path}: version {data.get('version')!r} of effects.yaml; this package reads version 1")
+    return data
+
+
+def check_model(env: Any, path: str | os.PathLike[str]) -> None:
+    """Refuse an `effects.yaml` that was made for another model than the environment's.
+
+    The environment's model file must have the digest that the file names. Where the environment has no model file, its
+    compiled model must be that of the `model.xml` beside the file, which must have that digest.
+
+    Raises:
+      InputError: it was made for another model, or that cannot be told.
+    """
+    path = Path(path)
+    wanted = str(read_effects(path).get("model_sha256"))
+    advice = f"make the environment from {path.with_name('model.xml')}, or say any_model=True"
+    base = env.unwrapped
+    file = getattr(base, "fullpath", None)
+    if file is not None and Path(file).is_file():
+        if _digest(Path(file)) != wanted:
+            raise InputError(f"{path} was made for a model whose SHA-256 is {wanted}, not for {file}; {advice}")
+        return
+    beside = path.with_name("model.xml")
+    if not beside.is_file() or _digest(beside) != wanted:
+        raise InputError(f"{path}: {beside} is absent or another model than the one it was made for; {advice}")
+    theirs, mine = mujoco.MjModel.from_xml_path(str(beside)), base.model
+    for name in _TELLING:
+        a, b = getattr(theirs, name), getattr(mine, name)
+        if a.shape != b.shape or not np.allclose(a, b, rtol=1e-6, atol=1e-9):
+            raise InputError(
+                f"{path} was made for {beside}, which differs from the environment's model in {name}; {advice}"
+            )
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()

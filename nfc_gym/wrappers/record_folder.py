@@ -1,0 +1,108 @@
+"""A folder of logs in the measured loop's format: the model, the mapping, and a Parquet file an episode."""
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError, MissingExtra
+from nfc_gym.core.files import replacing, write_whole
+from nfc_gym.physics.names import names
+from nfc_gym.wrappers.record_channels import columns, model_text, values
+
+Array = NDArray[np.float64]
+_NEEDED = ("pyarrow", "yaml")
+_SAMPLES = 8  # in a compared stretch, where control is slow: as many as 0.4 s at 20 Hz
+
+
+class LogFolder:
+    """Where the logs of one model go.
+
+    Args:
+      env: whose MJCF and psi are written.
+      sim: its simulation.
+      path: the folder; made here. Episodes are numbered after those that it already holds.
+      model_file: the environment's MJCF, where it does not say itself.
+
+    Raises:
+      MissingExtra: Parquet or YAML cannot be written.
+      InputError: the model's MJCF is not at hand, or the folder holds logs of another model.
+    """
+
+    def __init__(self, env: Any, sim: Any, path: str | os.PathLike[str], model_file: str | None) -> None:
+        missing = [name for name in _NEEDED if find_spec(name) is None]
+        if missing:
+            raise MissingExtra(f"RecordLog needs {', '.join(missing)}: pip install 'nfc_gym[measured]'")
+        self.env, self.sim, self.folder, self.model_file = env, sim, Path(path), model_file
+        self.columns = columns(sim.nominal)
+        self.controls = [f"ctrl:{name}" for name in names(sim.nominal).actuators]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.count = len(list(self.folder.glob("episode_*.parquet")))
+        self.text = ""
+
+    def describe(self) -> None:
+        """The model and the mapping, at the beginning of an episode: the ground may be another than before."""
+        text = model_text(self.env, self.sim.nominal, self.model_file)
+        if text == self.text:
+            return
+        file = self.folder / "model.xml"
+        if self.count and file.is_file() and file.read_text(encoding="utf-8") != text:
+            raise InputError(
+                f"RecordLog: {self.folder} holds logs of another model, or of the same on other ground: record into "
+                'another folder, or hold the ground by reset(options={"terrain_id": ...})'
+            )
+        write_whole(file, text)
+        self.text = text
+
+    def write(self, record: dict[str, Array]) -> None:
+        """One episode: `time` (T,), and qpos, qvel, ctrl, sensordata (T, ...); then the mapping."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        table: dict[str, Any] = {"time": record["time"]}
+        table |= {name: record["ctrl"][:, i] for i, name in enumerate(self.controls)}
+        for column in self.columns:
+            series = values(column, record)
+            for sense in self.sim.senses.live():
+                series = sense(column.name, series, self.sim.duration())
+            wide = pa.FixedSizeListArray.from_arrays(np.ascontiguousarray(series).reshape(-1), column.size)
+            table[column.name] = series[:, 0] if column.size == 1 else wide
+        with replacing(self.folder / f"episode_{self.count:04d}.parquet") as part:
+            pq.write_table(pa.table(table), part)
+        self.count += 1
+        self._map()
+
+    def _map(self) -> None:
+        import yaml
+
+        interval = self.sim.duration()
+        space = getattr(self.env.unwrapped, "psi_space", None)
+        rows = [] if space is None else [_parameter(p, n) for p, n in zip(space.parameters, space.nominal, strict=True)]
+        mapping = {
+            "version": 1,
+            "model": "model.xml",
+            "parameters": rows,
+            "logs": [{"path": "episode_*.parquet"}],
+            # Fewer than three episodes cannot be dealt out whole to fitting, choosing and verifying.
+            "split": {"by": "log" if self.count >= 3 else "time"},
+            "time": {"column": "time", "unit": "s"},
+            "controls": {n: {"column": n, "unit": "1"} for n in self.controls},
+            "channels": {c.name: _channel(c) for c in self.columns},
+            "segments": {"length": float(max(0.4, _SAMPLES * interval))},
+        }
+        write_whole(self.folder / "mapping.yaml", yaml.safe_dump(mapping, sort_keys=False, allow_unicode=True))
+
+
+def _parameter(p: Any, nominal: float) -> dict[str, Any]:
+    keys = ("name", "field", "unit", "low", "high", "anchored", "reason")
+    # One value for all its objects, as psi has it.
+    return {**{k: getattr(p, k) for k in keys}, "of": list(p.of), "nominal": float(nominal), "tied": True}
+
+
+def _channel(column: Any) -> dict[str, Any]:
+    places = [column.name] if column.size == 1 else [f"{column.name}[{i}]" for i in range(column.size)]
+    quaternion = {"order": "wxyz"} if column.name.endswith(":quat") else {"unit": column.unit}
+    return {"columns": places, **quaternion}

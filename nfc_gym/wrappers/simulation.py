@@ -1,0 +1,290 @@
+"""The physics beneath an environment, as the wrappers around it share it.
+
+All wrappers of one environment meet in one `Simulation`: model edits start from the same nominal model, forces add up,
+and whoever acts at each physics step is called there in the order in which the wrappers were put on, innermost first.
+
+What the hooks need is a place between two physics steps. An environment that keeps lists called `substep_hooks` and
+`after_hooks` offers it itself; Gymnasium's `MujocoEnv` (and whatever holds one, as the mazes of gymnasium-robotics do)
+is stepped here in place of its own `_step_mujoco_simulation`.
+"""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.wrappers.hooks import Hooks, refresh
+from nfc_gym.wrappers.stepping import Stepped, stepper_of
+
+Array = NDArray[np.float64]
+ATTRIBUTE = "_nfc_simulation"  # of an unwrapped environment
+
+
+def _nothing() -> None:
+    """What a simulation is pickled as: its wrappers make it anew."""
+
+
+class Simulation:
+    """State, model fields and hooks of one `MjData`, or of a batch of simulations.
+
+    Attributes:
+      env: the unwrapped environment.
+      fields, nominal: model fields that edits go through, and the model that they start from.
+      shape: leading batch shape, () or (n,).
+      commanded: (..., nu) what the environment sent to the actuators in this control step, before any effect.
+      started: which simulations are in the first control step of an episode: a bool, or (n,) bool.
+      pushed: whether any hook applies forces, which are then taken back after each control step.
+      on_control: called once a control step, before its first physics step.
+      on_substep: called before every physics step.
+      on_after: called after the last physics step of a control step, before anything is observed.
+      edits: called with `ModelFields` at an episode's beginning, psi's with rank 0, effects' with rank 1.
+      senses: (channel, values (T, k), interval in s) -> what the channel's sensor reports.
+    """
+
+    shape: tuple[int, ...] = ()
+    fields: ModelFields
+    nominal: mujoco.MjModel
+    started: bool | NDArray[np.bool_]
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+    qfrc_applied: Array
+    xfrc_applied: Array
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        self.on_control, self.on_substep, self.on_after = Hooks(), Hooks(), Hooks()
+        self.edits, self.senses = Hooks(), Hooks()
+        self.commanded = np.zeros(0)
+        self.pushed = False
+        self.attached = False
+
+    def refresh(self) -> None:
+        """Forget the hooks of wrappers that are gone."""
+        refresh(self.on_control, self.on_substep, self.on_after)
+
+    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
+        return _nothing, ()
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model that is simulated."""
+        return self.env.model
+
+    def bind(self, name: str) -> Array:
+        """A live field of `MjData`, (..., *shape)."""
+        raise NotImplementedError
+
+    def forward(self, ids: Any = None) -> None:
+        """Recompute the derived fields for the state as it is."""
+        raise NotImplementedError
+
+    def attach(self, who: str, after: bool = False) -> None:
+        """Make sure that the hooks are called."""
+        raise NotImplementedError
+
+    def restore_forces(self) -> None:
+        """Applied forces as they were after the last `on_control`: what a substep's own forces are added to."""
+        raise NotImplementedError
+
+    def duration(self) -> float:
+        """Length of a control step, s."""
+        env = self.env
+        skip = getattr(env, "frame_skip", None) or getattr(self.owner, "frame_skip", None)
+        if not skip:
+            raise InputError(f"{type(env).__name__} does not say its `frame_skip`: its control step is unknown")
+        return float(self.model.opt.timestep) * int(skip)
+
+    @property
+    def owner(self) -> Any:
+        """The object that steps the model: the environment, or the `MujocoEnv` that it holds."""
+        return self.env
+
+
+class SingleSimulation(Simulation):
+    """One environment with `model` and `data`.
+
+    An environment with `fields` (a `ModelFields` of its model, brought back to nominal at each of its resets) has its
+    own psi: edits are then made right after a reset. Any other's model is edited right before.
+    """
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        own = getattr(env, "fields", None)
+        self.own_fields = isinstance(own, ModelFields)
+        self.fields = own if isinstance(own, ModelFields) else ModelFields(env.model, copy.copy(env.model))
+        self.nominal = self.fields.nominal_model
+        self._steps: tuple[Any, str] | None = stepper_of(env)
+        self._inside = False
+        self._calls = self._written = 0
+        self._time = np.inf
+        self.started = True
+        self._look()
+
+    @property
+    def owner(self) -> Any:
+        """See `Simulation`."""
+        return self._steps[0] if self._steps else self.env
+
+    def _look(self) -> None:
+        """Views of the state; an environment may make itself another `MjData`."""
+        data = self.env.data
+        self.data = data
+        self.qpos, self.qvel, self.ctrl = data.qpos, data.qvel, data.ctrl
+        self.qfrc_applied, self.xfrc_applied = data.qfrc_applied, data.xfrc_applied
+        self._base = (self.qfrc_applied.copy(), self.xfrc_applied.copy())
+        self._held = (self.qfrc_applied.copy(), self.xfrc_applied.copy())
+
+    def bind(self, name: str) -> Array:
+        """See `Simulation`."""
+        return getattr(self.data, name)
+
+    def forward(self, ids: Any = None) -> None:
+        """See `Simulation`."""
+        mujoco.mj_forward(self.env.model, self.data)
+
+    # ---- model edits ----------------------------------------------------------------------------------------------
+
+    def edit(self) -> None:
+        """Before a reset: the nominal model with every wrapper's edits, psi's first; derived constants follow."""
+        if not self.own_fields:
+            self.fields.restore()
+            self._write()
+
+    def edit_after(self) -> None:
+        """After a reset: the edits that come on top of the psi that the environment itself has written."""
+        if self.own_fields:
+            self._write()
+
+    def _write(self) -> None:
+        edits = self.edits.live()
+        for edit in edits:
+            edit(self.fields)
+        self.fields.commit()
+        self._written = len(edits)
+
+    # ---- stepping -------------------------------------------------------------------------------------------------
+
+    def attach(self, who: str, after: bool = False) -> None:
+        """Make sure that the hooks are called.
+
+        Args:
+          who: for errors.
+          after: `on_after` is needed too.
+
+        Raises:
+          InputError: the environment steps its model where no such hook can be put.
+        """
+        owner, how = self._steps or (self.env, "")
+        if not how or (after and how == "substep_hooks" and not hasattr(owner, "after_hooks")):
+            place = "after the last physics step" if how else "between physics steps"
+            raise InputError(
+                f"{who} acts {place}, and {type(self.env).__name__} has no place for that: it needs `substep_hooks` "
+                "and `after_hooks`, lists of callables that it calls with itself before every mj_step and after "
+                "a control step's last, or to be stepped by gymnasium's MujocoEnv"
+            )
+        if self.attached:
+            return
+        if how == "substep_hooks":
+            owner.substep_hooks.append(self._called)
+            if hasattr(owner, "after_hooks"):
+                owner.after_hooks.append(lambda _: self._end())
+        else:
+            setattr(owner, how, Stepped(owner, how, self))
+        self.attached = True
+
+    def begin_episode(self) -> None:
+        """The next control step is the first of an episode."""
+        self.started = True
+        self.refresh()
+        if len(self.edits.live()) < self._written:  # a wrapper that edited the model is gone
+            self.edit()
+        self._inside, self._calls, self._time = False, 0, np.inf
+
+    def _begin(self) -> None:
+        """Before the first physics step of a control step; `ctrl` is set."""
+        if self._inside:  # nobody said that the last control step is over
+            self._end()
+        data = self.env.data
+        if data is not self.data:
+            self._look()
+        if data.time < self._time:  # the clock of an episode that was begun by whomever went back
+            self.started = True
+        self.commanded = self.ctrl.copy()
+        if self.pushed:
+            self._base[0][:] = self.qfrc_applied
+            self._base[1][:] = self.xfrc_applied
+        if self.started:
+            self.refresh()
+        for hook in self.on_control:
+            hook()
+        self.started, self._inside = False, True
+        if self.pushed and self.on_substep:
+            self._held[0][:] = self.qfrc_applied
+            self._held[1][:] = self.xfrc_applied
+
+    def restore_forces(self) -> None:
+        """See `Simulation`."""
+        self.qfrc_applied[:], self.xfrc_applied[:] = self._held
+
+    def _end(self) -> None:
+        if self.pushed:
+            self.qfrc_applied[:] = self._base[0]
+            self.xfrc_applied[:] = self._base[1]
+        for hook in self.on_after:
+            hook()
+        self._time = self.data.time
+        self._inside = False
+
+    def _called(self, _: Any) -> None:
+        """Before a physics step of an environment that has hooks of its own."""
+        if self._calls == 0:
+            self._begin()
+        self._calls = (self._calls + 1) % int(self.env.frame_skip)
+        for hook in self.on_substep:
+            hook()
+
+    def run(self, original: Callable[..., None], plain: bool, ctrl: Array, frames: int) -> None:
+        """A control step in place of `MujocoEnv._step_mujoco_simulation`."""
+        self.env.data.ctrl[:] = ctrl
+        self._begin()
+        if not self.on_substep:
+            original(self.commanded, frames)
+        else:
+            model, data, hooks = self.env.model, self.data, self.on_substep
+            for _ in range(frames):
+                for hook in hooks:
+                    hook()
+                if plain:
+                    mujoco.mj_step(model, data)
+                else:
+                    original(self.ctrl.copy(), 1)
+            if plain:  # as the original does after its steps
+                mujoco.mj_rnePostConstraint(model, data)
+        self._end()
+
+
+def simulation_of(env: Any, who: str) -> SingleSimulation:
+    """The simulation beneath an environment, the same one for all its wrappers.
+
+    Raises:
+      InputError: the environment has no MuJoCo model and data.
+    """
+    base = env.unwrapped
+    known = vars(base).get(ATTRIBUTE)
+    if isinstance(known, SingleSimulation):
+        return known
+    model, data = getattr(base, "model", None), getattr(base, "data", None)
+    if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
+        raise InputError(
+            f"{who} needs a MuJoCo environment: {type(base).__name__} has no `unwrapped.model` (mujoco.MjModel) and "
+            "`unwrapped.data` (mujoco.MjData)"
+        )
+    made = SingleSimulation(base)
+    setattr(base, ATTRIBUTE, made)
+    return made

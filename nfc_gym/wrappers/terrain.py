@@ -1,0 +1,182 @@
+"""`ResidualTerrain`: delta_e = truth - perceived. The simulator gets e + delta_e; the policy still sees e."""
+
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+from nfc_gym import terrain
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.physics.fields import names_of
+from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
+from nfc_gym.wrappers.batched import batch_simulation_of
+from nfc_gym.wrappers.simulation import SingleSimulation, simulation_of
+from nfc_gym.wrappers.source import Draws, Source
+
+Array = NDArray[np.float64]
+# Model fields that `terrain.write` changes.
+_WRITTEN = (
+    "hfield_data", "hfield_size", "geom_pos", "geom_sameframe", "geom_size", "geom_aabb", "geom_rbound", "bvh_aabb",
+)  # fmt: skip
+_FOOTPRINT = 1.0  # m around a start within which the ground must not rise into a robot
+
+
+class Ground:
+    """The heightfield beneath an environment, to which residuals are added.
+
+    An environment with a `heightfield` of its own takes them by `reset(options={"terrain_residual": ...})`. Of any
+    other the model's only heightfield is written, and the start in `init_qpos` rises with the ground around it.
+
+    Attributes:
+      shape: (rows, columns).
+
+    Raises:
+      InputError: the environment has no heightfield, or several.
+    """
+
+    def __init__(self, env: gym.Env, sim: SingleSimulation, who: str) -> None:
+        base = env.unwrapped
+        self.sim, self.env = sim, base
+        model = sim.model
+        names = names_of(model, mujoco.mjtObj.mjOBJ_HFIELD, model.nhfield)
+        if len(names) != 1 or not names[0]:
+            found = (
+                f"its model has {len(names)} of them: {', '.join(map(repr, names))}" if names else "it stands on none"
+            )
+            raise InputError(
+                f"{who} needs an environment on one named heightfield, and {type(base).__name__} is none: {found}"
+                + ("; use its Rough variant" if hasattr(base, "psi_space") and not names else "")
+            )
+        self.name = names[0]
+        self.shape = (int(model.hfield_nrow[0]), int(model.hfield_ncol[0]))
+        self.own = hasattr(base, "heightfield")
+        if not self.own:
+            self.perceived = read_ground(model, who)
+            self.start = getattr(sim.owner, "init_qpos", np.zeros(0)).copy()
+            self._given = {name: getattr(model, name).copy() for name in _WRITTEN}
+
+    def options(self, residual: Array, options: dict[str, Any] | None) -> dict[str, Any] | None:
+        """Reset options under which the coming episode runs on e + residual (rows, columns)."""
+        if self.own:
+            return {**(options or {}), "terrain_residual": residual}
+        for name, value in self._given.items():
+            getattr(self.sim.model, name)[...] = value
+        heights = (self.perceived.heights + residual).astype(np.float32)
+        truth = terrain.Heightfield(heights, self.perceived.resolution, self.perceived.origin)
+        if residual.any():  # through metres and back the heights would change in their last bit
+            terrain.write(self.sim.model, self.name, truth)
+        self._lift(truth)
+        return options
+
+    def _lift(self, truth: terrain.Heightfield) -> None:
+        """Raise the start of a free body by what the ground within a robot's length of it has risen."""
+        owner, model = self.sim.owner, self.sim.model
+        free = model.njnt > 0 and int(model.jnt_type[0]) == int(mujoco.mjtJoint.mjJNT_FREE)
+        if not free or not self.start.size:
+            return
+        side = np.arange(-_FOOTPRINT, _FOOTPRINT + 1e-9, truth.resolution / 2)
+        around = self.start[:2] + np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+        rise = float(np.max(truth.height(around) - self.perceived.height(around)))
+        owner.init_qpos[2] = self.start[2] + max(rise, 0.0)
+
+
+def read_ground(model: mujoco.MjModel, who: str) -> terrain.Heightfield:
+    """The map that a model's only heightfield and its geom make in the world, or that of its level plane.
+
+    Raises:
+      InputError: the model has neither, or a heightfield that no map can stand for.
+    """
+    if model.nhfield == 0:
+        planes = np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (model.geom_bodyid == 0))
+        if len(planes) != 1:
+            raise InputError(
+                f"{who}: the model has no heightfield and {len(planes)} planes; want one of either as ground"
+            )
+        return terrain.Heightfield(np.full(terrain.SHAPE, model.geom_pos[planes[0], 2], np.float32))
+    rows, cols = int(model.hfield_nrow[0]), int(model.hfield_ncol[0])
+    geoms = np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)) & (model.geom_dataid == 0))
+    if model.nhfield > 1 or len(geoms) != 1:
+        raise InputError(
+            f"{who}: the model has {model.nhfield} heightfields, {len(geoms)} geoms of the first; want one each"
+        )
+    x, y, z = model.geom_pos[geoms[0]]
+    half_x, half_y, span, _ = model.hfield_size[0]
+    resolution = 2 * half_x / (cols - 1)
+    if not np.isclose(resolution, 2 * half_y / (rows - 1)):
+        raise InputError(f"{who}: the cells of the model's heightfield are not square")
+    heights = z + span * np.asarray(model.hfield_data[: rows * cols], float).reshape(rows, cols)
+    return terrain.Heightfield(heights.astype(np.float32), float(resolution), (float(x - half_x), float(y - half_y)))
+
+
+class ResidualTerrain(EnvWrapper):
+    """Draws a residual terrain at each reset; steps cost nothing.
+
+    Args:
+      env: an environment on a heightfield: a Rough one, or any MuJoCo environment whose model has one.
+      source: where an episode's delta_e comes from: a posterior, an array (rows, columns) or (n, rows, columns) in m, a
+        path. It lies in the world, cell by cell on the environment's heightfield.
+
+    Raises:
+      InputError: the environment has no heightfield, or delta_e has another shape than it.
+    """
+
+    def __init__(self, env: gym.Env, source: Source) -> None:
+        super().__init__(env, source=source)
+        sim = simulation_of(env, "ResidualTerrain")
+        self.ground = Ground(env, sim, "ResidualTerrain")
+        self.draws = Draws(source, "delta_e", "ResidualTerrain")
+        self.draws.expect(self.ground.shape, meaning="the environment's heightfield")
+        self._delta = np.zeros(self.ground.shape)
+
+    @property
+    def delta_e(self) -> Array:
+        """(rows, columns) residual of the running episode, m."""
+        return self._delta.copy()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Draw the residual, then reset onto the ground with it."""
+        self._delta = self.draws.draw(1, self.stream(seed))[0]
+        return self.env.reset(seed=seed, options=self.ground.options(self._delta, options))
+
+
+class VectorResidualTerrain(VectorEnvWrapper):
+    """The same around a vector environment on `mujoco.batch`, whose simulations choose from a pool of maps.
+
+    Each map of the pool gets a residual of its own at every `reset` of all environments, for which the batch is built
+    anew (tens of ms for 1000 simulations); with a single sample, only at the first. Autoresets choose among the maps
+    as before.
+    """
+
+    def __init__(self, env: VectorEnv, source: Source) -> None:
+        super().__init__(env, source=source)
+        sim = batch_simulation_of(env, "ResidualTerrain")
+        maps = getattr(env.unwrapped, "maps", ())
+        if not maps:
+            raise InputError(f"ResidualTerrain needs rough ground: {type(env.unwrapped).__name__} stands on a plane")
+        self.sim, self.perceived = sim, tuple(maps)
+        self.draws = Draws(source, "delta_e", "ResidualTerrain")
+        self.draws.expect(maps[0].heights.shape, meaning="the environment's heightfields")
+        self._delta: Array | None = None
+        sampler = self.draws.sampler
+        self._constant = isinstance(sampler, Fidelity) and (not sampler.batched or len(sampler) == 1)
+
+    @property
+    def delta_e(self) -> Array:
+        """(maps, rows, columns) residual of each map of the pool, m."""
+        if self._delta is None:
+            raise InputError("VectorResidualTerrain: residuals are drawn at the first reset")
+        return self._delta.copy()
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Draw residuals where all environments are reset, then reset."""
+        mask = (options or {}).get("reset_mask")
+        everyone, rng = mask is None or bool(np.all(mask)), self.stream(seed)
+        if self._delta is None or (everyone and not self._constant):
+            self._delta = self.draws.draw(len(self.perceived), rng)
+            truth = [(m.heights + d).astype(np.float32) for m, d in zip(self.perceived, self._delta, strict=True)]
+            self.env.unwrapped.set_terrains(truth, self.perceived)
+        return self.env.reset(seed=seed, options=options)

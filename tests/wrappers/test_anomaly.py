@@ -1,0 +1,86 @@
+"""`MonitorAnomaly`: the detector sees each transition once, and its word is in `info`."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from fakes import NoModel, roll, same
+from test_signals import Plain
+
+from nfc_gym.core import InputError, register_loader
+from nfc_gym.wrappers import MonitorAnomaly, VectorMonitorAnomaly
+
+
+class Jump:
+    """Scores how far the first number went, and counts the steps since the last reset."""
+
+    threshold = 1.5
+
+    def __init__(self) -> None:
+        self.seen: list = []
+
+    def reset(self, rows=None) -> None:
+        self.seen.append(("reset", None if rows is None else rows.tolist()))
+
+    def update(self, obs, action, next_obs):
+        self.seen.append((obs[..., 0].tolist(), np.asarray(action)[..., 0].tolist(), next_obs[..., 0].tolist()))
+        return abs(next_obs[..., 0] - obs[..., 0])
+
+
+class Leaping(Plain):
+    """Its count leaps at the third step."""
+
+    def step(self, action):
+        self.count += 4 if self.count == 2 else 0
+        return super().step(action)
+
+
+def test_transitions_scores_and_threshold() -> None:
+    detector = Jump()
+    env = MonitorAnomaly(Leaping(), detector)
+    infos = [env.reset()[1]] + [env.step(np.array([k]))[4] for k in range(4)]
+    assert [float(i["anomaly_score"]) for i in infos] == [0, 1, 1, 5, 1]
+    assert [bool(i["anomaly"]) for i in infos] == [False, False, False, True, False]
+    assert detector.seen == [("reset", None), (0, 0, 1), (1, 1, 2), (2, 2, 7), (7, 3, 8)]
+    assert all(isinstance(v, np.generic) for i in infos for v in i.values())
+    assert MonitorAnomaly(Leaping(), Jump(), threshold=9.0).threshold == 9.0
+
+
+def test_nothing_else_changes() -> None:
+    env = MonitorAnomaly(gym.make("Ant-v5"), Jump())
+    same(roll(env, 4), roll(gym.make("Ant-v5"), 4))
+
+
+def test_rows_are_scored_together_and_forgotten_alone() -> None:
+    detector = Jump()
+    vector = gym.vector.SyncVectorEnv([lambda: Leaping(2), lambda: Leaping()])
+    env = VectorMonitorAnomaly(vector, detector)
+    _, info = env.reset()
+    np.testing.assert_array_equal(info["anomaly"], [False, False])
+    scores, flags = [], []
+    for _ in range(4):
+        info = env.step(np.zeros((2, 1)))[4]
+        scores.append(info["anomaly_score"].tolist())
+        flags.append(info["anomaly"].tolist())
+    # the first row's third observation begins its next episode: no transition, no score
+    assert scores == [[1, 1], [1, 1], [0, 5], [1, 1]]
+    assert flags == [[False, False], [False, False], [False, True], [False, False]]
+    assert [s for s in detector.seen if s[0] == "reset"] == [("reset", None), ("reset", [True, False])]
+    assert info["_anomaly"].all()
+
+
+def test_a_detector_in_a_file_is_opened_by_its_suffix(tmp_path) -> None:
+    register_loader(".jump", lambda path: Jump())  # type: ignore[arg-type,return-value]
+    path = tmp_path / "detector.jump"
+    path.touch()
+    env = MonitorAnomaly(gym.make("Ant-v5"), path)
+    assert '"detector.jump"' not in env.spec.to_json()
+    assert str(path) in env.spec.to_json()
+
+
+def test_bad_input_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="update"):
+        MonitorAnomaly(NoModel(), object())  # type: ignore[arg-type]
+    silent = Jump()
+    silent.threshold = None  # type: ignore[assignment]
+    with pytest.raises(InputError, match="threshold"):
+        MonitorAnomaly(NoModel(), silent)

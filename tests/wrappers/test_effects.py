@@ -1,0 +1,239 @@
+"""`ApplyEffects`: an effect in a wrapper is the effect in the calibrator, bit for bit."""
+
+import pickle
+from pathlib import Path
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from fakes import CUBE, STATELESS, FakeEnv, NoModel, ZooEnv, roll, same
+from machines import candidates, make, plant_of, probe
+
+from nfc_gym.core import InputError
+from nfc_gym.physics.effects import FAMILIES, Effect
+from nfc_gym.physics.effects.each import each
+from nfc_gym.physics.effects.saved import to_row
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.physics.rollout import Plant, Segments
+from nfc_gym.wrappers import ApplyEffects
+
+MODEL = mujoco.MjModel.from_xml_string(STATELESS)
+CANDIDATES = candidates(MODEL)
+IN_PHYSICS = [f for f in FAMILIES if f not in ("sensor_bias", "sensor_gain", "sensor_delay", "misalignment")]
+SKIP, STEPS = 10, 6
+
+
+def _start(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A state near rest and commands for each control step."""
+    rng = np.random.default_rng(seed)
+    qpos = MODEL.qpos0.copy()
+    for name in ("shoulder", "elbow", "rail", "wheel_l", "wheel_r"):
+        qpos[MODEL.joint(name).qposadr[0]] += 0.3 * rng.normal()
+    ctrl = rng.normal(size=(STEPS, MODEL.nu)) * np.array([3, 3, 8, 8, 0.7, 1, 1])
+    ctrl[:, :2] += 5.0
+    return qpos, 0.4 * rng.normal(size=MODEL.nv), ctrl
+
+
+def _wrapped(pairs: list[tuple[Effect, np.ndarray]], seed: int) -> np.ndarray:
+    """(physics steps + 1, nq + nv) states of a wrapped environment."""
+    qpos, qvel, ctrl = _start(seed)
+    env = ApplyEffects(ZooEnv(frame_skip=SKIP), pairs, exogenous={"exo:supply": lambda t: 11.0 - 5.0 * t})
+    base = env.unwrapped
+    base.start = (qpos, qvel)
+    states: list[np.ndarray] = []
+    env.sim.on_substep.add(lambda: states.append(base._observe()))
+    env.sim.attach("test")
+    env.reset(seed=0)
+    for action in ctrl:
+        env.step(action)
+    return np.array([*states, base._observe()])
+
+
+def _rolled(pairs: list[tuple[Effect, np.ndarray]], seed: int) -> np.ndarray:
+    qpos, qvel, ctrl = _start(seed)
+    count = STEPS * SKIP
+    time = np.zeros(count)
+    for k in range(1, count):
+        time[k] = time[k - 1] + MODEL.opt.timestep
+    signals = {"exo:supply": (11.0 - 5.0 * time)[None], "exo:time": time[None]}
+    segments = Segments(MODEL.opt.timestep, 0, qpos[None], qvel[None], np.repeat(ctrl, SKIP, 0)[None], signals)
+    plant = plant_of(MODEL, *(e for e, _ in pairs))
+    t = plant.shoot(np.concatenate([np.zeros(0), *(x for _, x in pairs)])[None], segments)
+    return np.concatenate([t.qpos[0, 0], t.qvel[0, 0]], -1)
+
+
+@pytest.mark.parametrize("family", IN_PHYSICS)
+def test_an_effect_is_the_same_in_a_wrapper_and_in_the_calibrator(family: str) -> None:
+    for seed, effect in enumerate(CANDIDATES[family][:3]):
+        pair = [(effect, probe(effect))]
+        np.testing.assert_array_equal(_wrapped(pair, seed), _rolled(pair, seed), err_msg=effect.id)
+    assert (_rolled(pair, seed) != _rolled([(effect, effect.null)], seed)).any()
+
+
+def test_several_effects_act_in_the_calibrators_order() -> None:
+    families = ("delay", "dead_zone", "thermal", "stribeck", "load_friction", "drag_quadratic", "slip", "payload")
+    pairs = [(CANDIDATES[f][0], probe(CANDIDATES[f][0])) for f in families]
+    np.testing.assert_array_equal(_wrapped(pairs, 5), _rolled(pairs, 5))
+    backwards = pairs[::-1]
+    np.testing.assert_array_equal(_wrapped(backwards, 5), _rolled(backwards, 5))
+
+
+@pytest.mark.parametrize("family", IN_PHYSICS)
+def test_null_is_no_wrapper_bit_for_bit(family: str) -> None:
+    effect = CANDIDATES[family][0]
+    given = {"exo:supply": 12.0}
+    same(roll(ApplyEffects(ZooEnv(), [(effect, effect.null)], given), 5), roll(ZooEnv(), 5))
+
+
+def test_hidden_states_begin_anew_with_each_episode() -> None:
+    effects = [
+        make("delay", "push", {"delay": 0.05}),
+        make("thermal", "push", {"fade": 0.3, "time_constant": 0.1, "reference": 1}),
+    ]
+    env = ApplyEffects(ZooEnv(), effects)
+    first, second = roll(env, 8), roll(env, 8)
+    same(first, second)
+    assert any((a[0] != b[0]).any() for a, b in zip(first[1:], roll(ZooEnv(), 8)[1:], strict=True))
+
+
+def test_episodes_begun_beneath_the_wrapper_are_seen() -> None:
+    """Somebody below resets without telling the wrappers above."""
+    env = ApplyEffects(ZooEnv(), [make("delay", "push", {"delay": 0.05})])
+    first = roll(env, 8)
+    env.unwrapped.reset(seed=0)
+    rng = np.random.default_rng(99)
+    again = [env.step(rng.uniform(-0.4, 0.4, env.action_space.shape))[0] for _ in range(8)]
+    same([s[0] for s in first[1:]], again)
+
+
+def test_model_edits_start_from_nominal_at_each_reset() -> None:
+    env = ApplyEffects(ZooEnv(), [make("payload", "craft", {"mass": 0.7, "x": 0, "y": 0, "z": 0})])
+    nominal = MODEL.body("craft").mass[0]
+    for _ in range(3):
+        env.reset(seed=0)
+        assert env.unwrapped.model.body("craft").mass[0] == pytest.approx(nominal + 0.7)
+
+
+def test_own_values_at_each_place() -> None:
+    names = ("spin_l", "spin_r")
+    both = each([make("gain", n, {"gain": 0.1})[0] for n in names])
+    both.bind(MODEL)
+    theta = np.array([0.3, -0.2])
+    np.testing.assert_array_equal(_wrapped([(both, theta)], 2), _rolled([(both, theta)], 2))
+    again = ApplyEffects(ZooEnv(), [to_row(both, theta)])
+    assert again.effects[0].id == both.id
+    np.testing.assert_array_equal(again.thetas[0], theta)
+
+
+def test_a_wrapped_environment_is_pickled_and_remade_from_its_spec() -> None:
+    gym.register("FakeZoo-v0", "fakes:ZooEnv")
+    env = ApplyEffects(gym.make("FakeZoo-v0", disable_env_checker=True), [make("coulomb", "elbow", {"level": 0.2})])
+    again = pickle.loads(pickle.dumps(env))
+    remade = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    expected = roll(env, 5)
+    same(roll(again, 5), expected)
+    same(roll(remade, 5), expected)
+
+
+def _file(folder: Path, digest: str) -> Path:
+    effect, theta = make("coulomb", "hinge", {"level": 0.05})
+    row = {"id": effect.id, **to_row(effect, theta), "where": "hinge", "sentence": "…"}
+    path = folder / "effects.yaml"
+    path.write_text(yaml.safe_dump({"version": 1, "model_sha256": digest, "effects": [row]}))
+    return path
+
+
+def test_from_file(tmp_path: Path) -> None:
+    import hashlib
+
+    path = _file(tmp_path, hashlib.sha256(CUBE.encode()).hexdigest())
+    env = ApplyEffects.from_file(FakeEnv(), path)
+    assert [e.id for e in env.effects] == ["coulomb:hinge"]
+    with pytest.raises(InputError, match="any_model"):
+        ApplyEffects.from_file(FakeEnv(CUBE.replace(".5", ".6")), path)
+    ApplyEffects.from_file(FakeEnv(CUBE.replace(".5", ".6")), path, any_model=True)
+
+
+def test_from_file_without_a_model_file_compares_the_model_beside_it(tmp_path: Path) -> None:
+    import hashlib
+
+    path = _file(tmp_path, hashlib.sha256(CUBE.encode()).hexdigest())
+    env = FakeEnv()
+    env.fullpath = None
+    with pytest.raises(InputError, match=r"model\.xml"):
+        ApplyEffects.from_file(env, path)
+    (tmp_path / "model.xml").write_text(CUBE)
+    ApplyEffects.from_file(env, path)
+    other = FakeEnv(CUBE.replace('mass=".5"', 'mass=".6"'))
+    other.fullpath = None
+    with pytest.raises(InputError, match="body_mass"):
+        ApplyEffects.from_file(other, path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("effects: [", "no YAML"),
+        ("[]", "the keys"),
+        ("version: 2\neffects: []", "version 2"),
+        ("version: 1\neffects: [{family: gain}]", "where"),
+    ],
+)
+def test_a_file_that_is_none_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "effects.yaml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        ApplyEffects.from_file(FakeEnv(), tmp_path / "effects.yaml", any_model=True)
+
+
+def test_bad_input_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="MuJoCo"):
+        ApplyEffects(NoModel(), [])
+    with pytest.raises(InputError, match="coulomb"):
+        ApplyEffects(FakeEnv(), [{"family": "colomb", "where": "hinge", "parameters": {"level": 1}}])
+    with pytest.raises(InputError, match="hinge"):
+        ApplyEffects(FakeEnv(), [{"family": "coulomb", "where": "knee", "parameters": {"level": 1}}])
+    with pytest.raises(InputError, match="number"):
+        ApplyEffects(FakeEnv(), [{"family": "coulomb", "where": "hinge", "parameters": {"level": "much"}}])
+    with pytest.raises(InputError, match="exo:supply"):
+        ApplyEffects(ZooEnv(), [_sag()])
+    with pytest.raises(InputError, match="only once"):
+        ApplyEffects(ApplyEffects(FakeEnv(), []), [])
+
+
+def _sag() -> tuple[Effect, np.ndarray]:
+    effect = CANDIDATES["supply_sag"][0]
+    return effect, probe(effect)
+
+
+def test_on_top_of_psi(tmp_path: Path) -> None:
+    """Psi below effects and effects below psi: psi is written first, effects edit what is there."""
+    from nfc_gym.wrappers import RandomizePsi
+
+    payload = [make("payload", "craft", {"mass": 0.7, "x": 0, "y": 0, "z": 0})]
+    bounds = {"craft": (2.0, 2.0)}
+    for env in (
+        ApplyEffects(RandomizePsi(ZooEnv(), bounds), payload),
+        RandomizePsi(ApplyEffects(ZooEnv(), payload), bounds),
+    ):
+        for _ in range(2):
+            env.reset(seed=0)
+            assert env.unwrapped.model.body("craft").mass[0] == pytest.approx(2.7)
+
+
+def test_psi_then_effects_is_what_the_calibrator_writes() -> None:
+    from nfc_gym.wrappers import RandomizePsi
+
+    effect, theta = CANDIDATES["payload"][0], probe(CANDIDATES["payload"][0])
+    env = RandomizePsi(ApplyEffects(ZooEnv(), [(effect, theta)]), {"craft": (2.0, 2.0)})
+    env.reset(seed=0)
+    mine = env.unwrapped.model
+    theirs = mujoco.MjModel.from_xml_string(STATELESS)
+    fields = ModelFields(theirs)
+    plant = Plant(MODEL, ParameterSpace(MODEL, env.psi_space.parameters), [effect], 1)
+    plant.write(fields, np.concatenate([[2.0], theta]))
+    fields.commit()
+    for name in ("body_mass", "body_inertia", "body_ipos", "dof_invweight0", "body_subtreemass"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)

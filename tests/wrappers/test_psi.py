@@ -1,0 +1,120 @@
+"""`RandomizePsi`: what is drawn is what is simulated, always from nominal."""
+
+import pickle
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from fakes import FakeEnv, Gaussian, NoModel, roll, same
+
+from nfc_gym.core import Fidelity, InputError
+from nfc_gym.wrappers import RandomizePsi
+
+
+def test_a_drawn_mass_is_in_the_model_and_inertia_follows() -> None:
+    env = RandomizePsi(FakeEnv(), {"cube": (2.0, 4.0)})
+    inertia = FakeEnv().model.body("cube").inertia.copy()
+    masses = []
+    for seed in range(20):
+        env.reset(seed=seed)
+        body = env.unwrapped.model.body("cube")
+        assert body.mass[0] == env.psi[0]
+        np.testing.assert_allclose(body.inertia, inertia * env.psi[0])  # 1 kg at first
+        assert env.unwrapped.model.body_subtreemass[0] == pytest.approx(env.psi[0] + 0.5)
+        masses.append(env.psi[0])
+    assert 2 <= min(masses) < 2.4 < 3.6 < max(masses) <= 4
+    env.reset(seed=3)
+    assert env.psi[0] == masses[3]
+
+
+def test_fractions_lie_strictly_inside_the_prior_around_nominal() -> None:
+    space = [{"name": "m", "field": "body_mass", "of": ["cube"], "low": 0.5, "high": 5.0}]
+    env = RandomizePsi(FakeEnv(), 0.5, space)
+    drawn = np.array([(env.reset(seed=s), env.psi[0])[1] for s in range(200)])
+    assert 0.75 <= drawn.min() < 0.78
+    assert 2.9 < drawn.max() <= 3.0
+
+
+def test_names_of_bodies_have_a_prior_of_half_to_one_and_a_half() -> None:
+    env = RandomizePsi(FakeEnv(), space=["cube", "pole"])
+    assert env.psi_space.names == ("cube", "pole")
+    np.testing.assert_allclose(env.psi_space.low, [0.5, 0.25])
+    np.testing.assert_allclose(env.psi_space.high, [1.5, 0.75])
+
+
+def test_samples_posteriors_and_files(tmp_path: Path) -> None:
+    samples = np.random.default_rng(0).uniform(0.6, 1.4, (30, 1))
+    Fidelity(psi=samples).save(tmp_path / "psi.npz")
+    for source in (samples, Fidelity(psi=samples), tmp_path / "psi.npz"):
+        env = RandomizePsi(FakeEnv(), source, ["cube"])
+        drawn = {float((env.reset(), env.psi)[1][0]) for _ in range(60)}
+        assert drawn <= set(samples[:, 0])
+        assert len(drawn) > 15
+    env = RandomizePsi(FakeEnv(), Gaussian("psi", np.array([1.0]), 0.05), ["cube"])
+    drawn = np.array([(env.reset(), env.psi)[1][0] for _ in range(300)])
+    assert abs(drawn.mean() - 1) < 0.01 < drawn.std() < 0.06
+
+
+def test_options_override_the_draw() -> None:
+    env = RandomizePsi(FakeEnv(), space=["cube", "pole"])
+    env.reset(options={"psi": {"cube": 1.25}})
+    np.testing.assert_array_equal(env.psi, [1.25, 0.5])
+    assert env.unwrapped.model.body("cube").mass[0] == 1.25
+
+
+def test_an_own_space_is_used_and_read_back() -> None:
+    import nfc_gym  # noqa: F401 (registers)
+
+    env = RandomizePsi(gym.make("nfc_gym/JackalFlat-v0"), 0.5)
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(env.unwrapped.psi, env.psi)
+    expected = np.clip(env.psi_space.normalise(env.psi), -1, 1)
+    np.testing.assert_allclose(observation["psi"], expected, rtol=1e-6)
+    env.reset(options={"psi": env.psi_space.nominal})
+    np.testing.assert_array_equal(env.unwrapped.psi, env.psi_space.nominal)
+
+
+def test_nominal_is_no_wrapper_bit_for_bit() -> None:
+    mass = float(gym.make("Ant-v5").unwrapped.model.body("torso").mass[0])
+    same(roll(RandomizePsi(gym.make("Ant-v5"), {"torso": (mass, mass)}), 5), roll(gym.make("Ant-v5"), 5))
+
+
+def test_spec_and_pickle(tmp_path: Path) -> None:
+    Fidelity(psi=np.array([[0.2], [0.3]])).save(tmp_path / "psi.npz")
+    for arguments in (
+        {"distribution": {"torso": [0.1, 0.4]}},
+        {"distribution": tmp_path / "psi.npz", "space": ["torso"]},
+    ):
+        env = RandomizePsi(gym.make("Ant-v5"), **arguments)
+        expected = roll(env, 4)
+        same(roll(pickle.loads(pickle.dumps(env)), 4), expected)
+        remade = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+        same(roll(remade, 4), expected)
+        assert remade.spec.additional_wrappers == env.spec.additional_wrappers
+
+
+@pytest.mark.parametrize(
+    ("distribution", "space", "message"),
+    [
+        (1.0, None, "psi_space"),
+        (0.0, ["cube"], r"\(0, 1\]"),
+        ({"cub": (0, 1)}, None, "cube, pole"),
+        ({"cube": (2, 1)}, None, "low <= high"),
+        ({"elbow": (1, 2)}, ["cube"], "cube"),
+        (np.ones((3, 2)), ["cube"], r"\(1,\)"),
+        (np.array([np.nan]), ["cube"], "nan"),
+        ("psi.npz", ["cube"], "no such file"),
+        ([[object()]], ["cube"], "posterior"),
+    ],
+)
+def test_bad_input_is_refused_by_name(distribution, space, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        RandomizePsi(FakeEnv(), distribution, space)
+
+
+def test_an_environment_without_mujoco_is_refused() -> None:
+    with pytest.raises(InputError, match="NoModel"):
+        RandomizePsi(NoModel(), 1.0, ["cube"])
+    with pytest.raises(InputError, match="mass"):
+        RandomizePsi(FakeEnv(), np.array([-1.0]), ["cube"]).reset()

@@ -1,0 +1,231 @@
+"""`RecordLog`: the measured loop's log format, read back by the measured loop itself."""
+
+import pickle
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from fakes import FakeEnv, NoModel, roll, same
+from machines import make
+
+import nfc_gym  # noqa: F401 (registers the ids)
+from nfc_gym.core import InputError, MissingExtra
+from nfc_gym.measured.checks import check
+from nfc_gym.measured.mapping import load_mapping
+from nfc_gym.measured.readers import read_table
+from nfc_gym.physics.state import rotate
+from nfc_gym.wrappers import ApplyEffects, RecordLog, VectorRecordLog
+
+
+def _drive(env: gym.Env, episodes: int, steps: int) -> None:
+    rng = np.random.default_rng(0)
+    for seed in range(episodes):
+        env.reset(seed=seed)
+        for k in range(steps):
+            if k % 10 == 0:
+                action = rng.uniform(-0.5, 0.5, env.action_space.shape)
+            _, _, ended, truncated, _ = env.step(action)
+            if ended or truncated:
+                break
+    env.close()
+
+
+def test_columns_are_what_the_simulation_was(tmp_path: Path) -> None:
+    env = RecordLog(FakeEnv(), tmp_path)
+    base = env.unwrapped
+    env.reset(seed=0)
+    base.data.qvel[:] = [0.1, 0.2, 0.3, 1.0, 2.0, 3.0, 0.5]
+    states, commands, sensors = [], [], []
+    for k in range(12):
+        states.append((base.data.time, base.data.qpos.copy(), base.data.qvel.copy()))
+        commands.append(0.1 * k)
+        aside = mujoco.MjData(base.model)
+        aside.qpos[:], aside.qvel[:], aside.ctrl[:] = base.data.qpos, base.data.qvel, 0.1 * k
+        mujoco.mj_forward(base.model, aside)
+        sensors.append(aside.sensordata.copy())
+        env.step(np.array([0.1 * k]))
+    assert not list(tmp_path.glob("*.parquet"))
+    env.close()
+    table = read_table(tmp_path / "episode_0000.parquet")
+    time, qpos, qvel = (np.array(s) for s in zip(*states, strict=True))
+    np.testing.assert_array_equal(table["time"], time)
+    np.testing.assert_array_equal(table["ctrl:twist"], commands)
+    np.testing.assert_array_equal(table["body:cube:pos"], qpos[:, :3])
+    np.testing.assert_allclose(table["body:cube:quat"], qpos[:, 3:7], rtol=1e-12)
+    np.testing.assert_array_equal(table["body:cube:linvel"], qvel[:, :3])
+    np.testing.assert_allclose(table["body:cube:angvel"], rotate(qpos[:, 3:7], qvel[:, 3:6]), rtol=1e-12)
+    np.testing.assert_array_equal(table["joint:hinge:pos"], qpos[:, 7])
+    np.testing.assert_array_equal(table["joint:hinge:vel"], qvel[:, 6])
+    np.testing.assert_allclose(table["sensor:gyro"], np.array(sensors)[:, 1:], rtol=1e-12)
+    assert set(table) == {"time", "ctrl:twist", "sensor:gyro"} | {
+        *(f"body:cube:{q}" for q in ("pos", "quat", "linvel", "angvel")),
+        *("joint:hinge:pos", "joint:hinge:vel"),
+    }
+
+
+def test_an_accelerometer_shows_the_command_of_its_own_step(tmp_path: Path) -> None:
+    xml = (
+        "<mujoco><option timestep='.005' gravity='0 0 0'/><worldbody><body><joint name='x' type='slide' axis='1 0 0'/>"
+    )
+    xml += (
+        "<geom size='.1' mass='2'/><site name='s'/></body></worldbody><actuator><motor name='m' joint='x'/></actuator>"
+    )
+    xml += "<sensor><accelerometer name='a' site='s'/></sensor></mujoco>"
+    for frames in (1, 4):
+        env = RecordLog(FakeEnv(xml, frames), tmp_path / str(frames))
+        env.reset(seed=0)
+        for force in (0.0, 1.0, 3.0, -2.0):
+            env.step(np.array([force]))
+        env.close()
+        table = read_table(tmp_path / str(frames) / "episode_0000.parquet")
+        np.testing.assert_allclose(table["sensor:a"][:, 0], [0, 0.5, 1.5, -1], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["Ant-v5", "nfc_gym/JackalFlat-v0", "nfc_gym/AntRough-v0"])
+def test_a_recorded_log_passes_the_check(name: str, tmp_path: Path) -> None:
+    kwargs = {"terrain_pool": 1} if "Rough" in name else {}
+    env = RecordLog(gym.make(name, max_episode_steps=80, **kwargs), tmp_path)
+    _drive(env, 4, 80)
+    assert len(list(tmp_path.glob("episode_*.parquet"))) == 4
+    findings = check(tmp_path / "mapping.yaml")
+    assert [f for f in findings if f.severity == "error"] == []
+    mapping = load_mapping(tmp_path / "mapping.yaml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert len(mapping.controls) == model.nu == env.unwrapped.model.nu
+    if "nfc_gym" in name:
+        assert [p.name for p in mapping.declared] == list(env.unwrapped.psi_space.names)
+
+
+def test_the_model_beside_the_logs_moves_as_the_environment_did(tmp_path: Path) -> None:
+    """From the recorded start, under the recorded commands, the written model makes the recorded motion."""
+    _drive(RecordLog(gym.make("nfc_gym/JackalFlat-v0", max_episode_steps=60), tmp_path), 1, 60)
+    table = read_table(tmp_path / "episode_0000.parquet")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qpos[3:7] = table["body:base:pos"][0], table["body:base:quat"][0]
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
+    shown = []
+    for k in range(len(table["time"])):
+        shown.append(data.qpos[:3].copy())
+        data.ctrl[:] = [table[f"ctrl:{n}"][k] for n in names]
+        mujoco.mj_step(model, data, nstep=4)
+    np.testing.assert_allclose(shown, table["body:base:pos"], atol=2e-3)
+
+
+def test_effects_act_on_what_is_measured_but_not_on_what_is_commanded(tmp_path: Path) -> None:
+    effects = [make("gain", "twist", {"gain": -0.5}), make("sensor_bias", "joint:hinge:pos", {"bias": 0.25})]
+    for k, wrap in enumerate(
+        (lambda e, p: RecordLog(ApplyEffects(e, effects), p), lambda e, p: ApplyEffects(RecordLog(e, p), effects))
+    ):
+        folder = tmp_path / str(k)
+        env = wrap(FakeEnv(), folder)
+        observation, _ = env.reset(seed=0)
+        for _ in range(5):
+            env.step(np.array([0.8]))
+        env.close()
+        table = read_table(folder / "episode_0000.parquet")
+        np.testing.assert_array_equal(table["ctrl:twist"], 0.8)
+        assert table["joint:hinge:pos"][0] == observation[7] + 0.25
+
+
+def test_files_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pyarrow.parquet as pq
+
+    env = RecordLog(FakeEnv(), tmp_path)
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros(1))
+
+    def fail(table, path) -> None:
+        Path(path).write_bytes(b"PAR1 half")
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pq, "write_table", fail)
+        with pytest.raises(OSError, match="space"):
+            env.reset()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model.xml"]
+    env.reset()
+    env.step(np.zeros(1))
+    env.step(np.zeros(1))
+    env.close()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["episode_0000.parquet", "mapping.yaml", "model.xml"]
+
+
+def test_episodes_are_numbered_on_and_short_ones_leave_nothing(tmp_path: Path) -> None:
+    for _ in range(2):
+        env = RecordLog(FakeEnv(), tmp_path)
+        env.reset()
+        env.reset()
+        env.step(np.zeros(1))
+        env.reset()
+        _drive(env, 1, 3)
+    assert sorted(p.name for p in tmp_path.glob("*.parquet")) == ["episode_0000.parquet", "episode_0001.parquet"]
+    same(roll(RecordLog(FakeEnv(), tmp_path), 4), roll(FakeEnv(), 4))
+
+
+def test_pickle_goes_on_in_the_same_folder(tmp_path: Path) -> None:
+    env = RecordLog(gym.make("Ant-v5"), tmp_path)
+    again = pickle.loads(pickle.dumps(env))
+    _drive(again, 1, 4)
+    assert len(read_table(tmp_path / "episode_0000.parquet")["time"]) == 4
+    assert str(tmp_path) in env.spec.to_json()
+
+
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_rows_of_a_vector_environment_have_files_of_their_own(mode, tmp_path: Path) -> None:
+    arguments = {"num_envs": 2, "max_episode_steps": 5, "autoreset_mode": mode, "context": []}
+    env = VectorRecordLog(gym.make_vec("nfc_gym/JackalFlat-v0", **arguments), tmp_path / "many")
+    env.reset(seed=7)
+    actions = np.random.default_rng(0).uniform(-1, 1, (9, 2, 2))
+    for k in range(9):
+        _, _, ended, truncated, _ = env.step(actions[k])
+        if mode is gym.vector.AutoresetMode.DISABLED and (ended | truncated).any():
+            env.reset(options={"reset_mask": ended | truncated})
+    env.close()
+    files = sorted((tmp_path / "many").glob("*.parquet"))
+    assert [len(read_table(f)["time"]) for f in files] == [
+        5,
+        5,
+        *[3 if mode is gym.vector.AutoresetMode.NEXT_STEP else 4] * 2,
+    ]
+    for row in range(2):
+        single = RecordLog(gym.make("nfc_gym/JackalFlat-v0", context=[]), tmp_path / f"one{row}")
+        single.reset(seed=7 + row)
+        for k in range(5):
+            single.step(actions[k, row])
+        single.close()
+        same(read_table(files[row]), read_table(tmp_path / f"one{row}" / "episode_0000.parquet"))
+
+
+def test_bad_input_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="NoModel"):
+        RecordLog(NoModel(), tmp_path)
+    env = FakeEnv()
+    env.fullpath = "gone.xml"
+    with pytest.raises(InputError, match="model_file"):
+        RecordLog(env, tmp_path).reset()
+    with pytest.raises(InputError, match="nq, nv"):
+        RecordLog(FakeEnv(), tmp_path, gym.make("Ant-v5").unwrapped.fullpath).reset()
+    with pytest.raises(InputError, match="terrain_pool=1"):
+        VectorRecordLog(gym.make_vec("nfc_gym/JackalRough-v0", num_envs=2, terrain_pool=2), tmp_path)
+    with pytest.raises(InputError, match="VectorRecordLog"):
+        RecordLog(gym.make_vec("Ant-v5", 1), tmp_path)  # type: ignore[arg-type]
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pyarrow", None)
+        patch.setattr("nfc_gym.wrappers.record_folder.find_spec", lambda name: None if name == "pyarrow" else name)
+        with pytest.raises(MissingExtra, match=r"pyarrow.*nfc_gym\[measured\]"):
+            RecordLog(FakeEnv(), tmp_path)
+
+
+def test_other_ground_needs_another_folder(tmp_path: Path) -> None:
+    env = RecordLog(gym.make("nfc_gym/JackalRough-v0", terrain_pool=2), tmp_path)
+    env.reset(options={"terrain_id": 0})
+    env.step(np.zeros(2))
+    env.step(np.zeros(2))
+    env.reset(options={"terrain_id": 0})
+    with pytest.raises(InputError, match="terrain_id"):
+        env.reset(options={"terrain_id": 1})

@@ -1,0 +1,142 @@
+"""`PerturbSignals` on environments whose numbers are known."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from fakes import NoModel, roll, same
+from gymnasium import spaces
+
+from nfc_gym.core import InputError
+from nfc_gym.wrappers import PerturbSignals, VectorPerturbSignals
+
+
+class Counting(gym.Env):
+    """Observes how many steps were made, tenfold beside it, and what action came."""
+
+    observation_space = spaces.Dict(
+        {
+            "count": spaces.Box(-np.inf, np.inf, (2,), np.float64),
+            "action": spaces.Box(-np.inf, np.inf, (1,), np.float32),
+        }
+    )
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, end: int = 1000) -> None:
+        self.end = end
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        super().reset(seed=seed)
+        self.count = 0
+        return self._observe(np.zeros(1, np.float32)), {}
+
+    def step(self, action):
+        self.count += 1
+        return self._observe(action), 0.0, self.count >= self.end, False, {}
+
+    def _observe(self, action):
+        return {"count": np.array([self.count, 10.0 * self.count]), "seen": 0, "action": action} | {}
+
+
+class Plain(Counting):
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def _observe(self, action):
+        return np.array([self.count, 10.0 * self.count])
+
+
+def test_bias_and_delay_of_an_observation() -> None:
+    env = PerturbSignals(Counting(), {"count": {"bias": [0.5, -1.0], "delay": 2}})
+    shown = [env.reset()[0]["count"]] + [env.step(np.zeros(1))[0]["count"] for _ in range(4)]
+    np.testing.assert_array_equal(shown, [[0.5, -1], [0.5, -1], [0.5, -1], [1.5, 9], [2.5, 19]])
+    again = env.reset()[0]["count"]
+    np.testing.assert_array_equal(again, [0.5, -1])  # the past is forgotten
+
+
+def test_motors_are_late_biased_and_stay_in_the_space() -> None:
+    class Seen(Plain):
+        def _observe(self, action):
+            return np.array([action[0], 0.0])
+
+    env = PerturbSignals(Seen(), {"action": {"bias": 0.2, "delay": 1}})
+    env.reset()
+    shown = [env.step(np.array([a], np.float32))[0][0] for a in (0.1, 0.3, 0.9, -0.5)]
+    np.testing.assert_allclose(shown, [0.3, 0.3, 0.5, 1.0], rtol=1e-6)
+
+
+def test_noise_has_the_spread_asked_for_and_a_seed_repeats_it() -> None:
+    env = PerturbSignals(Plain(), {"observation": {"sd": [0.1, 0.0], "bias_sd": 0.0}})
+    env.reset(seed=1)
+    shown = np.array([env.step(np.zeros(1))[0] for _ in range(4000)])
+    errors = shown[:, 0] - np.arange(1, 4001)
+    assert errors.std() == pytest.approx(0.1, rel=0.05)
+    assert abs(errors.mean()) < 0.01
+    np.testing.assert_array_equal(shown[:, 1], 10.0 * np.arange(1, 4001))
+    env.reset(seed=1)
+    np.testing.assert_array_equal([env.step(np.zeros(1))[0] for _ in range(10)], shown[:10])
+
+
+def test_a_drawn_bias_holds_for_an_episode() -> None:
+    env = PerturbSignals(Plain(), {"observation": {"bias_sd": 1.0}})
+    first = env.reset(seed=0)[0]
+    np.testing.assert_allclose(env.step(np.zeros(1))[0] - first, [1, 10])
+    others = np.array([env.reset()[0] for _ in range(2000)])
+    np.testing.assert_allclose(others.std(0), 1, rtol=0.1)
+
+
+def test_zeros_change_nothing_and_types_stay() -> None:
+    noise = {"observation": {"sd": 0.0, "bias": 0.0, "delay": 0}, "action": {}}
+    env, bare = PerturbSignals(gym.make("Ant-v5"), noise), gym.make("Ant-v5")
+    same(roll(env, 5), roll(bare, 5))
+    assert PerturbSignals(NoModel(), {"observation": {"sd": 0.1}}).reset()[0].dtype == np.float32
+
+
+def test_spaces_hold_what_comes_out() -> None:
+    env = PerturbSignals(NoModel(), {"observation": {"sd": 10.0}})
+    env.reset(seed=0)
+    for _ in range(20):
+        assert env.step(np.zeros(1))[0] in env.observation_space
+
+
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_rows_of_a_vector_environment_forget_on_their_own(mode) -> None:
+    makers = [lambda end=end: Plain(end) for end in (3, 5)]
+    env = VectorPerturbSignals(gym.vector.SyncVectorEnv(makers, autoreset_mode=mode), {"observation": {"delay": 2}})
+    shown = [env.reset()[0][:, 0]]
+    done = np.zeros(2, bool)
+    for _ in range(6):
+        if mode is gym.vector.AutoresetMode.DISABLED and done.any():
+            shown.append(env.reset(options={"reset_mask": done})[0][:, 0])
+        observation, _, ended, truncated, _ = env.step(np.zeros((2, 1)))
+        done = ended | truncated
+        shown.append(observation[:, 0])
+    # Two steps late, the first value in between. The rows end after 3 and 5 steps.
+    expected = {
+        gym.vector.AutoresetMode.NEXT_STEP: ([0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 2, 3, 0]),
+        gym.vector.AutoresetMode.SAME_STEP: ([0, 0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 2, 0, 0]),
+        # a reset of one row shows the other as it was before
+        gym.vector.AutoresetMode.DISABLED: ([0, 0, 0, 1, 0, 0, 0, 0, 1], [0, 0, 0, 1, 1, 2, 3, 0, 0]),
+    }[mode]
+    np.testing.assert_array_equal(np.array(shown).T, expected)
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        ({"proprio": {}}, "observation, action"),
+        ({"observation": {"variance": 1}}, "sd, bias, bias_sd, delay"),
+        ({"observation": {"sd": -1.0}}, "below 0"),
+        ({"observation": {"bias": [1.0, 2.0, 3.0]}}, r"\(2,\)"),
+        ({"action": {"delay": 0.5}}, "delay"),
+    ],
+)
+def test_bad_input_is_refused_by_name(noise, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        PerturbSignals(Plain(), noise)
+
+
+def test_keys_that_are_no_numbers_are_refused() -> None:
+    class Discrete(Plain):
+        action_space = spaces.Discrete(3)
+
+    with pytest.raises(InputError, match="no Box"):
+        PerturbSignals(Discrete(), {"action": {"sd": 1.0}})

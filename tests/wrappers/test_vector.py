@@ -1,0 +1,268 @@
+"""Twins around vector environments: row i with seed s + i is the single environment with that seed, bit for bit."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from fakes import same
+
+import nfc_gym  # noqa: F401 (registers the ids)
+from nfc_gym.core import Fidelity, InputError
+from nfc_gym.wrappers import (
+    ApplyEffects,
+    Hallucinate,
+    MonitorAnomaly,
+    PerceiveTerrain,
+    PerturbSignals,
+    RandomizePsi,
+    RecordLog,
+    ResidualDynamics,
+    ResidualTerrain,
+    VectorApplyEffects,
+    VectorHallucinate,
+    VectorMonitorAnomaly,
+    VectorPerceiveTerrain,
+    VectorPerturbSignals,
+    VectorRandomizePsi,
+    VectorRecordLog,
+    VectorResidualDynamics,
+    VectorResidualTerrain,
+)
+
+N, STEPS, END = 3, 14, 5
+ID = "nfc_gym/JackalFlat-v0"
+NV = 10
+SLIP = {"family": "slip", "where": "ground", "parameters": {"lateral": 0.4, "longitudinal": 0.1, "creep": 2.0}}
+DELAY = {"family": "delay", "where": "front_left", "parameters": {"delay": 0.017}}
+HEAT = {
+    "family": "thermal",
+    "where": "rear_right",
+    "parameters": {"fade": 0.4, "time_constant": 0.1, "reference": 10.0},
+}
+DRY = {"family": "coulomb", "where": "rear_left_wheel", "parameters": {"level": 0.3}}
+LOAD = {"family": "payload", "where": "base", "parameters": {"mass": 3.0, "x": 0.1, "y": 0.0, "z": 0.1}}
+EFFECTS = [SLIP, DELAY, HEAT, DRY, LOAD]
+BIAS = 0.02 * np.arange(1.0, NV + 1)
+
+STACKS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "effects": (lambda e: ApplyEffects(e, EFFECTS), lambda e: VectorApplyEffects(e, EFFECTS)),
+    "force": (lambda e: ResidualDynamics(e, BIAS), lambda e: VectorResidualDynamics(e, BIAS)),
+    "state": (
+        lambda e: ResidualDynamics(e, BIAS, mode="state"),
+        lambda e: VectorResidualDynamics(e, BIAS, mode="state"),
+    ),
+    "both": (
+        lambda e: ResidualDynamics(ApplyEffects(e, EFFECTS), BIAS),
+        lambda e: VectorResidualDynamics(VectorApplyEffects(e, EFFECTS), BIAS),
+    ),
+    "psi": (
+        lambda e: ApplyEffects(RandomizePsi(e, {"base_mass": [16.5, 16.5]}), [LOAD, DRY]),
+        lambda e: VectorApplyEffects(VectorRandomizePsi(e, {"base_mass": [16.5, 16.5]}), [LOAD, DRY]),
+    ),
+}
+
+
+def _vector(**kwargs: Any) -> gym.vector.VectorEnv:
+    return gym.make_vec(ID, num_envs=N, max_episode_steps=END, context=["psi"], nthread=2, **kwargs)
+
+
+def _actions() -> np.ndarray:
+    return np.random.default_rng(0).uniform(-1, 1, (STEPS, N, 2))
+
+
+@pytest.mark.parametrize("stack", STACKS)
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_rows_are_single_environments(stack: str, mode: gym.vector.AutoresetMode) -> None:
+    wrap, twin = STACKS[stack]
+    envs, actions = twin(_vector(autoreset_mode=mode)), _actions()
+    many = [envs.reset(seed=11)[0]["proprio"]]
+    for k in range(STEPS):
+        observation, _, ended, truncated, info = envs.step(actions[k])
+        if mode is gym.vector.AutoresetMode.SAME_STEP and (ended | truncated).any():
+            many.append(np.stack([f["proprio"] for f in info["final_obs"]]))
+        many.append(observation["proprio"])
+        if mode is gym.vector.AutoresetMode.DISABLED and truncated.any():
+            many.append(envs.reset(options={"reset_mask": truncated})[0]["proprio"])
+    for row in range(N):
+        env = wrap(gym.make(ID, max_episode_steps=END, context=["psi"]))
+        one = [env.reset(seed=11 + row)[0]["proprio"]]
+        truncated = False
+        for k in range(STEPS):
+            if truncated and mode is gym.vector.AutoresetMode.NEXT_STEP:
+                one.append(env.reset()[0]["proprio"])
+                truncated = False
+                continue
+            observation, _, _, truncated, _ = env.step(actions[k, row])
+            one.append(observation["proprio"])
+            if truncated and mode is not gym.vector.AutoresetMode.NEXT_STEP:
+                one.append(env.reset()[0]["proprio"])
+        np.testing.assert_array_equal(np.array(many)[:, row], one)
+
+
+@pytest.mark.parametrize("stack", STACKS)
+def test_each_stack_does_something(stack: str) -> None:
+    """And so the comparison above means something."""
+    envs, bare = STACKS[stack][1](_vector()), _vector()
+    shown = []
+    for each in (envs, bare):
+        each.reset(seed=11)
+        for action in _actions()[:4]:
+            observation = each.step(action)[0]["proprio"]
+        shown.append(observation)
+    assert (shown[0] != shown[1]).any(1).all()
+
+
+def test_null_is_no_wrapper_bit_for_bit() -> None:
+    nothing = [{**DRY, "parameters": {"level": 0.0}}, {**DELAY, "parameters": {"delay": 0.0}}]
+    mass = float(_vector().unwrapped.psi_space.nominal[0])
+    twins = [
+        lambda e: VectorApplyEffects(e, nothing),
+        lambda e: VectorResidualDynamics(e, np.zeros(NV)),
+        lambda e: VectorResidualDynamics(e, np.zeros(2 * NV), mode="state"),
+        lambda e: VectorRandomizePsi(e, {e.unwrapped.psi_space.names[0]: (mass, mass)}),
+        lambda e: VectorPerturbSignals(e, {"proprio": {"sd": 0.0}, "action": {"bias": 0.0}}),
+    ]
+    expected = _roll(_vector())
+    together = _vector()
+    for twin in twins:
+        same(_roll(twin(_vector())), expected)
+        together = twin(together)
+    same(_roll(together), expected)
+
+
+def _roll(envs: gym.vector.VectorEnv) -> list:
+    out: list = [envs.reset(seed=5)[0]]
+    for action in _actions():
+        observation, reward, ended, truncated, _ = envs.step(action)
+        out.append((observation, reward, ended, truncated))
+    return out
+
+
+def test_psi_is_drawn_for_each_episode_of_each_row() -> None:
+    envs = VectorRandomizePsi(_vector(), 0.5)
+    envs.reset(seed=1)
+    first = envs.psi
+    assert len(np.unique(first[:, 0])) == N
+    space = envs.psi_space
+    assert (first >= space.nominal - 0.5 * (space.nominal - space.low) - 1e-12).all()
+    for _ in range(END + 1):
+        observation, *_ = envs.step(np.zeros((N, 2)))
+    assert (envs.psi[:, 0] != first[:, 0]).all()
+    np.testing.assert_allclose(observation["psi"], np.clip(space.normalise(envs.psi), -1, 1), rtol=1e-5)
+    envs.reset(seed=1)
+    np.testing.assert_array_equal(envs.psi, first)
+    envs.reset(options={"psi": space.nominal})
+    np.testing.assert_array_equal(envs.psi, np.tile(space.nominal, (N, 1)))
+
+
+def test_a_posterior_gives_each_row_a_bias_of_its_own() -> None:
+    samples = np.random.default_rng(0).normal(size=(40, NV))
+    envs = VectorResidualDynamics(_vector(), samples, covariance=np.full(NV, 1e-4))
+    envs.reset(seed=2)
+    first = envs.delta_s
+    assert all((samples == row).all(1).any() for row in first)
+    once = _roll(envs)
+    same(_roll(envs), once)
+
+
+def test_residual_terrain_reaches_the_simulator_but_not_the_map() -> None:
+    arguments = {"num_envs": N, "terrain_pool": 2, "difficulty": 0.3, "max_episode_steps": 6}
+    bare = gym.make_vec("nfc_gym/JackalRough-v0", **arguments)
+    seen, _ = bare.reset(seed=3)
+    null = VectorResidualTerrain(gym.make_vec("nfc_gym/JackalRough-v0", **arguments), np.zeros((256, 256)))
+    same(null.reset(seed=3)[0], seen)
+    envs = VectorResidualTerrain(gym.make_vec("nfc_gym/JackalRough-v0", **arguments), np.full((256, 256), 0.2))
+    told, _ = envs.reset(seed=3)
+    rise = (envs.unwrapped.batch.qpos - bare.unwrapped.batch.qpos)[:, 2]
+    np.testing.assert_allclose(rise, 0.2, atol=1e-6)
+    np.testing.assert_allclose(told["elevation"] + 0.2, seen["elevation"], atol=1e-5)
+    both = VectorApplyEffects(VectorResidualDynamics(envs, BIAS), [SLIP, DELAY])
+    for _ in range(2):  # the batch is another one after the first reset
+        both.reset(seed=3)
+        for _ in range(8):
+            observation, *_ = both.step(np.full((N, 2), 0.5))
+    assert np.isfinite(observation["proprio"]).all()
+    two = VectorResidualTerrain(
+        gym.make_vec("nfc_gym/JackalRough-v0", **arguments), np.arange(5.0)[:, None, None] * np.ones((256, 256))
+    )
+    drawn = set()
+    for _ in range(4):
+        two.reset()
+        drawn |= set(two.delta_e[:, 0, 0])
+    assert len(drawn) > 2
+
+
+def test_rows_see_with_cameras_of_their_own() -> None:
+    arguments = {"terrain_pool": 2, "difficulty": 0.3}
+    envs = VectorPerceiveTerrain(gym.make_vec("nfc_gym/JackalRough-v0", num_envs=2, max_episode_steps=4, **arguments))
+    observation, _ = envs.reset(seed=3)
+    assert observation["elevation"].shape == (2, 128, 128)
+    assert observation in envs.observation_space
+    for _ in range(6):
+        observation, *_ = envs.step(np.zeros((2, 2)))
+    assert envs.valid.any((1, 2)).all()
+    assert (observation["elevation"][0] != observation["elevation"][1]).any()
+
+
+def test_each_row_holds_what_its_own_first_action_said() -> None:
+    rng = np.random.default_rng(0)
+    space = _vector().unwrapped.psi_space
+    psi = space.nominal * (1 + 0.05 * rng.standard_normal((100, len(space))))
+    delta = 0.01 * rng.standard_normal((100, NV))
+    envs = VectorHallucinate(VectorApplyEffects(_vector(), [LOAD]), Fidelity(psi, delta))
+    envs.reset(seed=0)
+    model = envs.unwrapped.model
+    base, mass = model.body("base").id, envs.unwrapped.batch.expand("body_mass")
+    size = envs.single_action_space.shape[0]
+    assert size == 2 + len(space) + NV
+    mean = envs.belief.at(np.zeros(size - 2), 1.0).psi
+    assert mean is not None
+    np.testing.assert_allclose(mass[:, base], mean[0] + 3.0)
+    actions = np.zeros((N, size), np.float32)
+    actions[:, 2] = [-1, 0, 1]
+    for k in range(2 * END + 2):
+        envs.step(actions)
+        if k % (END + 1) < END:
+            wanted = envs.belief.at(np.array([[h, *np.zeros(size - 3)] for h in (-1, 0, 1)]), 1.0)
+            assert wanted.psi is not None
+            np.testing.assert_allclose(mass[:, base], wanted.psi[:, 0] + 3.0)
+    single = Hallucinate(gym.make(ID, context=["psi"]), Fidelity(psi))
+    single.reset(seed=0)
+    single.step(actions[2, : 2 + len(space)])
+    assert single.unwrapped.model.body_mass[base] == pytest.approx(wanted.psi[2, 0], rel=1e-2)
+
+
+def test_hallucinated_ground_is_refused() -> None:
+    with pytest.raises(InputError, match="VectorResidualTerrain"):
+        VectorHallucinate(_vector(), Fidelity(delta_e=np.zeros((3, 256, 256))))
+
+
+ALL = [
+    (RandomizePsi, VectorRandomizePsi, ({},)),
+    (ResidualDynamics, VectorResidualDynamics, (BIAS,)),
+    (ResidualTerrain, VectorResidualTerrain, (np.zeros((256, 256)),)),
+    (Hallucinate, VectorHallucinate, (Fidelity(delta_s=np.zeros((2, NV))),)),
+    (ApplyEffects, VectorApplyEffects, ([],)),
+    (PerceiveTerrain, VectorPerceiveTerrain, ()),
+    (PerturbSignals, VectorPerturbSignals, ({},)),
+    (MonitorAnomaly, VectorMonitorAnomaly, (object(), 1.0)),
+    (RecordLog, VectorRecordLog, ("logs",)),
+]
+
+
+@pytest.mark.parametrize(("single", "vector", "arguments"), ALL)
+def test_each_refuses_the_others_environments(single: Any, vector: Any, arguments: tuple[Any, ...]) -> None:
+    assert vector.__name__ == f"Vector{single.__name__}"
+    with pytest.raises(InputError, match=f"Vector{single.__name__}"):
+        single(gym.make_vec("Ant-v5", 1), *arguments)
+    with pytest.raises(InputError, match=f"use {single.__name__}"):
+        vector(gym.make("Ant-v5"), *arguments)
+
+
+@pytest.mark.parametrize("vector", [VectorRandomizePsi, VectorResidualDynamics, VectorApplyEffects, VectorRecordLog])
+def test_vector_environments_of_others_are_refused(vector: Any, tmp_path) -> None:
+    arguments = {VectorRandomizePsi: 0.5, VectorResidualDynamics: np.zeros(14), VectorApplyEffects: []}
+    with pytest.raises(InputError, match=r"mujoco\.batch.*SyncVectorEnv.*wrappers="):
+        vector(gym.make_vec("Ant-v5", 1), arguments.get(vector, tmp_path))
