@@ -167,7 +167,7 @@ class RobotVectorEnv(VectorEnv):
     @property
     def mjcf(self) -> str:
         """The nominal model on the first map, as MJCF that plain MuJoCo loads."""
-        return self.robot.mjcf(self._sims.maps[0] if self.rough else None)
+        return self.robot.mjcf(self.maps[0] if self.rough else None)
 
     def set_terrains(self, maps: Sequence[Any], perceived: Sequence[Any] | None = None) -> None:
         """Other maps for the simulations to choose from; the batch is built anew, and must be reset before a step.

@@ -17,7 +17,7 @@ class BatchSimulation(Simulation):
     """The simulations of a vector environment on `mujoco.batch` with hooks at physics steps and resets.
 
     Attributes:
-      on_reset: called with the ids (k,) of the simulations about to begin an episode; may return reset options for them.
+      on_reset: called with the ids (k,) of the simulations about to begin an episode; may return their reset options.
     """
 
     def __init__(self, env: Any) -> None:

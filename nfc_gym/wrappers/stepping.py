@@ -13,7 +13,7 @@ class Stepped:
         self.owner, self.name, self.simulation = owner, name, simulation
         self.original = getattr(owner, name)
         # A subclass may do more in its own version: that is then called once a physics step.
-        self.plain = getattr(type(owner), name).__module__ == "gymnasium.envs.mujoco.mujoco_env"
+        self.plain = getattr(self.original, "__module__", "") == "gymnasium.envs.mujoco.mujoco_env"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return getattr, (self.owner, self.name)

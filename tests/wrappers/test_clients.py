@@ -57,7 +57,7 @@ def test_gymnasiums_own_checker_is_content(name: str, tmp_path) -> None:
     observation, info = env.reset(seed=0)
     assert observation in env.observation_space
     for _ in range(5):
-        observation, reward, ended, truncated, after = env.step(env.action_space.sample())
+        observation, reward, ended, _, after = env.step(env.action_space.sample())
         assert observation in env.observation_space
         assert isinstance(reward, float)
         assert isinstance(ended, bool)
