@@ -65,7 +65,7 @@ class Simulations:
 
     def terrains(self, maps: Sequence[Heightfield]) -> list[Heightfield]:
         """Of `maps` or `perceived`, each simulation's own."""
-        return [maps[k] for k in self.chosen] if maps else [FLAT] * self.n
+        return [maps[int(k)] for k in self.chosen] if maps else [FLAT] * self.n
 
     def begin(self, ids: Ids, given: Mapping[str, Any]) -> None:
         """Begin an episode in some simulations, (k,) ascending; `view.now` is left to the caller.

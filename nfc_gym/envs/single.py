@@ -221,13 +221,13 @@ class RobotEnv(gymnasium.Env):
 
     def _advance(self) -> None:
         try:
-            if not self.substep_hooks:
+            if self.substep_hooks:
+                for _ in range(self.frame_skip):
+                    for hook in self.substep_hooks:
+                        hook(self)
+                    mujoco.mj_step(self.model, self.data)
+            else:
                 mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
-                return
-            for _ in range(self.frame_skip):
-                for hook in self.substep_hooks:
-                    hook(self)
-                mujoco.mj_step(self.model, self.data)
             for hook in self.after_hooks:
                 hook(self)
         except mujoco.FatalError:  # the solver ran out of memory, as happens where bodies are driven into one another

@@ -226,7 +226,7 @@ class RobotVectorEnv(VectorEnv):
           ResetNeeded: an environment was not reset (after its episode, where autoreset is off).
         """
         actions = np.asarray(actions, np.float64)
-        if actions.shape != self._limit.shape or not np.isfinite(actions.sum()):
+        if actions.shape != self._limit.shape or not np.isfinite(actions).all():
             raise wrong_action(actions, self._limit.shape)
         resetting = self._waiting.copy() if self._waiting.any() else None
         if resetting is not None and (self._fresh or self.autoreset_mode is not AutoresetMode.NEXT_STEP):
@@ -270,7 +270,7 @@ class RobotVectorEnv(VectorEnv):
     def _begin(self, ids: Ids, given: Mapping[str, Any]) -> None:
         """Begin episodes with options of leading shape (k,), and what the hooks add to them."""
         for hook in self.reset_hooks:
-            given = vector_options(hook(ids), self.rough) | given
+            given = {**vector_options(hook(ids), self.rough), **given}
         self._sims.begin(ids, given)
         self._view.now = self.robot.derive(self._view)
         self._steps[ids] = 0
@@ -287,6 +287,8 @@ class RobotVectorEnv(VectorEnv):
     def _advance(self, active: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         """Physics of one control step; returns which simulations came apart (and were put back to rest), None: none."""
         self._run(active)
+        for hook in self.after_hooks:
+            hook(self)
         unstable = broken(self._view)
         if active is not None:
             unstable &= active
@@ -304,8 +306,6 @@ class RobotVectorEnv(VectorEnv):
             for hook in self.substep_hooks:
                 hook(self)
             self._physics(active, 1)
-        for hook in self.after_hooks:
-            hook(self)
 
     def _physics(self, active: NDArray[np.bool_] | None, steps: int) -> None:
         try:

@@ -127,6 +127,11 @@ def test_hooks_act_before_every_physics_step() -> None:
     own.substep_hooks.append(lambda e: times.append(e.data.time))
     env.step(np.zeros(4))
     np.testing.assert_allclose(times, [0, 0.005, 0.01, 0.015], atol=1e-12)
+    own.substep_hooks.clear()
+    own.after_hooks.append(lambda e: times.append(e.data.time))
+    env.step(np.zeros(4))
+    assert times[4:] == pytest.approx([0.04]), "and after the last, with or without others"
+    own.after_hooks.clear()
 
     def lift(e: Any) -> None:
         e.data.xfrc_applied[1, 2] = 9.81 * e.model.body("base").subtreemass[0]

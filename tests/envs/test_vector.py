@@ -188,6 +188,10 @@ def test_substep_hooks_see_every_physics_step() -> None:
     for _ in range(3):
         same(envs.step(actions)[0], twin.step(actions)[0])
     np.testing.assert_allclose(times, 0.005 * np.arange(12), atol=1e-9)
+    envs.unwrapped.substep_hooks.clear()
+    envs.unwrapped.after_hooks.append(lambda env: times.append(float(env.batch.time[0])))
+    envs.step(actions)
+    assert times[12:] == pytest.approx([0.08])
 
 
 def test_terrains_are_replaced() -> None:
@@ -240,7 +244,7 @@ def test_bad_input() -> None:
         envs.step(actions)
     with pytest.raises(InputError, match=r"shape \(2, 2\), want \(3, 2\)"):
         envs.step(actions[:2])
-    assert envs.step(np.zeros((N, 2)))[3].all()
+    assert envs.step(np.full((N, 2), 1e308))[3].all(), "finite values of any size are clipped"
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"\[0, 1, 2\]"):
         envs.step(np.zeros((N, 2)))
 
