@@ -13,7 +13,7 @@ from nfc_gym.physics.effects.each import Each, split
 _NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
 _SHARED = 0.8  # the same for the same law at a wider place
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
-_PAIRED, _PAIRED_ROUGH = 5, 3  # mechanisms that are tried in pairs; where bodies touch a fit costs seconds
+_PAIRED = 3  # mechanisms that are tried in pairs
 _TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
 
@@ -140,7 +140,7 @@ class Contest:
         for j in (*judged, *entered):
             if len(j.fitted.plant.effects) > len(arena.current.plant.effects) and arena.plausible(j):
                 pool.setdefault(mechanism(arena.new(j)[0]), j)
-        best = list(pool.values())[: _PAIRED_ROUGH if self.rough else _PAIRED]
+        best = list(pool.values())[:_PAIRED]
         pairs = [
             arena.enter_both(a, b)
             for i, a in enumerate(best)
