@@ -22,5 +22,5 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write_whole(path: Path, text: str) -> None:
     """Write a text file so that it is either the old one or the whole new one, never half of it."""
-    with replacing(path) as part:
-        part.write_text(text, encoding="utf-8")
+    with replacing(path) as part, open(part, "w", encoding="utf-8") as handle:
+        handle.write(text)

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from nfc_gym.core import InputError
-from nfc_gym.measured import stages
+from nfc_gym.core import InputError, files
 from nfc_gym.measured.stages import OUTPUTS, Stages, digest, write_whole
 
 
@@ -54,7 +53,7 @@ def test_a_write_that_fails_changes_nothing(
 
     with monkeypatch.context() as patch:
         if fault == "write":
-            patch.setattr(stages, "open", lambda path, *_, **__: _Half(path), raising=False)
+            patch.setattr(files, "open", lambda path, *_, **__: _Half(path), raising=False)
         elif fault == "interrupt":
             patch.setattr(os, "replace", interrupt)
         else:
@@ -123,7 +122,7 @@ def test_a_stage_cut_short_is_not_one(tmp_path: Path, monkeypatch: pytest.Monkey
     run = Stages(out, "key", False, True)
     run.put("calibrated", [1])
     with monkeypatch.context() as patch:
-        patch.setattr(stages, "open", lambda path, *_, **__: _Half(path), raising=False)
+        patch.setattr(files, "open", lambda path, *_, **__: _Half(path), raising=False)
         with pytest.raises(OSError, match="No space left"):
             run.put("final", {"x": [1.0] * 100})
     again = Stages(out, "key", False, True)
