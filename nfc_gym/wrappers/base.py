@@ -14,11 +14,30 @@ from nfc_gym.wrappers.order import beneath, check_order, kind
 
 
 def _rebuild(cls: type, env: Any, kwargs: dict[str, Any]) -> Any:
+    """A pickled wrapper, which must be reset before it steps: what it drew for its episode is gone."""
+    for inner in beneath(env):
+        if isinstance(inner, gym.wrappers.OrderEnforcing):
+            inner._has_reset = False
     return cls(env, **kwargs)
+
+
+def finite(action: Any) -> Any:
+    """An action that a wrapper reads before the environment does.
+
+    Raises:
+      InputError: an entry is not finite; the message names it.
+    """
+    action = np.asarray(action)
+    if not np.isfinite(action).all():
+        at = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
+        raise InputError(f"action[{', '.join(map(str, at))}] is {action[at]}, want finite numbers")
+    return action
 
 
 class _Common(RecordConstructorArgs):
     """The wrapper's own stream of random numbers, and pickling through the constructor.
+
+    What a wrapper drew for the running episode is not pickled: `step` before the next `reset` raises `ResetNeeded`.
 
     The stream follows from the seed of `reset` and never draws from the environment's own generator, so that a wrapper
     which changes nothing leaves the environment's draws as they are.

@@ -22,7 +22,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.posterior import Sampler, load_source
 from nfc_gym.physics.residual import Components
-from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
+from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.belief import Belief
 from nfc_gym.wrappers.dynamics import Injection, Mode, checked_mode, component_names
@@ -159,7 +159,8 @@ class Hallucinate(_Hallucinating, EnvWrapper):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step in the world that the action asks for."""
-        held, h = self.belief.held, np.asarray(action[self.own :], float)
+        action = finite(action)
+        held, h = self.belief.held, action[self.own :].astype(float)
         if not self._chosen:
             self._h, self._chosen = h.copy(), True
             self._enter()
@@ -231,7 +232,8 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step in the worlds that the actions ask for."""
-        h = np.asarray(actions[:, self.own :], float)
+        actions = finite(actions)
+        h = actions[:, self.own :].astype(float)
         first = self.sim.beginning
         if first.any():
             self._held[first] = h[first, : self.belief.held]

@@ -42,20 +42,23 @@ class LogFolder:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.count = len(list(self.folder.glob("episode_*.parquet")))
         self.text = ""
+        self._heights: Array | None = None
 
     def describe(self) -> None:
-        """The model and the mapping, at the beginning of an episode: the ground may be another than before."""
-        text = model_text(self.env, self.sim.nominal, self.model_file)
-        if text == self.text:
+        """The model, at the beginning of an episode: the ground may be another than before."""
+        heights = _heights(self.env.unwrapped)
+        if self.text and _equal(heights, self._heights):  # writing a heightfield as text takes a tenth of a second
             return
+        text = model_text(self.env, self.sim.nominal, self.model_file)
         file = self.folder / "model.xml"
         if self.count and file.is_file() and file.read_text(encoding="utf-8") != text:
             raise InputError(
                 f"RecordLog: {self.folder} holds logs of another model, or of the same on other ground: record into "
                 'another folder, or hold the ground by reset(options={"terrain_id": ...})'
             )
-        write_whole(file, text)
-        self.text = text
+        if text != self.text:
+            write_whole(file, text)
+        self.text, self._heights = text, heights
 
     def write(self, record: dict[str, Array]) -> None:
         """One episode: `time` (T,), and qpos, qvel, ctrl, sensordata (T, ...); then the mapping."""
@@ -94,6 +97,16 @@ class LogFolder:
             "segments": {"length": float(max(0.4, _SAMPLES * interval))},
         }
         write_whole(self.folder / "mapping.yaml", yaml.safe_dump(mapping, sort_keys=False, allow_unicode=True))
+
+
+def _heights(base: Any) -> Array | None:
+    """What an environment's MJCF may change by from episode to episode: its ground, the first of a pool's."""
+    ground = base.maps[0] if getattr(base, "maps", ()) else getattr(base, "heightfield", None)
+    return getattr(ground, "heights", None)
+
+
+def _equal(a: Array | None, b: Array | None) -> bool:
+    return a is b or (a is not None and b is not None and np.array_equal(a, b))
 
 
 def _parameter(p: Any, nominal: float) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
+from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
 from nfc_gym.wrappers.rows import Rows
 
 ACTION, OBSERVATION = "action", "observation"
@@ -134,7 +134,7 @@ class _Perturbing:
 
     def _act(self, action: Any) -> Any:
         channel = self.channels.get(ACTION)
-        return action if channel is None or self.rng is None else channel(action, self.rng)
+        return action if channel is None or self.rng is None else channel(finite(action), self.rng)
 
     def _begin(self, first: NDArray[np.bool_] | None) -> None:
         for channel in self.channels.values():

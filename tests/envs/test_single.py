@@ -6,7 +6,6 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from gymnasium.wrappers import RecordVideo
 
 from nfc_gym import InputError, terrain
 from nfc_gym.envs import render, terrains
@@ -216,16 +215,6 @@ def test_pictures_of_a_vector_environment(pictured: gymnasium.Env) -> None:
     assert (np.abs(first.astype(int) - second) > 8).mean() > 0.05
     single.close()
     envs.close()
-
-
-def test_videos_are_recorded(pictured: gymnasium.Env, tmp_path: Any) -> None:
-    pytest.importorskip("moviepy")
-    env = RecordVideo(pictured, str(tmp_path), disable_logger=True)
-    env.reset(seed=0)
-    for _ in range(3):
-        env.step(np.zeros(2))
-    env.close()
-    assert list(tmp_path.glob("*.mp4"))
 
 
 def test_the_window_is_sent_changed_heights(monkeypatch: pytest.MonkeyPatch) -> None:
