@@ -27,6 +27,21 @@ def root(x: Any) -> Any:
     return sqrt(x) if isinstance(x, float) else np.sqrt(x)
 
 
+def some(flags: Any) -> Any:
+    """Whether a flag, or any of an array of them, is set."""
+    return flags if isinstance(flags, bool) else np.count_nonzero(flags)
+
+
+def at_most(x: Any, bound: float) -> Any:
+    """A float or array, or the bound where that is smaller."""
+    return min(x, bound) if isinstance(x, float) else np.minimum(x, bound)
+
+
+def at_least(x: Any, bound: float) -> Any:
+    """A float or array, or the bound where that is larger."""
+    return max(x, bound) if isinstance(x, float) else np.maximum(x, bound)
+
+
 class Axes(NamedTuple):
     """Rows of the rotation matrix that takes the robot's frame to the world: world x, y, z of forward, left and up."""
 
@@ -60,10 +75,15 @@ def axes(quat: Array) -> Axes:
     )
 
 
+def in_robot(r: Axes, vector: Array) -> tuple[Array, Array, Array]:
+    """Components (...) along the robot's axes of world vectors (..., 3)."""
+    x, y, z = components(vector)
+    return r.xx * x + r.yx * y + r.zx * z, r.xy * x + r.yy * y + r.zy * z, r.xz * x + r.yz * y + r.zz * z
+
+
 def to_robot(r: Axes, vector: Array) -> Array:
     """World vectors (..., 3) in the robot's frame, (..., 3)."""
-    x, y, z = components(vector)
-    return np.array((r.xx * x + r.yx * y + r.zx * z, r.xy * x + r.yy * y + r.zy * z, r.xz * x + r.yz * y + r.zz * z)).T
+    return np.array(in_robot(r, vector)).T
 
 
 def to_world(r: Axes, vector: Array) -> Array:
