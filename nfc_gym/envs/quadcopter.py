@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from nfc_gym.envs.components import base, joints, observed
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, at_least, at_most, axes, components, root, turned
+from nfc_gym.envs.rotations import Axes, at_least, at_most, axes, turned
 from nfc_gym.envs.view import View
+from nfc_gym.physics.state import components, root
 
 REACH = 0.35  # m, from the chassis' centre to a propeller's tip, with room
 NEAREST, FARTHEST = 3.0, 8.0  # m to a goal over ground: within the map of 25.5 m

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from nfc_gym.envs.components import base, joints, observed
 from nfc_gym.envs.robot import Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, components, some, to_robot
+from nfc_gym.envs.rotations import Axes, axes, some, to_robot
 from nfc_gym.envs.spawn import place, spread, underside
 from nfc_gym.envs.view import View
+from nfc_gym.physics.state import components
 
 SCALE = 0.25  # rad off the default pose at full action
 NOISE = 0.05  # rad by which joints start off their pose

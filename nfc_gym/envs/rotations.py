@@ -4,27 +4,14 @@ Written out in multiplications and additions, without matrix products: those rou
 many, and one robot must give the same bits as a row of a batch.
 """
 
-from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.physics.state import components
+
 Array = NDArray[np.float64]
-
-
-def components(array: Array) -> Any:
-    """Components (...) of an array (..., k), to be unpacked: floats for one robot, as their arithmetic is fastest.
-
-    Float and array arithmetic round alike, so that one robot and a row of many agree to the bit. Beware that floats
-    raise where arrays give infinity (division by zero), and that `x ** 2` rounds differently for the two: `x * x`.
-    """
-    return array.tolist() if array.ndim == 1 else array.T
-
-
-def root(x: Any) -> Any:
-    """Square root of a float or of arrays: rounded correctly by both libraries, so the same to the bit."""
-    return sqrt(x) if isinstance(x, float) else np.sqrt(x)
 
 
 def some(flags: Any) -> Any:

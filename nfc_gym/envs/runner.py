@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, at_most, axes, components, in_robot, root, some
+from nfc_gym.envs.rotations import Axes, at_most, axes, in_robot, some
 from nfc_gym.envs.spawn import place, spread, underside
 from nfc_gym.envs.view import View
+from nfc_gym.physics.state import components, root
 
 RING = 9.0  # m; the map ends 12.75 m from its middle
 REACHED = 1.0  # m
