@@ -23,12 +23,17 @@ def components(array: Array) -> Any:
     """
     if array.ndim == 1:
         return array.tolist()
-    return array.T if array.ndim == 2 else np.moveaxis(array, -1, 0)
+    return [array[..., i] for i in range(array.shape[-1])]
 
 
 def joined(parts: Sequence[Any]) -> Array:
     """Vectors (..., k) of k components (...)."""
-    return np.array(parts) if isinstance(parts[0], float) else np.stack(parts, -1)
+    if isinstance(parts[0], float):
+        return np.array(parts)
+    out = np.empty((*parts[0].shape, len(parts)))
+    for i, part in enumerate(parts):
+        out[..., i] = part
+    return out
 
 
 def root(x: Any) -> Any:
