@@ -92,10 +92,12 @@ class Observer:
         return obs
 
 
-def broken(view: View) -> NDArray[np.bool_]:
+def broken(view: View) -> Any:
     """(*B,) whether a simulation has come apart: NaN or an absurd speed."""
     speed = view.qvel
-    return np.logical_not((speed @ speed if speed.ndim == 1 else np.vecdot(speed, speed)) < FASTEST * FASTEST)
+    if speed.ndim == 1:
+        return not speed.dot(speed) < FASTEST * FASTEST
+    return np.logical_not(np.vecdot(speed, speed) < FASTEST * FASTEST)
 
 
 def outcome(

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from nfc_gym.envs.components import base, observed
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, components, root, to_robot, turned
+from nfc_gym.envs.rotations import Axes, axes, to_robot, turned
 from nfc_gym.envs.view import View
+from nfc_gym.physics.state import components, root
 
 # Public dimensions of the machine, as in its MJCF.
 RADIUS = 0.098  # m, a wheel's

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from nfc_gym.envs.components import base, joints, observed
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, components, root, turned
+from nfc_gym.envs.rotations import Axes, at_least, at_most, axes, turned
 from nfc_gym.envs.view import View
+from nfc_gym.physics.state import components, root
 
 REACH = 0.35  # m, from the chassis' centre to a propeller's tip, with room
 NEAREST, FARTHEST = 3.0, 8.0  # m to a goal over ground: within the map of 25.5 m
@@ -18,7 +19,7 @@ LOW, HIGH = 1.0, 2.5  # m above the ground of starts and goals: below the talles
 ABOVE = 0.6  # m that a goal lies above what stands there: a rotor's reach and as much again
 START = 0.5  # m, half the side of the square that episodes start in: 1 m around the middle is free
 STRAY = 8.0  # m from the straight way between start and goal: lost
-TILTED = np.cos(2.5)  # z of the up axis at 2.5 rad, upside down
+TILTED = float(np.cos(2.5))  # z of the up axis at 2.5 rad, upside down
 
 LOOP = 3.0  # m, half the length of the figure of eight
 LAP = 10.0  # s for one round: 1.8 m/s on average
@@ -52,7 +53,8 @@ class Quadcopter(Robot):
     def __init__(self, model: mujoco.MjModel, task: str) -> None:
         super().__init__(model, task)
         self._half = model.actuator_ctrlrange[:, 1] / 2  # N
-        self._touch = int(model.sensor("collision").adr[0])
+        touch = int(model.sensor("collision").adr[0])
+        self._touch = slice(touch, touch + 1)
 
     def begin(self, u: Array, ground: Ground) -> Start:
         """Hovering near the middle, any heading; the goal is above whatever stands there."""
@@ -111,15 +113,16 @@ class Quadcopter(Robot):
     def terminated(self, view: View) -> NDArray[np.bool_]:
         """Collided, overturned, or too far off the way."""
         now = view.now
+        (force,) = components(view.sensordata[..., self._touch])
         lost = self._off_the_way(view) > STRAY if self.task == "goal" else now.distance > STRAY
-        return (view.sensordata[..., self._touch] > 0) | (now.frame.zz < TILTED) | lost
+        return (force > 0) | (now.frame.zz < TILTED) | lost
 
     def _off_the_way(self, view: View) -> Array:
         """Distance (*B,) from the straight line between start and goal [m]."""
         ax, ay, az = components(view.now.goal - view.task["start"])
         dx, dy, dz = components(view.now.offset)
         share = (ax * dx + ay * dy + az * dz) / (ax * ax + ay * ay + az * az)
-        share = np.minimum(np.maximum(share, 0.0), 1.0)  # of the way that is left
+        share = at_most(at_least(share, 0.0), 1.0)  # of the way that is left
         ex, ey, ez = dx - share * ax, dy - share * ay, dz - share * az
         return root(ex * ex + ey * ey + ez * ez)
 

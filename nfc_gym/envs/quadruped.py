@@ -1,6 +1,6 @@
 """Quadruped: twelve joints under position control; it walks at a commanded velocity."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -8,14 +8,15 @@ from numpy.typing import NDArray
 
 from nfc_gym.envs.components import base, joints, observed
 from nfc_gym.envs.robot import Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, components, to_robot
+from nfc_gym.envs.rotations import Axes, axes, some, to_robot
 from nfc_gym.envs.spawn import place, spread, underside
 from nfc_gym.envs.view import View
+from nfc_gym.physics.state import components
 
 SCALE = 0.25  # rad off the default pose at full action
 NOISE = 0.05  # rad by which joints start off their pose
 MIDDLE = 0.3  # m, half the side of the square that episodes start in
-TILTED = np.cos(1.0)  # of the angle to the vertical at which an episode ends
+TILTED = float(np.cos(1.0))  # of the angle to the vertical at which an episode ends
 TOUCHED = 1.0  # N on trunk or thigh that count as touching the ground, or on a foot as standing on it
 FALLEN = -5.5  # m: below the lowest point that a map can have, so off its edge
 EDGE = (
@@ -91,10 +92,10 @@ class Quadruped(Robot):
     def advance(self, view: View, action: Array) -> dict[str, NDArray]:
         """The last action and how much it changed; a command that leads off the map is turned round."""
         change = action - view.task["action"]
-        task = {"action": action, "rate": np.add.reduce(change * change, -1)}
+        task = {"action": action, "rate": np.vecdot(change, change)}
         x, y = components(view.qpos[..., :2])
         far = (x * x > EDGE * EDGE) | (y * y > EDGE * EDGE)
-        if np.count_nonzero(far):
+        if some(far):
             frame = view.now.frame
             forward, sideways, turning = components(view.task["command"])
             vx, vy = frame.xx * forward + frame.xy * sideways, frame.yx * forward + frame.yy * sideways
@@ -113,23 +114,24 @@ class Quadruped(Robot):
         wx, wy, wz = components(view.qvel[..., 3:6])
         forward, sideways, turning = components(view.task["command"])
         sensors, torque = view.sensordata, view.field("actuator_force")
-        along, across = sensors[..., self.along], sensors[..., self.across]
-        slip = (sensors[..., self.feet] > TOUCHED) * (along * along + across * across)
+        feet = (components(sensors[..., part]) for part in (self.feet, self.along, self.across))
+        slip: Any = sum((force > TOUCHED) * (vx * vx + vy * vy) for force, vx, vy in zip(*feet, strict=True))
         dx, dy, dz = vx - forward, vy - sideways, wz - turning
         return {
             "linear": LINEAR * np.exp(-(dx * dx + dy * dy) / WIDTH),
             "yaw": YAW * np.exp(-dz * dz / WIDTH),
             "vertical": -VERTICAL * vz * vz,
             "rolling": -ROLLING * (wx * wx + wy * wy),
-            "torque": -TORQUE * np.add.reduce(torque * torque, -1),
+            "torque": -TORQUE * np.vecdot(torque, torque),
             "rate": -RATE * view.task["rate"],
-            "slip": -SLIP * np.add.reduce(slip, -1),
+            "slip": -SLIP * slip,
         }
 
     def terminated(self, view: View) -> NDArray[np.bool_]:
         """Trunk or a thigh touches the ground, the trunk leans too far, or the robot has fallen off the map."""
-        touched = np.maximum.reduce(view.sensordata[..., self.hull], -1) > TOUCHED
-        return touched | (view.now.frame.zz < TILTED) | (view.qpos[..., 2] < FALLEN)
+        (z,) = components(view.qpos[..., 2:3])
+        touching = sum(force > TOUCHED for force in components(view.sensordata[..., self.hull]))
+        return (touching > 0) | (view.now.frame.zz < TILTED) | (z < FALLEN)
 
     def components(self, model: mujoco.MjModel) -> list[str]:
         """See `Robot`."""

@@ -17,7 +17,7 @@ from nfc_gym.physics.parameters import Parameter, ParameterSpace, parameters_fro
 from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
-Ground = Callable[[NDArray], Array]
+Ground = Callable[[NDArray], Any]  # see `View.ground`
 
 FRAME_SKIP = 4  # physics steps a control step
 DT = scene.TIMESTEP * FRAME_SKIP  # s: control 50 Hz

@@ -4,27 +4,29 @@ Written out in multiplications and additions, without matrix products: those rou
 many, and one robot must give the same bits as a row of a batch.
 """
 
-from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.physics.state import components
+
 Array = NDArray[np.float64]
 
 
-def components(array: Array) -> Any:
-    """Components (...) of an array (..., k), to be unpacked: floats for one robot, as their arithmetic is fastest.
-
-    Float and array arithmetic round alike, so that one robot and a row of many agree to the bit. Beware that floats
-    raise where arrays give infinity (division by zero), and that `x ** 2` rounds differently for the two: `x * x`.
-    """
-    return array.tolist() if array.ndim == 1 else array.T
+def some(flags: Any) -> Any:
+    """Whether a flag, or any of an array of them, is set."""
+    return flags if isinstance(flags, bool) else np.count_nonzero(flags)
 
 
-def root(x: Any) -> Any:
-    """Square root of a float or of arrays: rounded correctly by both libraries, so the same to the bit."""
-    return sqrt(x) if isinstance(x, float) else np.sqrt(x)
+def at_most(x: Any, bound: float) -> Any:
+    """A float or array, or the bound where that is smaller."""
+    return min(x, bound) if isinstance(x, float) else np.minimum(x, bound)
+
+
+def at_least(x: Any, bound: float) -> Any:
+    """A float or array, or the bound where that is larger."""
+    return max(x, bound) if isinstance(x, float) else np.maximum(x, bound)
 
 
 class Axes(NamedTuple):
@@ -60,10 +62,15 @@ def axes(quat: Array) -> Axes:
     )
 
 
+def in_robot(r: Axes, vector: Array) -> tuple[Array, Array, Array]:
+    """Components (...) along the robot's axes of world vectors (..., 3)."""
+    x, y, z = components(vector)
+    return r.xx * x + r.yx * y + r.zx * z, r.xy * x + r.yy * y + r.zy * z, r.xz * x + r.yz * y + r.zz * z
+
+
 def to_robot(r: Axes, vector: Array) -> Array:
     """World vectors (..., 3) in the robot's frame, (..., 3)."""
-    x, y, z = components(vector)
-    return np.array((r.xx * x + r.yx * y + r.zx * z, r.xy * x + r.yy * y + r.zy * z, r.xz * x + r.yz * y + r.zz * z)).T
+    return np.array(in_robot(r, vector)).T
 
 
 def to_world(r: Axes, vector: Array) -> Array:

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
-from nfc_gym.envs.rotations import Axes, axes, components, root, to_robot
+from nfc_gym.envs.rotations import Axes, at_most, axes, in_robot, some
 from nfc_gym.envs.spawn import place, spread, underside
 from nfc_gym.envs.view import View
+from nfc_gym.physics.state import components, root
 
 RING = 9.0  # m; the map ends 12.75 m from its middle
 REACHED = 1.0  # m
@@ -70,11 +71,12 @@ class Runner(Robot):
 
     def __init__(self, model: mujoco.MjModel, task: str) -> None:
         super().__init__(model, task)
-        self.gear = model.actuator_gear[:, 0].copy()  # N m at full action
+        self.gear = np.abs(model.actuator_gear[:, 0])  # N m at full action
         self.low, self.high = model.jnt_range[1:].T.copy()
         # |stretch q - middle| runs from 0 in the middle of a joint's range to 1 / (1 - NEAR_LIMIT) at its limits.
         self.stretch = 2 / (self.high - self.low) / (1 - NEAR_LIMIT)
         self.middle = self.stretch * (self.low + self.high) / 2
+        self.free = np.full(len(self.low), NEAR_LIMIT / (1 - NEAR_LIMIT))
         self.below = underside(model, self.home)
         # A joint off by `noise` lowers a foot by no more than this: no leg is longer than the robot is high or wide.
         self.gap = 0.01 + self.noise * float(np.abs(self.below).max())
@@ -100,7 +102,7 @@ class Runner(Robot):
         (x, y), (tx, ty) = components(view.qpos[..., :2]), components(view.task["target"])
         dx, dy = tx - x, ty - y
         reached = dx * dx + dy * dy < REACHED**2
-        if not np.count_nonzero(reached):
+        if not some(reached):
             return {"action": action}
         cos, sin = np.cos(ONWARD), np.sin(ONWARD)
         target = np.where(reached, (cos * tx - sin * ty, sin * tx + cos * ty), (tx, ty)).T
@@ -115,6 +117,8 @@ class Runner(Robot):
         scale = 1 / (root(dx * dx + dy * dy) + 1e-9)  # never a division by zero
         ux, uy = dx * scale, dy * scale
         facing = frame.xx * ux + frame.yx * uy
+        opposite = np.array((frame.yx, frame.zy, frame.xx * uy - frame.yx * ux))
+        yaw, roll, angle = components(np.arctan2(opposite, np.array((frame.xx, frame.zz, facing))).T)
         return Now(
             frame,
             x + 0.0,  # a copy: the state is live
@@ -122,9 +126,9 @@ class Runner(Robot):
             z - view.ground(view.qpos[..., :2]),
             ux,
             uy,
-            np.arctan2(frame.yx, frame.xx),
-            np.arctan2(frame.zy, frame.zz),
-            np.arctan2(frame.xx * uy - frame.yx * ux, facing),
+            yaw,
+            roll,
+            angle,
             facing,
         )
 
@@ -132,18 +136,16 @@ class Runner(Robot):
         """See `Weights`; progress is measured over the control step, along the direction to the target at its start."""
         w, now, was = self.weights, view.now, view.before
         moved = (now.x - was.x) * was.towards_x + (now.y - was.y) * was.towards_y
-        power = np.abs(self.gear * view.ctrl * view.qvel[..., 6:])
         reach = np.abs(self.stretch * view.qpos[..., 7:] - self.middle)
-        near = np.maximum(reach - NEAR_LIMIT / (1 - NEAR_LIMIT), 0)
-        squared, power, near = np.add.reduce(np.array((action * action, power, near)), -1)
+        near = np.maximum(reach, self.free) - self.free
         return {
             "progress": w.progress / DT * moved,
             "alive": w.alive + 0 * moved,
             "upright": w.upright * now.frame.zz,
-            "heading": w.heading * np.minimum(now.facing / FACING, 1),
-            "action": -w.action * squared,
-            "energy": -w.energy * power,
-            "limits": -w.limits * near,
+            "heading": w.heading * at_most(now.facing / FACING, 1.0),
+            "action": -w.action * np.vecdot(action, action),
+            "energy": -w.energy * np.vecdot(self.gear, np.abs(view.ctrl * view.qvel[..., 6:])),
+            "limits": -w.limits * np.add.reduce(near, -1),
         }
 
     def terminated(self, view: View) -> NDArray[np.bool_]:
@@ -157,6 +159,6 @@ class Runner(Robot):
         up on the vertical and of forward on the target's direction.
         """
         now = view.now
-        velocity = components(to_robot(now.frame, view.qvel[..., :3]))
+        velocity = in_robot(now.frame, view.qvel[..., :3])
         rates = components(view.qvel[..., 3:6])
         return np.array((now.height, *velocity, *rates, now.yaw, now.roll, now.angle, now.frame.zz, now.facing)).T

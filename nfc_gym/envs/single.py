@@ -32,7 +32,7 @@ from nfc_gym.envs.view import View
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.terrain import Heightfield, surface
 
-_FLAG = (bool, np.bool_)
+_FLAGS = (bool, np.bool_)
 
 
 class RobotEnv(gymnasium.Env):
@@ -173,8 +173,8 @@ class RobotEnv(gymnasium.Env):
             raise wrong_action(action, self._shape)
         if max(values) > 1 or min(values) < -1:
             action = np.clip(action, -1, 1)
-        view, data = self._view, self.data
-        data.ctrl[:] = self.robot.actuate(action, view)
+        view = self._view
+        view.ctrl[...] = self.robot.actuate(action, view)
         self._advance()
         unstable = broken(view)
         if unstable:
@@ -195,7 +195,9 @@ class RobotEnv(gymnasium.Env):
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 
-    def _ground(self, xy: NDArray) -> NDArray[np.float64]:
+    def _ground(self, xy: NDArray) -> NDArray[np.float64] | float:
+        if xy.ndim == 1:
+            return self._terrain.height_at(*xy.tolist()) if self.rough else 0.0
         if not self.rough:
             return np.zeros(xy.shape[:-1])
         return surface(self._terrain.heights, xy, self._terrain.resolution, self._terrain.origin)[0]
@@ -283,7 +285,7 @@ class RobotEnv(gymnasium.Env):
 
 def _leaves(info: dict[str, Any]) -> dict[str, NDArray | np.float64]:
     """Numpy leaves: float64 scalars, and flags as arrays of shape (), as Gymnasium's vectors want them."""
-    return {k: np.asarray(v) if isinstance(v, _FLAG) else np.float64(v) for k, v in info.items()}
+    return {k: np.asarray(v) if v.__class__ in _FLAGS else np.float64(v) for k, v in info.items()}
 
 
 def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotEnv:

@@ -27,7 +27,7 @@ class View:
       task: the episode's memory (goal, clock, last action, ...), name -> (*B, ...). Never write into these arrays.
       now: what `Robot.derive` computed of the present state.
       before: the same, one control step earlier.
-      ground: world points (*B, ..., 2) -> height of the terrain there, (*B, ...) m.
+      ground: world points (*B, ..., 2) -> height of the terrain there, (*B, ...) m; a float for a single point.
     """
 
     qpos: Array
@@ -40,7 +40,7 @@ class View:
         model: mujoco.MjModel,
         fetch: Callable[[str], NDArray],
         reads: Sequence[str],
-        ground: Callable[[NDArray], Array],
+        ground: Callable[[NDArray], Array | float],
     ) -> None:
         self.model = model
         self.ground = ground

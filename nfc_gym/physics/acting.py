@@ -64,7 +64,8 @@ class Acting:
         self.derived: set[str] = set()
         self.fresh: NDArray[np.bool_] | None = None
         self.shown: tuple[Context, Forces] | None = None
-        self.base_friction = self.fields["dof_frictionloss"].copy() if self.rubbing else np.zeros(0)
+        self.loss = self.fields["dof_frictionloss"] if self.rubbing else np.zeros(0)
+        self.base_friction = self.loss.copy()
 
     def restart(self, rows: NDArray[np.bool_] | None = None) -> None:
         """Episodes begin, of all simulations or of the `rows` (n,): hidden states are settled by the next command.
@@ -77,7 +78,7 @@ class Acting:
             rows = None
         self.fresh, self.shown = rows, None
         if self.rubbing:
-            loss = self.fields["dof_frictionloss"]
+            self.loss = loss = self.fields["dof_frictionloss"]
             self.base_friction = loss.copy() if rows is None else np.where(rows[:, None], loss, self.base_friction)
 
     def command(self, ctrl: Array, exogenous: Mapping[str, Array]) -> Array:
@@ -101,11 +102,10 @@ class Acting:
             self.engine.forward(np.flatnonzero(fresh))
         ctx, out = self._show(ctrl, exogenous)
         if self.rubbing:
-            loss = self.fields["dof_frictionloss"]
-            loss[...] = self.base_friction
+            self.loss[...] = self.base_friction
             for i in self.rubbing:
                 dofs, level = self.effects[i].friction(ctx, self.thetas[i])
-                loss[..., dofs] += level
+                self.loss[..., dofs] += level
         for i in self.pushing:
             self.effects[i].force(ctx, self.thetas[i], out)
 

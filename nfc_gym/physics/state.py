@@ -4,11 +4,41 @@ A configuration holds unit quaternions (free and ball joints), whose differences
 vector in the body's own frame, as `mj_differentiatePos` and `mj_integratePos` have it.
 """
 
+from collections.abc import Sequence
+from math import sqrt
+from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+def components(array: Array) -> Any:
+    """Components (...) of vectors (..., k), to be unpacked: floats for one vector, as their arithmetic is fastest.
+
+    Float and array arithmetic round alike, so that one vector and a row of many agree to the bit. Beware that floats
+    raise where arrays give infinity (division by zero), and that `x ** 2` rounds differently for the two: `x * x`.
+    """
+    if array.ndim == 1:
+        return array.tolist()
+    return [array[..., i] for i in range(array.shape[-1])]
+
+
+def joined(parts: Sequence[Any]) -> Array:
+    """Vectors (..., k) of k components (...)."""
+    if isinstance(parts[0], float):
+        return np.array(parts)
+    out = np.empty((*parts[0].shape, len(parts)))
+    for i, part in enumerate(parts):
+        out[..., i] = part
+    return out
+
+
+def root(x: Any) -> Any:
+    """Square root of a float or of arrays: rounded correctly by both libraries, so the same to the bit."""
+    return sqrt(x) if isinstance(x, float) else np.sqrt(x)
 
 
 def quat_multiply(a: Array, b: Array) -> Array:
@@ -51,27 +81,42 @@ def quat_difference(a: Array, b: Array) -> Array:
     return quat_to_vector(quat_multiply(quat_conjugate(a), b))
 
 
+def cross_parts(a: Sequence[Any], b: Sequence[Any]) -> tuple[Any, Any, Any]:
+    """Cross product of vectors, by components (...)."""
+    x, y, z = a
+    u, v, w = b
+    return y * w - z * v, z * u - x * w, x * v - y * u
+
+
+def rotate_parts(q: Sequence[Any], v: Sequence[Any]) -> tuple[Any, Any, Any]:
+    """Vectors rotated by unit quaternions, by components (...)."""
+    w, *axis = q
+    x, y, z = v
+    a, b, c = cross_parts(axis, v)
+    a, b, c = 2 * a, 2 * b, 2 * c
+    d, e, f = cross_parts(axis, (a, b, c))
+    return x + w * a + d, y + w * b + e, z + w * c + f
+
+
+def rotate_back_parts(q: Sequence[Any], v: Sequence[Any]) -> tuple[Any, Any, Any]:
+    """Vectors rotated by the inverse of unit quaternions, by components (...): world to body."""
+    w, x, y, z = q
+    return rotate_parts((w, -x, -y, -z), v)
+
+
 def cross(a: Array, b: Array) -> Array:
-    """Cross product of vectors (..., 3); `np.cross` gives the same bits, on small arrays in five times the time."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    x, y, z = a[..., 0], a[..., 1], a[..., 2]
-    u, v, w = b[..., 0], b[..., 1], b[..., 2]
-    out[..., 0] = y * w - z * v
-    out[..., 1] = z * u - x * w
-    out[..., 2] = x * v - y * u
-    return out
+    """Cross product of vectors (..., 3); `np.cross` gives the same bits, on small arrays in ten times the time."""
+    return joined(cross_parts(components(a), components(b)))
 
 
 def rotate(q: Array, v: Array) -> Array:
     """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
-    w, u = q[..., :1], q[..., 1:]
-    t = 2 * cross(u, v)
-    return v + w * t + cross(u, t)
+    return joined(rotate_parts(components(q), components(v)))
 
 
 def rotate_back(q: Array, v: Array) -> Array:
     """Vectors (..., 3) rotated by the inverse of unit quaternions (..., 4): world to body."""
-    return rotate(quat_conjugate(q), v)
+    return joined(rotate_back_parts(components(q), components(v)))
 
 
 def yaw(q: Array) -> Array:

@@ -6,29 +6,53 @@ MuJoCo's derived fields, which are one substep behind.
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
 
+from collections.abc import Sequence
+from typing import Any
+
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
 from nfc_gym.physics.effects.places import base_bodies, body_ids, sized
-from nfc_gym.physics.state import cross, rotate, rotate_back
+from nfc_gym.physics.state import components, cross_parts, joined, root, rotate_back_parts, rotate_parts
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 
-def body_motion(ctx: Context, body: int) -> tuple[Array, Array]:
-    """Orientation quaternion (..., 4) and velocity of the centre of mass in the world (..., 3), m/s."""
-    model = ctx.model
-    joint = int(model.body_jntadr[body])
-    if joint >= 0 and int(model.jnt_type[joint]) == _FREE:
-        q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        quat = ctx.q[..., q + 3 : q + 7]
-        arm = cross(ctx.v[..., v + 3 : v + 6], ctx.nominal("body_ipos")[..., body, :])
-        return quat, ctx.v[..., v : v + 3] + rotate(quat, arm)
-    spatial = ctx.data("cvel")[..., body, :]
-    arm = ctx.data("xipos")[..., body, :] - ctx.data("subtree_com")[..., int(model.body_rootid[body]), :]
-    return ctx.data("xquat")[..., body, :], spatial[..., 3:] + cross(spatial[..., :3], arm)
+class BodyMotion:
+    """How a body's centre of mass moves.
+
+    Args:
+      model: the nominal model.
+      body: id of the body.
+    """
+
+    def __init__(self, model: mujoco.MjModel, body: int) -> None:
+        self.body, self.root = body, int(model.body_rootid[body])
+        joint = int(model.body_jntadr[body])
+        self.free = joint >= 0 and int(model.jnt_type[joint]) == _FREE
+        if self.free:
+            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            self.turn, self.linear, self.angular = slice(q + 3, q + 7), slice(v, v + 3), slice(v + 3, v + 6)
+
+    def quat(self, ctx: Context) -> Sequence[Any]:
+        """Orientation quaternion, by components (...)."""
+        return components(ctx.q[..., self.turn] if self.free else ctx.data("xquat")[..., self.body, :])
+
+    def velocity(self, ctx: Context, quat: Sequence[Any]) -> tuple[Any, Any, Any]:
+        """Velocity in the world, m/s, by components (...); `quat` is the orientation's."""
+        if self.free:
+            arm = cross_parts(
+                components(ctx.v[..., self.angular]), components(ctx.nominal("body_ipos")[..., self.body, :])
+            )
+            x, y, z = components(ctx.v[..., self.linear])
+            a, b, c = rotate_parts(quat, arm)
+        else:
+            spatial = ctx.data("cvel")[..., self.body, :]
+            arm = ctx.data("xipos")[..., self.body, :] - ctx.data("subtree_com")[..., self.root, :]
+            x, y, z = components(spatial[..., 3:])
+            a, b, c = cross_parts(components(spatial[..., :3]), components(arm))
+        return x + a, y + b, z + c
 
 
 def translating(model: mujoco.MjModel) -> list[str]:
@@ -54,14 +78,7 @@ def body_scales(model: mujoco.MjModel, scales: Scales, body: int) -> tuple[float
     return max(force, 0.1 * weight, 1e-3), speed
 
 
-class _BodyForce(Effect):
-    """What forces on bodies share."""
-
-    def bind(self, model: mujoco.MjModel) -> None:
-        self.bodies: NDArray[np.intp] = body_ids(model, self.where)
-
-
-class DragLinear(_BodyForce):
+class DragLinear(Effect):
     """Drag proportional to speed along each of the body's axes: F = -(x vx, y vy, z vz), at the centre of mass."""
 
     family = "drag_linear"
@@ -69,13 +86,17 @@ class DragLinear(_BodyForce):
     PARAMS = tuple(Param(axis, "N s/m", 0.0, 1e3, probes=(0.1,)) for axis in "xyz")
     power = 1
 
+    def bind(self, model: mujoco.MjModel) -> None:
+        self.motions = [BodyMotion(model, int(b)) for b in body_ids(model, self.where)]
+
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
-        for b in self.bodies:
-            quat, velocity = body_motion(ctx, int(b))
-            along = rotate_back(quat, velocity)
-            if self.power == 2:
-                along = along * np.linalg.norm(along, axis=-1, keepdims=True)
-            out.xfrc[..., b, :3] += rotate(quat, -theta * along)
+        a, b, c = components(theta)
+        for motion in self.motions:
+            quat = motion.quat(ctx)
+            x, y, z = rotate_back_parts(quat, motion.velocity(ctx, quat))
+            scale = -root(x * x + y * y + z * z) if self.power == 2 else -1.0
+            push = out.xfrc[..., motion.body, :3]
+            push += joined(rotate_parts(quat, (scale * a * x, scale * b * y, scale * c * z)))
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:

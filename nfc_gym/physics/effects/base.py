@@ -22,6 +22,7 @@ from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.names import names as names_in
 
 Array = NDArray[np.float64]
+Rows = slice | NDArray[np.intp]  # what picks rows of an array, see `index`
 
 
 @dataclass(frozen=True)
@@ -196,8 +197,8 @@ class Effect(ABC):
         """Command (..., nu) -> what the actuators receive, and the new hidden state."""
         return ctrl, memory
 
-    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
-        """Dry friction to add: (dofs (n,), level (..., n) >= 0 in N or N m). MuJoCo's constraint solver applies it."""
+    def friction(self, ctx: Context, theta: Array) -> tuple[Rows, Array]:
+        """Dry friction to add: (n dofs, level (..., n) >= 0 in N or N m). MuJoCo's constraint solver applies it."""
         raise NotImplementedError
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:  # noqa: B027 (a hook: does nothing by design)
@@ -254,6 +255,19 @@ def joint_dofs(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
             raise InputError(f"the model has no joint named {name!r}; it has: {', '.join(scalar_joints(model))}")
         out.append(int(model.jnt_dofadr[joint]))
     return np.array(out, np.intp)
+
+
+def index(rows: NDArray[np.intp]) -> Rows:
+    """Rows (n,) as what picks them fastest: a slice where they are evenly spaced, of which numpy makes no copy."""
+    step = int(rows[1] - rows[0]) if len(rows) > 1 else 1
+    if step < 1 or (np.diff(rows) != step).any():
+        return rows
+    return slice(int(rows[0]), int(rows[-1]) + 1, step)
+
+
+def limited(x: Array, low: Array, high: Array) -> Array:
+    """`np.clip`, on small arrays in a third of the time."""
+    return np.minimum(np.maximum(x, low), high)
 
 
 def scalar_joints(model: mujoco.MjModel) -> list[str]:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names
+from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names, index, limited
 from nfc_gym.physics.effects.drive import actuator_places, command_unit, is_position, plain
 from nfc_gym.physics.effects.places import sized, with_units
 from nfc_gym.physics.fields import ModelFields
@@ -22,7 +22,7 @@ class _OnCommand(Effect):
     """What the laws share: some actuators' commands, each (..., n) in its own unit."""
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.rows = actuator_ids(model, self.where)
+        self.rows = index(actuator_ids(model, self.where))
 
     @staticmethod
     def _spread(model: mujoco.MjModel, scales: Scales, where: Sequence[str]) -> float:
@@ -89,7 +89,7 @@ class DeadZone(_OnCommand):
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
         out, width = np.array(ctrl), theta[..., :1]
-        out[..., self.rows] -= np.clip(out[..., self.rows], -width, width)
+        out[..., self.rows] -= limited(ctrl[..., self.rows], -width, width)
         return out, memory
 
     @classmethod
@@ -141,7 +141,7 @@ class Saturation(_OnCommand):
             return ctrl, memory
         out = np.array(ctrl)
         cut = theta[..., :1] * (self.range_high - self.range_low) / 2
-        out[..., self.rows] = np.clip(out[..., self.rows], self.range_low + cut, self.range_high - cut)
+        out[..., self.rows] = limited(ctrl[..., self.rows], self.range_low + cut, self.range_high - cut)
         return out, memory
 
     def model(self, fields: ModelFields, theta: Array) -> None:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, overrides
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Rows, overrides
 from nfc_gym.physics.fields import ModelFields
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ class Each(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         """Bind every member."""
+        self._dofs = np.arange(model.nv)
         for m in self.members:
             m.bind(model)
 
@@ -73,10 +74,10 @@ class Each(Effect):
             kept.append(new)
         return ctrl, kept
 
-    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
+    def friction(self, ctx: Context, theta: Array) -> tuple[Rows, Array]:
         """See `Effect`."""
         both = [m.friction(ctx, t) for m, t in zip(self.members, self._theta(theta), strict=True)]
-        return np.concatenate([d for d, _ in both]), np.concatenate([level for _, level in both], -1)
+        return np.concatenate([self._dofs[d] for d, _ in both]), np.concatenate([level for _, level in both], -1)
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         """See `Effect`."""

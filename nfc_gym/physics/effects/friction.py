@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales, joint_dofs
+from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Rows, Scales, index, joint_dofs
 from nfc_gym.physics.effects.places import angle_unit, force_unit, joint_places, joint_scales, sized, with_units
 from nfc_gym.physics.fields import ModelFields
 
@@ -37,6 +37,7 @@ class _JointFriction(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.dofs = joint_dofs(model, self.where)
+        self.at = index(self.dofs)
 
     def model(self, fields: ModelFields, theta: Array) -> None:
         sharpen(fields, self.dofs)
@@ -102,9 +103,10 @@ class Stribeck(_JointFriction):
         Param("speed", "rad/s", 1e-3, 1e2, probes=(0.1, 0.3, 1.0), shape=True),
     )
 
-    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
+    def friction(self, ctx: Context, theta: Array) -> tuple[Rows, Array]:
         level, rise, speed = theta[..., 0:1], theta[..., 1:2], theta[..., 2:3]
-        return self.dofs, level + rise * np.exp(-((ctx.v[..., self.dofs] / speed) ** 2))
+        share = ctx.v[..., self.at] / speed
+        return self.at, level + rise * np.exp(-share * share)
 
     @classmethod
     def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
@@ -132,11 +134,11 @@ class LoadFriction(_JointFriction):
         Param("square", "1/(N m)", 0.0, 1e3, probes=(0.05, 0.2)),
     )
 
-    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
-        torque = ctx.data("qfrc_actuator")[..., self.dofs]
+    def friction(self, ctx: Context, theta: Array) -> tuple[Rows, Array]:
+        torque = ctx.data("qfrc_actuator")[..., self.at]
         drive = theta[..., 1:2] * torque
-        load = theta[..., 2:3] * ctx.data("qfrc_bias")[..., self.dofs]
-        return self.dofs, theta[..., 0:1] + np.abs(drive + load) + theta[..., 3:4] * torque**2
+        load = theta[..., 2:3] * ctx.data("qfrc_bias")[..., self.at]
+        return self.at, theta[..., 0:1] + np.abs(drive + load) + theta[..., 3:4] * torque**2
 
     @classmethod
     def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
@@ -161,12 +163,12 @@ class DirectionalFriction(_JointFriction):
         Param("backward_viscous", "N m s/rad", 0.0, 1e5, probes=(0.01, 0.1)),
     )
 
-    def friction(self, ctx: Context, theta: Array) -> tuple[NDArray[np.intp], Array]:
-        v = ctx.v[..., self.dofs]
+    def friction(self, ctx: Context, theta: Array) -> tuple[Rows, Array]:
+        v = ctx.v[..., self.at]
         ahead, speed = (1 + np.tanh(v / _TURN)) / 2, np.abs(v)
         forward = theta[..., 0:1] + theta[..., 2:3] * speed
         backward = theta[..., 1:2] + theta[..., 3:4] * speed
-        return self.dofs, forward * ahead + backward * (1 - ahead)
+        return self.at, forward * ahead + backward * (1 - ahead)
 
     @classmethod
     def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:

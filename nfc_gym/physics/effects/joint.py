@@ -5,7 +5,7 @@
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, joint_dofs
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index, joint_dofs
 from nfc_gym.physics.effects.places import (
     angle_unit,
     force_unit,
@@ -22,7 +22,7 @@ class _OnJoint(Effect):
     """What the laws share: scalar joints resolved to dofs."""
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.dofs = joint_dofs(model, self.where)
+        self.dofs = index(joint_dofs(model, self.where))
 
 
 class DampingPoly(_OnJoint):
@@ -174,7 +174,7 @@ class Cogging(_OnJoint):
 
     def bind(self, model: mujoco.MjModel) -> None:
         super().bind(model)
-        self.coordinates = model.jnt_qposadr[model.dof_jntid[self.dofs]].astype(np.intp)
+        self.coordinates = index(model.jnt_qposadr[model.dof_jntid[self.dofs]].astype(np.intp))
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:

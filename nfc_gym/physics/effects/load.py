@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.air import body_motion, body_scales, translating
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, joint_dofs
+from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index, joint_dofs
 from nfc_gym.physics.effects.places import (
     body_ids,
     force_unit,
@@ -19,7 +19,7 @@ from nfc_gym.physics.effects.places import (
     with_units,
 )
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.physics.state import rotate, vector_to_quat
+from nfc_gym.physics.state import components, joined, rotate, vector_to_quat
 
 
 class ExternalForce(Effect):
@@ -40,13 +40,15 @@ class ExternalForce(Effect):
         return self.params[0].name == "force"
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.rows = joint_dofs(model, self.where) if self.on_joint else body_ids(model, self.where)
+        self.dofs = index(joint_dofs(model, self.where)) if self.on_joint else slice(0)
+        self.bodies = [] if self.on_joint else body_ids(model, self.where).tolist()
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         if self.on_joint:
-            out.qfrc[..., self.rows] += theta
-        else:
-            out.xfrc[..., self.rows, :3] += theta[..., None, :]
+            out.qfrc[..., self.dofs] += theta
+        for body in self.bodies:
+            push = out.xfrc[..., body, :3]
+            push += theta
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -89,10 +91,13 @@ class Wind(Effect):
     )
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.body = int(body_ids(model, self.where)[0])
+        self.motion = BodyMotion(model, int(body_ids(model, self.where)[0]))
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
-        out.xfrc[..., self.body, :3] += theta[..., :3] - theta[..., 3:] * body_motion(ctx, self.body)[1]
+        *push, drag = components(theta)
+        velocity = self.motion.velocity(ctx, self.motion.quat(ctx))
+        felt = out.xfrc[..., self.motion.body, :3]
+        felt += joined([p - drag * v for p, v in zip(push, velocity, strict=True)])
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
         if theta[3] <= 0:

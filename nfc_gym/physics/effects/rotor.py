@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.air import body_motion, body_scales, translating
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index
 from nfc_gym.physics.effects.places import body_ids, gyration, sized
 from nfc_gym.physics.fields import names_of
-from nfc_gym.physics.state import rotate, rotate_back
+from nfc_gym.physics.state import components, joined, rotate_back_parts, rotate_parts
 
 _SITE = int(mujoco.mjtTrn.mjTRN_SITE)
 
@@ -42,17 +42,17 @@ class _Rotor(Effect):
     """What both share: the total thrust along its common axis, from the actuators' forces one substep before."""
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.body = int(body_ids(model, self.where)[0])
-        self.actuators, pushes = thrusters(model, self.body)
-        if not self.actuators:
+        self.motion = BodyMotion(model, int(body_ids(model, self.where)[0]))
+        actuators, pushes = thrusters(model, self.motion.body)
+        if not actuators:
             raise InputError(f"{self.family} at body {self.where[0]!r}: no actuator pushes at a site of it")
         total = pushes.sum(0)
-        self.axis = total / np.linalg.norm(total)
-        self.along = pushes @ self.axis
+        axis = total / np.linalg.norm(total)
+        self.actuators, self.along, self.axis = index(np.array(actuators)), pushes @ axis, axis.tolist()
 
     def thrust(self, ctx: Context) -> Array:
-        """Total thrust (..., 1), N."""
-        return (ctx.data("actuator_force")[..., self.actuators] * self.along).sum(-1, keepdims=True)
+        """Total thrust (...,), N."""
+        return (ctx.data("actuator_force")[..., self.actuators] * self.along).sum(-1)
 
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
@@ -83,13 +83,14 @@ class RotorDrag(_Rotor):
     )
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
-        quat, velocity = body_motion(ctx, self.body)
-        velocity = rotate_back(quat, velocity)
-        axial = (velocity @ self.axis)[..., None] * self.axis
-        plane = velocity - axial
-        lift = theta[..., 2:3] * (plane**2).sum(-1, keepdims=True) * self.axis
-        pull = self.thrust(ctx) * (lift - theta[..., 0:1] * plane - theta[..., 1:2] * axial)
-        out.xfrc[..., self.body, :3] += rotate(quat, pull)
+        drag, inflow, lift = components(theta)
+        quat, thrust = self.motion.quat(ctx), self.thrust(ctx)
+        velocity = rotate_back_parts(quat, self.motion.velocity(ctx, quat))
+        axial = sum(v * a for v, a in zip(velocity, self.axis, strict=True))
+        plane = [v - axial * a for v, a in zip(velocity, self.axis, strict=True)]
+        gain = lift * sum(p * p for p in plane) - inflow * axial
+        pull = [thrust * (gain * a - drag * p) for a, p in zip(self.axis, plane, strict=True)]
+        out.xfrc[..., self.motion.body, :3] += joined(rotate_parts(quat, pull))
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -113,10 +114,10 @@ class GroundEffect(_Rotor):
     PARAMS = (Param("strength", "m^2", 0.0, 100.0, probes=(0.05,)),)
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
-        quat, _ = body_motion(ctx, self.body)
-        height = np.maximum(ctx.data("xipos")[..., self.body, 2], 1e-3)[..., None]
-        gain = np.minimum(theta[..., :1] / (16 * height**2), 0.5)
-        out.xfrc[..., self.body, :3] += rotate(quat, gain * self.thrust(ctx) * self.axis)
+        height = np.maximum(ctx.data("xipos")[..., self.motion.body, 2], 1e-3)
+        added = np.minimum(theta[..., 0] / (16 * height * height), 0.5) * self.thrust(ctx)
+        push = rotate_parts(self.motion.quat(ctx), [added * a for a in self.axis])
+        out.xfrc[..., self.motion.body, :3] += joined(push)
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:

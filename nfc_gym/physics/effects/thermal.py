@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names
+from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names, index
 from nfc_gym.physics.effects.drive import actuator_places, plain
 from nfc_gym.physics.effects.places import sized
 
@@ -29,7 +29,7 @@ class Thermal(Effect):
     )
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.rows = actuator_ids(model, self.where)
+        self.rows = index(actuator_ids(model, self.where))
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         return (ctrl[..., self.rows] / theta[..., 2:3]) ** 2

@@ -7,16 +7,25 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names
+from nfc_gym.physics.effects.base import (
+    Array,
+    Effect,
+    Param,
+    Rows,
+    Scales,
+    actuator_ids,
+    actuator_names,
+    index,
+    limited,
+)
 from nfc_gym.physics.effects.drive import actuator_places
 from nfc_gym.physics.effects.places import sized
 
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
 
 
-def command_limits(model: mujoco.MjModel, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+def command_limits(model: mujoco.MjModel, rows: Rows) -> tuple[Array, Array]:
     """(low, high) that MuJoCo itself clips the commands of some actuators to, infinite where it does not."""
     off = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL))
     limited = model.actuator_ctrllimited[rows].astype(bool) & (not off)
@@ -28,11 +37,11 @@ class _Late(Effect):
     """What both share: the commands of some actuators, clipped as MuJoCo would, and a time in seconds."""
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.rows = actuator_ids(model, self.where)
+        self.rows = index(actuator_ids(model, self.where))
         self.limits = command_limits(model, self.rows)
 
     def _commands(self, ctrl: Array) -> Array:
-        return np.clip(ctrl[..., self.rows], *self.limits)
+        return limited(ctrl[..., self.rows], *self.limits)
 
     def _replace(self, ctrl: Array, values: Array) -> Array:
         out = np.array(ctrl)
@@ -92,22 +101,22 @@ class Delay(_Late):
     PARAMS = (Param("delay", "s", 0.0, 0.5, probes=(0.01, 0.03, 0.08)),)
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
+        """What each past command weighs, None for one that no simulation looks back to, and those commands."""
         length = int(np.ceil(np.max(theta[..., 0], initial=0.0) / dt - 1e-9)) + 1
-        return (self._commands(ctrl),) * length
+        weights = [np.maximum(0.0, 1.0 - np.abs(theta[..., :1] / dt - age)) for age in range(length)]
+        return [w if w.any() else None for w in weights], [self._commands(ctrl)] * length
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
-        past = (self._commands(ctrl), *memory[:-1]) if len(memory) > 1 else (self._commands(ctrl),)
-        steps = theta[..., :1] / dt
-        made = np.zeros_like(past[0])
-        for age, values in enumerate(past):
-            made = made + np.maximum(0.0, 1.0 - np.abs(steps - age)) * values
-        return self._replace(ctrl, made), past
+        weights, past = memory
+        past = [self._commands(ctrl), *past[:-1]]
+        made: Any = sum(weight * values for weight, values in zip(weights, past, strict=True) if weight is not None)
+        return self._replace(ctrl, made), (weights, past)
 
     def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
         out, time = np.array(force), np.arange(len(force)) * dt
-        for a in self.rows:  # u(t) = y(t + delay); the last value is held
+        for a in np.arange(force.shape[1])[self.rows]:  # u(t) = y(t + delay); the last value is held
             out[:, a] = np.interp(time + theta[0], time, force[:, a])
         return out
 
