@@ -1,5 +1,8 @@
 """The vector engine: equal to single environments to the bit, whatever is randomised, reset or broken."""
 
+import gc
+import multiprocessing
+import os
 import resource
 from typing import Any
 
@@ -247,6 +250,25 @@ def test_bad_input() -> None:
     assert envs.step(np.full((N, 2), 1e308))[3].all(), "finite values of any size are clipped"
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"\[0, 1, 2\]"):
         envs.step(np.zeros((N, 2)))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_worker_may_forget_the_environments_of_its_parent() -> None:
+    """Their threads are not in the worker, which would wait for them forever."""
+    held = [vector("nfc_gym/JackalFlat-v0", nthread=2)]
+    held[0].reset(seed=0)
+
+    def forget() -> None:
+        held.clear()
+        gc.collect()
+
+    worker = multiprocessing.get_context("fork").Process(target=forget)
+    worker.start()
+    worker.join(20)
+    code = worker.exitcode
+    worker.kill()
+    assert code == 0
+    same(held[0].step(np.zeros((N, 2)))[2], np.zeros(N, bool))
 
 
 def test_memory_stays_flat_over_resets() -> None:
