@@ -12,9 +12,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 
 import nfc_gym.wrappers
-from nfc_gym.core import Fidelity
+from nfc_gym.core import Fidelity, MissingExtra
 from nfc_gym.core.posterior import register_loader
 
 IDS = sorted(i for i in gym.registry if i.startswith("nfc_gym/"))
@@ -98,7 +99,10 @@ def kind(name: str) -> str:
 
 def wrapped(name: str, env: Any, sources: Path, null: bool = False) -> Any:
     """`env` in a wrapper, or a vector environment in its twin."""
-    return PUBLIC[name](env, **CASES[kind(name)][0 if null else 1](sources))
+    try:
+        return PUBLIC[name](env, **CASES[kind(name)][0 if null else 1](sources))
+    except MissingExtra as error:
+        pytest.skip(str(error))
 
 
 def made(name: str, **kwargs: Any) -> gym.Env:
