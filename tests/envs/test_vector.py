@@ -3,7 +3,6 @@
 import gc
 import multiprocessing
 import os
-import resource
 from typing import Any
 
 import gymnasium
@@ -269,17 +268,3 @@ def test_a_forked_worker_may_forget_the_environments_of_its_parent() -> None:
     worker.kill()
     assert code == 0
     same(held[0].step(np.zeros((N, 2)))[2], np.zeros(N, bool))
-
-
-def test_memory_stays_flat_over_resets() -> None:
-    envs = vector("nfc_gym/JackalRough-v0", n=16, context=["psi"])
-    env = gymnasium.make("nfc_gym/JackalRough-v0", **SMALL)
-
-    def reset(times: int) -> int:
-        for _ in range(times):
-            envs.reset()
-            env.reset()
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-    before = reset(60)
-    assert reset(250) - before < 3000, "KiB"
