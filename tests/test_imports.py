@@ -107,7 +107,21 @@ def test_a_forbidden_import_is_seen(module: str, source: str) -> None:
 @pytest.mark.parametrize(
     ("statement", "unwanted"),
     [
-        ("import nfc_gym", {"torch", "plotly", "pandas", "pydantic", "pyarrow", "cma", "jinja2", "matplotlib"}),
+        (
+            "import nfc_gym",
+            {
+                "torch",
+                "torchrl",
+                "stable_baselines3",
+                "plotly",
+                "pandas",
+                "pydantic",
+                "pyarrow",
+                "cma",
+                "jinja2",
+                "matplotlib",
+            },
+        ),
         ("import nfc_gym.cli", {"torch", "plotly", "pandas", "pydantic", "scipy", "mujoco", "yaml"}),
     ],
 )

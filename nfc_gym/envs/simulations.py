@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nfc_gym.envs import scene
 from nfc_gym.envs.batching import Ids, terrain_ids
 from nfc_gym.envs.contract import FLAT, psi_of, rest_key, seen_psi
+from nfc_gym.envs.forking import safe_to_fork
 from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.view import View
 from nfc_gym.physics.fields import ModelFields
@@ -43,7 +44,7 @@ class Simulations:
         for k, heightfield in enumerate(maps):
             scene.write(self.model, k, heightfield.heights)
         self.robot, self.space = given.robot(self.model), given.kind.space(self.model)
-        self.batch = Batch(self.model, n, nthread)
+        self.batch = safe_to_fork(Batch(self.model, n, nthread))
         self.fields = ModelFields(self.batch)
         self.view = View(self.model, self.batch.bind, given.kind.reads, self.ground)
         self.psi = np.tile(self.space.nominal, (n, 1))

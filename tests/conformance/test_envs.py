@@ -152,6 +152,13 @@ def test_memory_is_flat_over_resets(name: str) -> None:
     assert grown(env.reset, RESETS) < RESETS / 4 * mujoco.mj_sizeModel(env.unwrapped.model)
 
 
+@pytest.mark.parametrize("name", IDS)
+def test_memory_of_vectors_is_flat_over_resets(name: str) -> None:
+    envs = gym.make_vec(name, num_envs=4, nthread=1, context=["psi"], terrain_pool=2)
+    envs.reset(seed=0)
+    assert grown(envs.reset, RESETS // 5) < RESETS / 5 / 4 * mujoco.mj_sizeModel(envs.unwrapped.model)
+
+
 def test_a_leak_of_a_model_each_reset_would_be_seen() -> None:
     env = made("nfc_gym/JackalFlat-v0", context=["psi"])
     kept = []

@@ -150,6 +150,21 @@ def test_memory_is_flat_over_resets(name: str, sources: Path) -> None:
     assert grown(episode, RESETS) < RESETS / 4 * mujoco.mj_sizeModel(env.unwrapped.model)
 
 
+def test_memory_is_flat_over_resets_of_environments_of_others() -> None:
+    pytest.importorskip("imageio", reason="Gymnasium's own MuJoCo environments need gymnasium[mujoco]")
+    env: Any = SINGLE["RandomizePsi"](gym.make("Ant-v5"), space=["torso"])
+    delay = {"family": "delay", "where": "hip_1", "parameters": {"delay": 0.03}}
+    env = SINGLE["ApplyEffects"](env, [delay])
+    env = SINGLE["ResidualDynamics"](env, 0.01 * np.ones((5, 14)), covariance=np.full(14, 1e-4))
+    env = SINGLE["PerturbSignals"](env, {"observation": {"sd": 0.01, "delay": 2}})
+
+    def episode() -> None:
+        env.reset()
+        env.step(np.zeros(8))
+
+    assert grown(episode, RESETS) < RESETS / 4 * mujoco.mj_sizeModel(env.unwrapped.model)
+
+
 @pytest.mark.parametrize("name", SINGLE)
 def test_checks_of_gymnasium_and_stable_baselines(name: str, sources: Path) -> None:
     env = wrapped(name, base(), sources)
