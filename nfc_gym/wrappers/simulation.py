@@ -217,25 +217,22 @@ class SingleSimulation(Simulation):
             self.started = True
         self.commanded = self.ctrl.copy()
         if self.pushed:
-            self._base[0][:] = self.qfrc_applied
-            self._base[1][:] = self.xfrc_applied
+            self._base[0][...], self._base[1][...] = self.qfrc_applied, self.xfrc_applied
         if self.started:
             self.refresh()
         for hook in self.on_control:
             hook()
         self.started, self._inside = False, True
         if self.pushed and self.on_substep:
-            self._held[0][:] = self.qfrc_applied
-            self._held[1][:] = self.xfrc_applied
+            self._held[0][...], self._held[1][...] = self.qfrc_applied, self.xfrc_applied
 
     def restore_forces(self) -> None:
         """See `Simulation`."""
-        self.qfrc_applied[:], self.xfrc_applied[:] = self._held
+        self.qfrc_applied[...], self.xfrc_applied[...] = self._held
 
     def _end(self) -> None:
         if self.pushed:
-            self.qfrc_applied[:] = self._base[0]
-            self.xfrc_applied[:] = self._base[1]
+            self.qfrc_applied[...], self.xfrc_applied[...] = self._base
         for hook in self.on_after:
             hook()
         self._time = self.data.time
