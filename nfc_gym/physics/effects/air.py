@@ -69,7 +69,9 @@ class BodyMotion:
 
 
 def _total(a: Parts, b: Parts) -> Parts:
-    return [p + q for p, q in zip(a, b, strict=True)]
+    x, y, z = a
+    u, v, w = b
+    return x + u, y + v, z + w
 
 
 def translating(model: mujoco.MjModel) -> list[str]:
