@@ -48,6 +48,7 @@ class RobotEnv(gymnasium.Env):
       model, data: the simulation. Edits of the model last until the next reset where psi or `fields` touched them.
       fields: `ModelFields` of `model`; what is written through it goes back to nominal at every reset.
       psi_space: names, units, bounds and nominal values of psi.
+      control_hooks: called with this environment before a control step's first physics step, its command being set.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
       after_hooks: called with this environment after the last physics step, before anything is observed.
       screen: what renders; its `camera` may be changed between pictures.
@@ -75,6 +76,7 @@ class RobotEnv(gymnasium.Env):
         self.fields = ModelFields(self.model)
         self.frame_skip = kind.frame_skip
         self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
+        self.control_hooks: list[Callable[[RobotEnv], None]] = []
         self.substep_hooks: list[Callable[[RobotEnv], None]] = []
         self.after_hooks: list[Callable[[RobotEnv], None]] = []
 
@@ -223,6 +225,8 @@ class RobotEnv(gymnasium.Env):
 
     def _advance(self) -> None:
         try:
+            for hook in self.control_hooks:
+                hook(self)
             if self.substep_hooks:
                 for _ in range(self.frame_skip):
                     for hook in self.substep_hooks:

@@ -51,6 +51,7 @@ class RobotVectorEnv(VectorEnv):
       settings: the attributes of `Settings`.
 
     Attributes:
+      control_hooks: called with this environment before a control step's first physics step, its command being set.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
       after_hooks: called with this environment after the last physics step, before anything is observed.
       reset_hooks: called with the ids (k,) about to be reset, autoresets included; a returned dict of reset options,
@@ -74,6 +75,7 @@ class RobotVectorEnv(VectorEnv):
         self.screen = Screen(render_mode, (None, "rgb_array"), self._given)
         self.num_envs, self.rough, self.render_mode = int(num_envs), bool(rough), render_mode
         self.frame_skip, self.autoreset_mode = self._kind.frame_skip, AutoresetMode(autoreset_mode)
+        self.control_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.after_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
@@ -299,6 +301,8 @@ class RobotVectorEnv(VectorEnv):
         return unstable
 
     def _run(self, active: NDArray[np.bool_] | None) -> None:
+        for hook in self.control_hooks:
+            hook(self)
         if not self.substep_hooks:
             self._physics(active, self.frame_skip)
             return

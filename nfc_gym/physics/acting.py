@@ -55,11 +55,11 @@ class Acting:
         engine: Engine,
         dt: float,
     ) -> None:
-        self.model, self.effects, self.thetas = model, tuple(effects), tuple(thetas)
-        self.fields, self.engine, self.dt = fields, engine, dt
-        self.commanding = [i for i, e in enumerate(effects) if overrides(e, "action")]
-        self.rubbing = [i for i, e in enumerate(effects) if overrides(e, "friction")]
-        self.pushing = [i for i, e in enumerate(effects) if overrides(e, "force")]
+        self.model, self.fields, self.engine, self.dt = model, fields, engine, dt
+        pairs = list(zip(effects, thetas, strict=True))
+        self.commanding = [(e, theta) for e, theta in pairs if overrides(e, "action")]
+        self.rubbing = [(e, theta) for e, theta in pairs if overrides(e, "friction")]
+        self.pushing = [(e, theta) for e, theta in pairs if overrides(e, "force")]
         self.memories: list[Any] = []
         self.derived: set[str] = set()
         self.fresh: NDArray[np.bool_] | None = None
@@ -83,8 +83,7 @@ class Acting:
 
     def command(self, ctrl: Array, exogenous: Mapping[str, Array]) -> Array:
         """The command (..., nu) of a step after the effects on it; the first one settles their hidden states."""
-        for slot, i in enumerate(self.commanding):
-            effect, theta = self.effects[i], self.thetas[i]
+        for slot, (effect, theta) in enumerate(self.commanding):
             if len(self.memories) == slot:
                 self.memories.append(effect.state0(ctrl.shape[:-1], ctrl, theta, self.dt))
             elif self.fresh is not None:
@@ -95,28 +94,28 @@ class Acting:
 
     def push(self, ctrl: Array, exogenous: Mapping[str, Array]) -> None:
         """Write the dry friction of the coming step and add its forces to what is applied already."""
-        fresh, self.fresh = self.fresh, None
+        if self.fresh is not None:
+            fresh, self.fresh = self.fresh, None
+            if self.derived:
+                self.engine.forward(np.flatnonzero(fresh))
         if not (self.rubbing or self.pushing):
             return
-        if fresh is not None and self.derived:
-            self.engine.forward(np.flatnonzero(fresh))
-        ctx, out = self._show(ctrl, exogenous)
+        ctx, out = self.shown or self._show(ctrl, exogenous)
+        ctx.ctrl, ctx.exogenous = ctrl, exogenous
         if self.rubbing:
             self.loss[...] = self.base_friction
-            for i in self.rubbing:
-                dofs, level = self.effects[i].friction(ctx, self.thetas[i])
+            for effect, theta in self.rubbing:
+                dofs, level = effect.friction(ctx, theta)
                 self.loss[..., dofs] += level
-        for i in self.pushing:
-            self.effects[i].force(ctx, self.thetas[i], out)
+        for effect, theta in self.pushing:
+            effect.force(ctx, theta, out)
 
     def _show(self, ctrl: Array, exogenous: Mapping[str, Array]) -> tuple[Context, Forces]:
         """What hooks read and where they write; the engine's arrays are live, and asked for once an episode."""
-        if self.shown is None:
-            engine = self.engine
-            state = (engine.qpos, engine.qvel, ctrl)
-            ctx = Context(self.model, self.dt, *state, exogenous, self._derived, self._nominal)
-            self.shown = ctx, Forces(engine.qfrc_applied, engine.xfrc_applied)
-        self.shown[0].ctrl, self.shown[0].exogenous = ctrl, exogenous
+        engine = self.engine
+        state = (engine.qpos, engine.qvel, ctrl)
+        ctx = Context(self.model, self.dt, *state, exogenous, self._derived, self._nominal)
+        self.shown = ctx, Forces(engine.qfrc_applied, engine.xfrc_applied)
         return self.shown
 
     def _derived(self, name: str) -> Array:

@@ -90,12 +90,10 @@ def cross_parts(a: Sequence[Any], b: Sequence[Any]) -> tuple[Any, Any, Any]:
 
 def rotate_parts(q: Sequence[Any], v: Sequence[Any]) -> tuple[Any, Any, Any]:
     """Vectors rotated by unit quaternions, by components (...)."""
-    w, *axis = q
-    x, y, z = v
-    a, b, c = cross_parts(axis, v)
-    a, b, c = 2 * a, 2 * b, 2 * c
-    d, e, f = cross_parts(axis, (a, b, c))
-    return x + w * a + d, y + w * b + e, z + w * c + f
+    w, x, y, z = q
+    i, j, k = v
+    a, b, c = 2 * (y * k - z * j), 2 * (z * i - x * k), 2 * (x * j - y * i)
+    return i + w * a + (y * c - z * b), j + w * b + (z * a - x * c), k + w * c + (x * b - y * a)
 
 
 def rotate_back_parts(q: Sequence[Any], v: Sequence[Any]) -> tuple[Any, Any, Any]:
@@ -198,9 +196,13 @@ class Inertia:
     def times(self, packed: Array, velocity: Array) -> Array:
         """Momentum M v, (nv,) or (n, nv), from `MjData.M`, (nC,) or (n, nC), and velocities of the result's shape."""
         out = np.empty(velocity.shape)
-        for inertia, v, made in (
-            ((packed, velocity, out),) if velocity.ndim == 1 else zip(packed, velocity, out, strict=True)
-        ):
-            self.packed[:] = inertia
-            mujoco.mj_mulM(self.model, self.aside, made, v)
+        if velocity.ndim == 1:
+            self._into(out, packed, velocity)
+            return out
+        for row in zip(out, packed, velocity, strict=True):
+            self._into(*row)
         return out
+
+    def _into(self, out: Array, packed: Array, velocity: Array) -> None:
+        self.packed[...] = packed
+        mujoco.mj_mulM(self.model, self.aside, out, velocity)

@@ -11,6 +11,7 @@ from nfc_gym.wrappers.hooks import Hooks
 from nfc_gym.wrappers.simulation import ATTRIBUTE, Simulation
 
 Array = NDArray[np.float64]
+_HOOKS = ("control_hooks", "substep_hooks", "after_hooks", "reset_hooks")
 
 
 class BatchSimulation(Simulation):
@@ -27,7 +28,6 @@ class BatchSimulation(Simulation):
         self.started = np.ones(self.shape, bool)
         self.on_reset = Hooks()
         self._bound: set[str] = set()
-        self._calls = 0
         self._unedited = np.zeros(self.shape, bool)
         self._look()
         env.reset_hooks.append(self._resetting)
@@ -70,7 +70,6 @@ class BatchSimulation(Simulation):
         """Rows are about to begin an episode: the options of the wrappers for them."""
         self.look_again()
         self.pending[ids] = self._unedited[ids] = True
-        self._calls = 0
         options: dict[str, Any] = {}
         self.refresh()
         for hook in self.on_reset.live():
@@ -92,17 +91,17 @@ class BatchSimulation(Simulation):
         """Model fields of some simulations, ascending ids."""
         return self.fields if len(ids) == self.shape[0] else self.fields.rows(ids)
 
-    def attach(self, who: str, after: bool = False) -> None:
-        """Make sure that the hooks are called."""
+    def attach(self, who: str, after: bool = False, substeps: bool = True) -> None:
+        """See `SingleSimulation`; these environments have a place for every hook."""
         if not self.attached:
-            self.env.substep_hooks.append(self._called)
+            self.env.control_hooks.append(lambda _: self._begin())
             self.env.after_hooks.append(lambda _: self._end())
-            self.attached = True
+        if substeps and not self.between:
+            self.env.substep_hooks.append(self._act)
+            self.between = True
+        self.attached = True
 
-    def _called(self, _: Any) -> None:
-        if self._calls == 0:
-            self._begin()
-        self._calls = (self._calls + 1) % int(self.env.frame_skip)
+    def _act(self, _: Any) -> None:
         for hook in self.on_substep:
             hook()
 
@@ -137,7 +136,7 @@ def batch_simulation_of(env: Any, who: str) -> BatchSimulation:
     known = vars(base).get(ATTRIBUTE)
     if isinstance(known, BatchSimulation):
         return known
-    lacking = [n for n in ("batch", "fields", "substep_hooks", "after_hooks", "reset_hooks") if not hasattr(base, n)]
+    lacking = [n for n in (*_HOOKS, "batch", "fields") if not hasattr(base, n)]
     if lacking:
         raise InputError(
             f"Vector{who} acts in the physics of a vector environment on mujoco.batch, as gymnasium.make_vec makes of "

@@ -39,7 +39,8 @@ class Injection:
     def __init__(self, sim: Simulation, components: Components, mode: Mode, noise: Array) -> None:
         self.sim, self.components, self.mode, self.noise = sim, components, mode, noise
         self.noisy, self.steady = bool(noise.shape[1]), components.direct and not noise.shape[1]
-        self.duration, self.observing = sim.duration(), bool(components.observed.size)
+        self.duration = np.full(components.nv, sim.duration())  # s; by an array division is faster than by a number
+        self.observing = bool(components.observed.size)
         self.bias = self.delta = np.zeros((*sim.shape, components.size))
         self.rng: np.random.Generator = np.random.default_rng(0)
         sim.bind("M")
@@ -170,7 +171,7 @@ class ResidualDynamics(_Observing, EnvWrapper):
         super().__init__(env, source=source, mode=mode, covariance=covariance, components=components, key=key)
         sim = simulation_of(env, "ResidualDynamics")
         self.draws, bound, root = prepare(env, sim, source, mode, covariance, components)
-        sim.attach("ResidualDynamics", after=mode == "state")
+        sim.attach("ResidualDynamics", after=mode == "state", substeps=False)
         self.sim = sim
         self.key = box_key(env.observation_space, key, bound.size) if bound.observed.size else None
         self.injection = Injection(sim, bound, mode, root)
@@ -211,7 +212,7 @@ class VectorResidualDynamics(_Observing, VectorEnvWrapper):
         sim = batch_simulation_of(env, "ResidualDynamics")
         self.draws, bound, root = prepare(env, sim, source, mode, covariance, components)
         self.key = box_key(env.single_observation_space, key, bound.size) if bound.observed.size else None
-        sim.attach("ResidualDynamics", after=mode == "state")
+        sim.attach("ResidualDynamics", after=mode == "state", substeps=False)
         self.injection = Injection(sim, bound, mode, root)
         sim.on_reset.add(self._draw)
 

@@ -28,6 +28,7 @@ from nfc_gym.wrappers.simulation import Simulation, simulation_of
 Array = NDArray[np.float64]
 Given = Sequence[tuple[Effect, Array] | Mapping[str, Any]] | str | os.PathLike[str]
 Signal = float | Callable[[Any], Any]
+_NONE: Mapping[str, Any] = {}
 
 
 def recorded(effects: Given) -> list[dict[str, Any]] | str:
@@ -112,13 +113,13 @@ class Application:
 
     def _act(self) -> None:
         """One physics step's command, friction and forces."""
-        sim = self.sim
-        signals = self._signals() if self.reads else {}
-        if self.acting.commanding:
-            sim.ctrl[...] = self.acting.command(sim.commanded, signals)
-        if self.acting.pushing:
+        sim, acting = self.sim, self.acting
+        signals = self._signals() if self.reads else _NONE
+        if acting.commanding:
+            sim.ctrl[...] = acting.command(sim.commanded, signals)
+        if acting.pushing:
             sim.restore_forces()
-        self.acting.push(sim.ctrl, signals)
+        acting.push(sim.ctrl, signals)
 
     def _signals(self) -> dict[str, Any]:
         time = np.asarray(self.sim.bind("time"), float)

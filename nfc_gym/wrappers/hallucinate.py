@@ -59,7 +59,7 @@ def injection_of(
         return None
     checked_mode(mode)
     bound = Components(sim.model, component_names(env, components, belief.step_size), belief.step_size)
-    sim.attach("Hallucinate", after=mode == "state")
+    sim.attach("Hallucinate", after=mode == "state", substeps=False)
     return Injection(sim, bound, mode, np.zeros((belief.step_size, 0)))
 
 
@@ -126,6 +126,8 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         self.injection = injection_of(env, sim, self.belief, mode, components)
         self._h = np.zeros(self.belief.size)
         self._chosen, self._lever = False, self.belief.lever(self.beta)
+        self._high = np.ones(self.belief.step_size)
+        self._low = -self._high
         self._made = self.belief.held_part(self._h[: self.belief.held], self.beta)
         self._again: tuple[Any, ...] = ()
 
@@ -160,13 +162,14 @@ class Hallucinate(_Hallucinating, EnvWrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step in the world that the action asks for."""
         action = finite(action)
-        held, h = self.belief.held, action[self.own :].astype(float)
         if not self._chosen:
-            self._h, self._chosen = h.copy(), True
+            self._h, self._chosen = np.array(action[self.own :], float), True
             self._enter()
         if self.injection is not None:
-            self._h[held:] = h[held:]
-            self.injection.bias = self._made + self._lever.dot(np.minimum(np.maximum(h[held:], -1.0), 1.0))
+            varying = self._h[self.belief.held :]
+            varying[:] = action[self.own + self.belief.held :]
+            h = np.minimum(np.maximum(varying, self._low), self._high)
+            self.injection.bias = self._made + self._lever.dot(h)
         return self.env.step(action[: self.own])
 
     def _enter(self) -> None:

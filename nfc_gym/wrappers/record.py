@@ -39,7 +39,7 @@ class _Recording:
         sim = self.sim
         self.log = LogFolder(self.env, sim, path, None if model_file is None else os.fspath(model_file))
         self.sensing = int(sim.nominal.nsensordata) > 0
-        sim.attach("RecordLog", after=self.sensing)
+        sim.attach("RecordLog", after=self.sensing, substeps=self.sensing)
         sim.on_control.add(self._command)
         if self.sensing:
             sim.bind("sensordata")

@@ -4,7 +4,8 @@ All wrappers of one environment meet in one `Simulation`: model edits start from
 and whoever acts at each physics step is called there in the order in which the wrappers were put on, innermost first.
 
 What the hooks need is a place between two physics steps. An environment that keeps lists called `substep_hooks` and
-`after_hooks` offers it itself; Gymnasium's `MujocoEnv` (and whatever holds one, as the mazes of gymnasium-robotics do)
+`after_hooks` offers it itself, and one called `control_hooks` lets a control step in which nothing acts between two
+physics steps stay one call; Gymnasium's `MujocoEnv` (and whatever holds one, as the mazes of gymnasium-robotics do)
 is stepped here in place of its own `_step_mujoco_simulation`.
 """
 
@@ -62,7 +63,7 @@ class Simulation:
         self.edits, self.senses = Hooks(), Hooks()
         self.commanded = np.zeros(0)
         self.pushed = False
-        self.attached = False
+        self.attached = self.between = False
 
     def refresh(self) -> None:
         """Forget the hooks of wrappers that are gone."""
@@ -84,8 +85,8 @@ class Simulation:
         """Recompute the derived fields for the state as it is."""
         raise NotImplementedError
 
-    def attach(self, who: str, after: bool = False) -> None:
-        """Make sure that the hooks are called."""
+    def attach(self, who: str, after: bool = False, substeps: bool = True) -> None:
+        """Make sure that the hooks are called: those before a control step, after it, and at physics steps."""
         raise NotImplementedError
 
     def restore_forces(self) -> None:
@@ -170,12 +171,13 @@ class SingleSimulation(Simulation):
 
     # ---- stepping -------------------------------------------------------------------------------------------------
 
-    def attach(self, who: str, after: bool = False) -> None:
+    def attach(self, who: str, after: bool = False, substeps: bool = True) -> None:
         """Make sure that the hooks are called.
 
         Args:
           who: for errors.
           after: `on_after` is needed too.
+          substeps: `on_substep` is needed too.
 
         Raises:
           InputError: the environment steps its model where no such hook can be put.
@@ -188,14 +190,17 @@ class SingleSimulation(Simulation):
                 "and `after_hooks`, lists of callables that it calls with itself before every mj_step and after "
                 "a control step's last, or to be stepped by gymnasium's MujocoEnv"
             )
-        if self.attached:
-            return
-        if how == "substep_hooks":
-            owner.substep_hooks.append(self._called)
-            if hasattr(owner, "after_hooks"):
-                owner.after_hooks.append(lambda _: self._end())
-        else:
+        own = how == "substep_hooks"
+        whole = own and hasattr(owner, "control_hooks")
+        if not self.attached and not own:
             setattr(owner, how, Stepped(owner, how, self))
+        if not self.attached and whole:
+            owner.control_hooks.append(lambda _: self._begin())
+        if not self.attached and hasattr(owner, "after_hooks"):
+            owner.after_hooks.append(lambda _: self._end())
+        if own and not self.between and (substeps or not whole):
+            owner.substep_hooks.append(self._act if whole else self._called)
+            self.between = True
         self.attached = True
 
     def begin_episode(self) -> None:
@@ -217,37 +222,38 @@ class SingleSimulation(Simulation):
             self.started = True
         self.commanded = self.ctrl.copy()
         if self.pushed:
-            self._base[0][:] = self.qfrc_applied
-            self._base[1][:] = self.xfrc_applied
+            self._base[0][...], self._base[1][...] = self.qfrc_applied, self.xfrc_applied
         if self.started:
             self.refresh()
         for hook in self.on_control:
             hook()
         self.started, self._inside = False, True
         if self.pushed and self.on_substep:
-            self._held[0][:] = self.qfrc_applied
-            self._held[1][:] = self.xfrc_applied
+            self._held[0][...], self._held[1][...] = self.qfrc_applied, self.xfrc_applied
 
     def restore_forces(self) -> None:
         """See `Simulation`."""
-        self.qfrc_applied[:], self.xfrc_applied[:] = self._held
+        self.qfrc_applied[...], self.xfrc_applied[...] = self._held
 
     def _end(self) -> None:
         if self.pushed:
-            self.qfrc_applied[:] = self._base[0]
-            self.xfrc_applied[:] = self._base[1]
+            self.qfrc_applied[...], self.xfrc_applied[...] = self._base
         for hook in self.on_after:
             hook()
         self._time = self.data.time
         self._inside = False
 
-    def _called(self, _: Any) -> None:
+    def _act(self, _: Any) -> None:
         """Before a physics step of an environment that has hooks of its own."""
-        if self._calls == 0:
-            self._begin()
-        self._calls = (self._calls + 1) % int(self.env.frame_skip)
         for hook in self.on_substep:
             hook()
+
+    def _called(self, env: Any) -> None:
+        """The same where the environment does not say which physics step is a control step's first."""
+        if self._calls == 0:
+            self._begin()
+        self._calls = (self._calls + 1) % int(env.frame_skip)
+        self._act(env)
 
     def run(self, original: Callable[..., None], plain: bool, ctrl: Array, frames: int) -> None:
         """A control step in place of `MujocoEnv._step_mujoco_simulation`."""

@@ -19,6 +19,9 @@ from nfc_gym.physics.state import components, cross_parts, joined, root, rotate_
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 
+Parts = Sequence[Any]  # components (...) of a vector
+
+
 class BodyMotion:
     """How a body's centre of mass moves.
 
@@ -32,27 +35,43 @@ class BodyMotion:
         joint = int(model.body_jntadr[body])
         self.free = joint >= 0 and int(model.jnt_type[joint]) == _FREE
         if self.free:
-            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-            self.turn, self.linear, self.angular = slice(q + 3, q + 7), slice(v, v + 3), slice(v + 3, v + 6)
+            q, v = int(model.jnt_qposadr[joint]) + 3, int(model.jnt_dofadr[joint])
+            self.turn, self.rates = slice(q, q + 4), slice(v, v + 6)
 
-    def quat(self, ctx: Context) -> Sequence[Any]:
-        """Orientation quaternion, by components (...)."""
+    def quat(self, ctx: Context) -> Parts:
+        """Orientation quaternion."""
         return components(ctx.q[..., self.turn] if self.free else ctx.data("xquat")[..., self.body, :])
 
-    def velocity(self, ctx: Context, quat: Sequence[Any]) -> tuple[Any, Any, Any]:
-        """Velocity in the world, m/s, by components (...); `quat` is the orientation's."""
-        if self.free:
-            arm = cross_parts(
-                components(ctx.v[..., self.angular]), components(ctx.nominal("body_ipos")[..., self.body, :])
-            )
-            x, y, z = components(ctx.v[..., self.linear])
-            a, b, c = rotate_parts(quat, arm)
-        else:
-            spatial = ctx.data("cvel")[..., self.body, :]
-            arm = ctx.data("xipos")[..., self.body, :] - ctx.data("subtree_com")[..., self.root, :]
-            x, y, z = components(spatial[..., 3:])
-            a, b, c = cross_parts(components(spatial[..., :3]), components(arm))
-        return x + a, y + b, z + c
+    def velocity(self, ctx: Context, quat: Parts) -> Parts:
+        """Velocity in the world, m/s; `quat` is the body's orientation."""
+        if not self.free:
+            return self._derived(ctx)
+        linear, spun = self._of_joint(ctx)
+        return _total(linear, rotate_parts(quat, spun))
+
+    def own_velocity(self, ctx: Context, quat: Parts) -> Parts:
+        """The same along the body's axes, m/s."""
+        if not self.free:
+            return rotate_back_parts(quat, self._derived(ctx))
+        linear, spun = self._of_joint(ctx)
+        return _total(rotate_back_parts(quat, linear), spun)
+
+    def _of_joint(self, ctx: Context) -> tuple[Parts, Parts]:
+        """The joint's velocity in the world, and what turning about it adds, along the body's axes."""
+        x, y, z, *turning = components(ctx.v[..., self.rates])
+        return (x, y, z), cross_parts(turning, components(ctx.nominal("body_ipos")[..., self.body, :]))
+
+    def _derived(self, ctx: Context) -> Parts:
+        spatial = ctx.data("cvel")[..., self.body, :]
+        arm = ctx.data("xipos")[..., self.body, :] - ctx.data("subtree_com")[..., self.root, :]
+        a, b, c, *linear = components(spatial)
+        return _total(linear, cross_parts((a, b, c), components(arm)))
+
+
+def _total(a: Parts, b: Parts) -> Parts:
+    x, y, z = a
+    u, v, w = b
+    return x + u, y + v, z + w
 
 
 def translating(model: mujoco.MjModel) -> list[str]:
@@ -93,7 +112,7 @@ class DragLinear(Effect):
         a, b, c = components(theta)
         for motion in self.motions:
             quat = motion.quat(ctx)
-            x, y, z = rotate_back_parts(quat, motion.velocity(ctx, quat))
+            x, y, z = motion.own_velocity(ctx, quat)
             scale = -root(x * x + y * y + z * z) if self.power == 2 else -1.0
             push = out.xfrc[..., motion.body, :3]
             push += joined(rotate_parts(quat, (scale * a * x, scale * b * y, scale * c * z)))

@@ -10,7 +10,7 @@ from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index
 from nfc_gym.physics.effects.places import body_ids, gyration, sized
 from nfc_gym.physics.fields import names_of
-from nfc_gym.physics.state import components, joined, rotate_back_parts, rotate_parts
+from nfc_gym.physics.state import components, joined, rotate_parts
 
 _SITE = int(mujoco.mjtTrn.mjTRN_SITE)
 
@@ -85,7 +85,7 @@ class RotorDrag(_Rotor):
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         drag, inflow, lift = components(theta)
         quat, thrust = self.motion.quat(ctx), self.thrust(ctx)
-        velocity = rotate_back_parts(quat, self.motion.velocity(ctx, quat))
+        velocity = self.motion.own_velocity(ctx, quat)
         axial = sum(v * a for v, a in zip(velocity, self.axis, strict=True))
         plane = [v - axial * a for v, a in zip(velocity, self.axis, strict=True)]
         gain = lift * sum(p * p for p in plane) - inflow * axial

@@ -3,6 +3,8 @@
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
 
 from collections.abc import Mapping
+from functools import reduce
+from operator import add
 from typing import Any
 
 import mujoco
@@ -44,7 +46,7 @@ class _Late(Effect):
         return limited(ctrl[..., self.rows], *self.limits)
 
     def _replace(self, ctrl: Array, values: Array) -> Array:
-        out = np.array(ctrl)
+        out = ctrl.copy()
         out[..., self.rows] = values
         return out
 
@@ -111,7 +113,7 @@ class Delay(_Late):
     ) -> tuple[Array, Any]:
         weights, past = memory
         past = [self._commands(ctrl), *past[:-1]]
-        made: Any = sum(weight * values for weight, values in zip(weights, past, strict=True) if weight is not None)
+        made = reduce(add, [w * values for w, values in zip(weights, past, strict=True) if w is not None])
         return self._replace(ctrl, made), (weights, past)
 
     def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
