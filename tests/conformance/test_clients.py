@@ -39,10 +39,11 @@ def sb3(torch: Any) -> Any:
 # ---- Gymnasium ------------------------------------------------------------------------------------------------------
 
 
-def test_gymnasiums_wrappers() -> None:
+def test_gymnasiums_wrappers(sources: Path) -> None:
     """Observations normalised, actions rescaled, frames stacked, episodes cut, around a wrapped environment."""
     bare = made(ANT, context=["psi"])
-    env: Any = gym.wrappers.RescaleAction(made(ANT, context=[]), -10.0, 10.0)
+    env: Any = wrapped("RandomizePsi", made(ANT, context=[]), sources, null=True)
+    env = gym.wrappers.RescaleAction(env, -10.0, 10.0)
     env = gym.wrappers.TimeLimit(env, 4)
     env = gym.wrappers.FrameStackObservation(env, 3)
     first, _ = env.reset(seed=0)
