@@ -62,6 +62,7 @@ class Acting:
         self.pushing = [(e, theta) for e, theta in pairs if overrides(e, "force")]
         self.memories: list[Any] = []
         self.derived: set[str] = set()
+        self.nominal: dict[str, Array] = {}
         self.fresh: NDArray[np.bool_] | None = None
         self.shown: tuple[Context, Forces] | None = None
         self.loss = self.fields["dof_frictionloss"] if self.rubbing else np.zeros(0)
@@ -77,6 +78,7 @@ class Acting:
             self.derived.clear()
             rows = None
         self.fresh, self.shown = rows, None
+        self.nominal.clear()
         if self.rubbing:
             self.loss = loss = self.fields["dof_frictionloss"]
             self.base_friction = loss.copy() if rows is None else np.where(rows[:, None], loss, self.base_friction)
@@ -131,9 +133,11 @@ class Acting:
         return array
 
     def _nominal(self, name: str) -> Array:
-        if name == "dof_frictionloss" and self.rubbing:
-            return self.base_friction
-        return self.fields[name]
+        """A model field; these arrays are live too, but for the friction that `push` writes to."""
+        if name not in self.nominal:
+            rubbed = self.rubbing and name == "dof_frictionloss"
+            self.nominal[name] = self.base_friction if rubbed else self.fields[name]
+        return self.nominal[name]
 
 
 def _merged(new: Any, old: Any, rows: NDArray[np.bool_]) -> Any:

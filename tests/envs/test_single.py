@@ -131,6 +131,12 @@ def test_hooks_act_before_every_physics_step() -> None:
     env.step(np.zeros(4))
     assert times[4:] == pytest.approx([0.04]), "and after the last, with or without others"
     own.after_hooks.clear()
+    own.control_hooks.append(lambda e: times.append((e.data.time, *e.data.ctrl)))
+    env.step(np.ones(4))
+    assert times[5][0] == pytest.approx(0.04), "once, before the first"
+    assert times[5][1:] == tuple(own.model.actuator_ctrlrange[:, 1]), "with the command that is about to act"
+    assert len(times) == 6
+    own.control_hooks.clear()
 
     def lift(e: Any) -> None:
         e.data.xfrc_applied[1, 2] = 9.81 * e.model.body("base").subtreemass[0]

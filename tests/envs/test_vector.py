@@ -194,6 +194,9 @@ def test_substep_hooks_see_every_physics_step() -> None:
     envs.unwrapped.after_hooks.append(lambda env: times.append(float(env.batch.time[0])))
     envs.step(actions)
     assert times[12:] == pytest.approx([0.08])
+    envs.unwrapped.control_hooks.append(lambda env: times.append(float(env.batch.time[0])))
+    envs.step(actions)
+    assert times[13:] == pytest.approx([0.08, 0.1])
 
 
 def test_terrains_are_replaced() -> None:

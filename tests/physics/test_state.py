@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.physics.state import (
+    cross,
     difference,
     integrate,
     quat_conjugate,
@@ -75,3 +76,14 @@ def test_rotation_is_mujocos_and_inverts() -> None:
         np.testing.assert_allclose(turned, expected, atol=1e-14)
     np.testing.assert_allclose(rotate_back(q, rotate(q, v)), v, atol=1e-14)
     np.testing.assert_array_equal(rotate(np.array([1.0, 0, 0, 0]), v), v)
+
+
+def test_one_vector_is_a_row_of_many_to_the_bit() -> None:
+    q, v, w = (RNG.normal(size=(4, 5, k)) for k in (4, 3, 3))
+    np.testing.assert_array_equal(cross(v, w), np.cross(v, w))
+    for law, a, b in ((cross, v, w), (rotate, q, v), (rotate_back, q, v)):
+        stacked = law(a, b)
+        for i in np.ndindex(4, 5):
+            np.testing.assert_array_equal(stacked[i], law(a[i], b[i]))
+            np.testing.assert_array_equal(stacked[i], law(a[i][None], b[i][None])[0])
+        np.testing.assert_array_equal(law(a[0, 0], b), law(np.broadcast_to(a[0, 0], a.shape), b))

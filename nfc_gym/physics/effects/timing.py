@@ -104,9 +104,12 @@ class Delay(_Late):
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         """What each past command weighs, None for one that no simulation looks back to, and those commands."""
-        length = int(np.ceil(np.max(theta[..., 0], initial=0.0) / dt - 1e-9)) + 1
-        weights = [np.maximum(0.0, 1.0 - np.abs(theta[..., :1] / dt - age)) for age in range(length)]
-        return [w if w.any() else None for w in weights], [self._commands(ctrl)] * length
+        steps = theta[..., :1] / dt
+        whole = np.rint(steps)
+        steps = np.where(np.abs(steps - whole) < 1e-9, whole, steps)
+        ages = range(int(np.ceil(np.max(steps, initial=0.0))) + 1)
+        weights = [np.maximum(0.0, 1.0 - np.abs(steps - age)) for age in ages]
+        return [w if w.any() else None for w in weights], [self._commands(ctrl)] * len(ages)
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
