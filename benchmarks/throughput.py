@@ -15,11 +15,9 @@ import importlib.util
 import json
 import multiprocessing
 import os
-import statistics
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -30,70 +28,13 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 from peers.ant_v5 import AntV5, AntV5ContactVectorEnv
+from timing import SEED, Table, race, use_clock
 
 import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym.envs.vector import RobotVectorEnv
 from nfc_gym.physics.fields import ModelFields
 
-SEED = 0
 CORES = os.cpu_count() or 1
-
-
-@dataclass
-class Row:
-    """One figure with what it is compared to; `holds` is None where there is no goal."""
-
-    name: str
-    value: float
-    unit: str
-    baseline: float | None = None
-    goal: str | None = None
-    holds: bool | None = None
-    seeds: tuple[int, ...] = (SEED,)
-
-
-class Table:
-    """Collects rows and prints each as it comes."""
-
-    def __init__(self) -> None:
-        self.rows: list[Row] = []
-
-    def add(
-        self, name: str, value: float, unit: str, *, baseline: float | None = None, at_least: float | None = None,
-        at_most: float | None = None,
-    ) -> None:  # fmt: skip
-        goal = f">= {at_least:g}" if at_least is not None else f"<= {at_most:g}" if at_most is not None else None
-        holds = None if goal is None else bool(value >= at_least if at_least is not None else value <= at_most)
-        self.rows.append(Row(name, float(value), unit, baseline, goal, holds))
-        compared = "" if baseline is None else f"   (baseline {baseline:.4g})"
-        verdict = "" if goal is None else f"   goal {goal}: {'holds' if holds else 'FALLS SHORT'}"
-        print(f"{name:68} {value:10.4g} {unit}{compared}{verdict}", flush=True)
-
-
-def processor_time() -> float:
-    """Seconds of processor time of this process and its live children."""
-    own, tick = time.process_time(), os.sysconf("SC_CLK_TCK")
-    for child in multiprocessing.active_children():
-        fields = Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split()
-        own += (int(fields[11]) + int(fields[12])) / tick
-    return own
-
-
-clock: Callable[[], float] = time.perf_counter
-
-
-def race(contestants: dict[str, Callable[[], None]], turns: int, before: Callable[[], None] = lambda: None) -> dict:
-    """Median seconds of each contestant over `turns` turns, each turn in another order; `before` runs untimed."""
-    seconds: dict[str, list[float]] = {name: [] for name in contestants}
-    names = list(contestants)
-    for turn in range(turns + 1):
-        for name in names[turn % len(names) :] + names[: turn % len(names)]:
-            before()
-            began = clock()
-            contestants[name]()
-            if turn:  # the first turn warms up
-                seconds[name].append(clock() - began)
-    return {name: statistics.median(s) for name, s in seconds.items()}
 
 
 def randomised(space, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -395,8 +336,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the rows here")
     args = parser.parse_args()
     quick = args.quick
-    global clock
-    clock = processor_time if args.clock == "cpu" else time.perf_counter
+    use_clock(args.clock)
     turns = 5 if quick else 25
     robots = ["Jackal"] if quick else ["Jackal", "Quadcopter", "Quadruped", "Ant", "Humanoid"]
     grounds = [f"{robot}{ground}" for robot in robots for ground in ("Flat", "Rough")]

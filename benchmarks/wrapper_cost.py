@@ -19,7 +19,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from throughput import Table
+from timing import Table
 
 import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym.core import Fidelity
