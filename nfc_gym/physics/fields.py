@@ -97,6 +97,12 @@ class ModelFields:
 
     def __getitem__(self, name: str) -> NDArray:
         """Live array of the field: its own shape for one model, `(nsim, ...)` for a batch."""
+        if name in _SETCONST:
+            self._dirty = True
+        return self._live(name)
+
+    def _live(self, name: str) -> NDArray:
+        """The same to be read alone: nothing counts as written."""
         if name not in self._arrays:
             if isinstance(self._target, Batch):
                 self._arrays[name] = self._target.expand(name)
@@ -106,8 +112,6 @@ class ModelFields:
                 if not isinstance(value, np.ndarray):
                     self._scalars.add(name)
                 self._arrays[name] = np.asarray(value, float) if name in self._scalars else value
-        if name in _SETCONST:
-            self._dirty = True
         return self._arrays[name]
 
     def restore(self) -> None:
@@ -145,8 +149,8 @@ class RowFields(ModelFields):
     def __init__(self, whole: ModelFields, ids: NDArray[np.intp]) -> None:
         self._whole, self._ids = whole, ids
         self._target, self.nominal_model, self.batched = whole._target, whole.nominal_model, True
-        self._arrays = {name: whole[name][ids] for name in whole._arrays}
-        self._dirty = False
+        self._arrays = {name: array[ids] for name, array in whole._arrays.items()}
+        self._dirty = whole._dirty  # something was written there that nobody committed
 
     @property
     def count(self) -> int | None:
@@ -156,15 +160,20 @@ class RowFields(ModelFields):
     def __getitem__(self, name: str) -> NDArray:
         """Copy of the simulations' values, (k, ...), to be written before `commit`."""
         if name not in self._arrays:
-            self._arrays[name] = self._whole[name][self._ids]
-        if name in _SETCONST:
-            self._dirty = True
+            self._arrays[name] = self._whole._live(name)[self._ids]
         return self._arrays[name]
 
+    def restore(self) -> None:
+        """Every field touched so far goes back to its nominal value."""
+        for name, array in self._arrays.items():
+            array[...] = self.nominal(name)
+
     def commit(self) -> None:
-        """Put the values into the batch, and recompute what MuJoCo derives from them."""
+        """Put the values into the batch, and recompute what MuJoCo derives from those that are others than before."""
         for name, values in self._arrays.items():
-            self._whole[name][self._ids] = values
+            live = self._whole._live(name)
+            self._dirty = self._dirty or (name in _SETCONST and not np.array_equal(live[self._ids], values))
+            live[self._ids] = values
         if self._dirty:
             self._target.set_const(self._ids)
         self._dirty = False

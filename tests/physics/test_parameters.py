@@ -123,6 +123,24 @@ def test_some_rows_of_a_batch_are_written_as_all_would_be_and_leave_the_others(r
             np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=f"{name} of {i}")
 
 
+def test_rows_that_stay_as_they_were_are_recomputed_only_if_somebody_else_wrote_to_them() -> None:
+    batch = Batch(MODEL, 2, 1)
+    fields = ModelFields(batch, MODEL)
+    SPACE.write(fields, np.tile(SPACE.nominal, (2, 1)))
+    fields.commit()
+    calls = []
+    batch.set_const = lambda ids=None: calls.append(ids)  # type: ignore[method-assign]
+    part = fields.rows(np.array([1]))
+    part.restore()
+    SPACE.write(part, SPACE.nominal[None])
+    part.commit()
+    assert calls == []
+    fields["body_mass"][1] *= 2  # and not committed
+    part = fields.rows(np.array([1]))
+    part.commit()
+    assert [c.tolist() for c in calls] == [[1]]
+
+
 def test_normalise_maps_the_box_and_inverts() -> None:
     np.testing.assert_allclose(SPACE.normalise(SPACE.low), -1)
     np.testing.assert_allclose(SPACE.normalise(SPACE.high), 1)
