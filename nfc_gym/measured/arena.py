@@ -56,7 +56,7 @@ class Arena:
         self.fit_data, self.select, self.current, self.under, self.rng, self.say = (
             fit_data, select, current, under, rng, say,
         )  # fmt: skip
-        self.on = metric(select.problem, select.sigma, extra)
+        self.on, self.extra = metric(select.problem, select.sigma, extra), extra
         self.blocks = clusters(fit_data.problem), clusters(select.problem)
         self.folds = fold_of(fit_data.problem)
         self.base = losses(select.problem, self.on, current)
@@ -151,6 +151,12 @@ class Arena:
             fitted, self.current, self.fit_data.problem, self.under, self.left_out, self.folds, self.blocks[0],
             self.select.problem, self.on, self.base, self.rng,
         )  # fmt: skip
+
+    @property
+    def leftover(self) -> float:
+        """What the model that set the metric leaves beyond the noise: nats a number, 0 if nothing."""
+        noise = np.einsum("sii->i", self.fit_data.sigma) / max(len(self.fit_data.problem), 1)
+        return float(0.5 * np.log1p(self.extra / np.maximum(noise, 1e-30)).mean())
 
     def likelier(self, j: Judged) -> bool:
         """Whether a candidate is likelier than the model to beat by more than its price, each with its own slack."""

@@ -15,6 +15,7 @@ _SHARED = 0.8  # the same for the same law at a wider place
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
 _PAIRED = 3  # mechanisms that are tried in pairs
 _TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
+_LEFT = 0.1  # nats a number beyond the noise, below which a second law beside one that is believed has nothing to mend
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
 
 
@@ -61,7 +62,7 @@ class Contest:
         beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in judged)]
         outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *(arena.judge(j.fitted) for j in beaten)]])
         believed = [j for j in judged if self._believed(j)]
-        pairs = self._pairs(judged, entered)
+        pairs = self._pairs(judged, entered) if not believed or arena.leftover > _LEFT else []
         outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
         alone = max((j.total for j in believed), default=0.0)
         both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(j)]

@@ -76,6 +76,14 @@ def test_own_slack_weighs_a_mended_quantity_however_large_the_error_was() -> Non
     assert half - whole > 3 * (bare - half)
 
 
+def test_leftover_counts_the_slack_beyond_the_noise() -> None:
+    contest, _ = arena(0.0)
+    assert contest.leftover == 0.0
+    variance = float(contest.fit_data.sigma[0, 0, 0])
+    contest.extra = np.repeat([3 * variance, 0.0], 4)  # half of the numbers have twice the noise's deviation
+    assert contest.leftover == pytest.approx(0.5 * np.log(2))
+
+
 @pytest.mark.parametrize(
     ("param", "value", "plausible"),
     [
