@@ -47,6 +47,7 @@ class Log:
       known: `<field>:<object>` -> (T,) model fields that the log itself gives.
       servo: `ctrl:<actuator>` -> {"gain" | "supply" | "damping": (T,)} of a firmware servo's law.
       group: logs of one group are never split between fitting and verifying.
+      condition: label of what the day was like (a wind, a floor); logs of one label share it.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Log:
     known: Mapping[str, Array] = field(default_factory=dict)
     servo: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
     group: str = ""
+    condition: str = ""
 
     def __post_init__(self) -> None:
         if self.time.ndim != 1 or len(self.time) < 2:
@@ -105,4 +107,5 @@ class Log:
             known={k: v[rows] for k, v in self.known.items()},
             servo={k: {n: v[rows] for n, v in terms.items()} for k, terms in self.servo.items()},
             group=self.group,
+            condition=self.condition,
         )

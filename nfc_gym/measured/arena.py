@@ -14,6 +14,7 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import Each, split
 from nfc_gym.physics.rollout import Plant
 
@@ -252,5 +253,5 @@ def contains(law: Effect, plain: Effect) -> bool:
     """Whether a law has a plainer one as its special case: it can then do no worse, and is no alternative to it."""
     same = set(plain.where) <= set(law.where)
     if law.family == plain.family:
-        return same and isinstance(law, Each)
+        return same and isinstance(law, Each | Conditioned)
     return same and ((plain.family,) in law.simpler or plain.family in law.covers)

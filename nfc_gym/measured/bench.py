@@ -18,6 +18,7 @@ from nfc_gym.measured.segments import Layout, servos
 from nfc_gym.measured.states import States, estimate_states
 from nfc_gym.physics.effects import complete_inertia, propose
 from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrides
+from nfc_gym.physics.effects.conditions import conditioned
 from nfc_gym.physics.parameters import ParameterSpace, parameters_from_toml
 from nfc_gym.physics.rollout import Plant
 
@@ -177,4 +178,5 @@ def candidates(bench: Bench, logs: Sequence[Log]) -> list[Effect]:
         hidden = lambda e: (overrides(e, "action") and not overrides(e, "demand")) or overrides(e, "sense")  # noqa: E731
         found = [e for e in found if not hidden(e)]
     available = set(logs[0].exogenous)
-    return [e for e in found if set(e.signals) <= available]
+    found = [e for e in found if set(e.signals) <= available]
+    return found + conditioned(found, sorted({log.condition for log in logs}))

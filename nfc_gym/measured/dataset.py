@@ -141,7 +141,9 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
     if defects:
         return None, defects
     parts = {"controls": controls, "channels": channels, "exogenous": exogenous, "known": known, "servo": servo}
-    log = attempt("log", lambda: Log(name=source.name, time=time, group=source.group, **parts))
+    log = attempt(
+        "log", lambda: Log(name=source.name, time=time, group=source.group, condition=source.condition, **parts)
+    )
     return log, defects
 
 

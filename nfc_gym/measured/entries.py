@@ -203,9 +203,10 @@ class LogEntry(Strict):
     path: str
     split: Literal["fit", "select", "verify", "auto"] = "auto"
     group: str | None = None
+    condition: str | None = None
     splits: str | None = None
 
-    @field_validator("group")
+    @field_validator("group", "condition")
     @classmethod
     def _regex(cls, value: str | None) -> str | None:
         try:
@@ -213,7 +214,7 @@ class LogEntry(Strict):
         except re.error as e:
             raise PydanticCustomError("regex", "not a regular expression: {why}", {"why": str(e)}) from None
         if groups < 1:
-            raise PydanticCustomError("regex", "needs one (group) in round brackets, which names the log's group")
+            raise PydanticCustomError("regex", "needs one (group) in round brackets, which gives the name")
         return value
 
     @model_validator(mode="after")

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 # values. A coarse step averages over the jumps and a tiny one nearly always misses them; any step between counts a jump
 # for a steep slope. A rough fit therefore goes from the first to the second.
 COARSE, FINE, TINY = 1e-1, 2e-4, 1e-5
+_UNSEEN = 1e-8  # of the largest column's norm: what the differences' own rounding makes of one that is zero
 _SPREAD = 0.3  # of a polish's first draws, in scaled parameters
 
 
@@ -58,7 +59,10 @@ def jacobian(
     rows = np.repeat(z[None], len(which), 0)
     rows[np.arange(len(which)), which] += step
     moved = metric.whiten(problem.residual(limits.plant, limits.x(rows, x)))
-    return np.moveaxis((moved - base) / step[:, None, None], 0, -1)
+    slopes = (moved - base) / step[:, None, None]
+    norms = np.linalg.norm(slopes.reshape(len(which), -1), axis=1)
+    slopes[norms < _UNSEEN * norms.max(initial=0.0)] = 0.0
+    return np.moveaxis(slopes, 0, -1)
 
 
 def fit(
@@ -115,8 +119,15 @@ def fit(
         x = limits.x(solved.x, start)
     if problem.rough and len(limits.scale):
         last["jacobian"] = slopes(x, COARSE)
-    base = white(x)
-    return Fit(plant, x, base, last.get("jacobian", np.zeros((*base.shape, 0))))
+    base, found = white(x), last.get("jacobian", np.zeros((*problem.mask.shape, 0)))
+    unseen = ~found.any((0, 1))
+    if unseen.any():
+        # What the data say nothing of stays at null, unless that would change the motion after all.
+        quiet = limits.x(np.where(unseen, limits.centre, limits.at(x)), start)
+        moved = white(quiet)
+        if loss(moved).sum() <= loss(base).sum() * (1 + 1e-9):
+            x, base = quiet, moved
+    return Fit(plant, x, base, found)
 
 
 def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed: int) -> Fit:
@@ -162,7 +173,8 @@ def uncertainty(result: Fit, blocks: NDArray[np.intp]) -> Array:
     Args:
       blocks: (S,) cluster of each block of numbers (neighbouring segments share one).
 
-    Anchored parameters get 0; directions that the data do not show keep the prior's spread.
+    Anchored parameters get 0; directions that the data do not show keep the prior's spread, which for effects is
+    infinite.
     """
     limits = box(result.plant)
     weight = loss_weight(result.white) ** 2
@@ -175,4 +187,5 @@ def uncertainty(result: Fit, blocks: NDArray[np.intp]) -> Array:
     robust = inverse @ (clustered.T @ clustered) @ inverse
     slopes = limits.slopes(result.x)
     spread = lambda covariance: np.einsum("ni,ij,nj->n", slopes, covariance, slopes)  # noqa: E731
-    return np.sqrt(np.maximum(np.maximum(spread(inverse), spread(robust)), 0.0))
+    sd = np.sqrt(np.maximum(np.maximum(spread(inverse), spread(robust)), 0.0))
+    return np.where((slopes[:, ~hessian.any(0)] != 0).any(1), np.inf, sd)

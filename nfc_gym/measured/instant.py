@@ -19,6 +19,7 @@ from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.smoothing import moving_average
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import actuator_names
+from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -40,6 +41,7 @@ class Track:
     measured: Array
     mask: NDArray[np.bool_]
     noise: Array
+    condition: str = ""
 
 
 def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[str], stride: int) -> Track:
@@ -63,7 +65,7 @@ def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[st
         log.name, log.time[rows], log.interval * stride,
         states.qpos[rows], states.qvel[rows], states.qacc[rows], ctrl[rows],
         {k: v[rows] for k, v in log.exogenous.items()}, known,
-        np.concatenate(columns, 1)[rows], np.concatenate(masks, 1)[rows], np.array(noise),
+        np.concatenate(columns, 1)[rows], np.concatenate(masks, 1)[rows], np.array(noise), log.condition,
     )  # fmt: skip
 
 
@@ -120,10 +122,22 @@ class InstantProblem(Problem):
         """Moving average (T, C) over the samples that remain of the declared width."""
         return moving_average(values, max(1, self.smooth // self.stride))
 
+    def along(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
+        """`evaluate`, each track in its own condition."""
+        if all(not isinstance(e, Conditioned) for e in plant.effects):
+            return self.evaluate(plant, x, tracks)
+        out: list[Array] = [np.zeros(0)] * len(tracks)
+        for label in dict.fromkeys(t.condition for t in tracks):
+            of = [i for i, t in enumerate(tracks) if t.condition == label]
+            inside, own = plant.under(x, np.array([label]))
+            for i, values in zip(of, self.evaluate(inside, own[:, 0], [tracks[i] for i in of]), strict=True):
+                out[i] = values
+        return out
+
     def residual(self, plant: Plant, x: Array) -> Array:
         """See `Problem`."""
         needed = np.unique(self.log_of)
-        predicted = self.evaluate(plant, x, [self.tracks[i] for i in needed])
+        predicted = self.along(plant, x, [self.tracks[i] for i in needed])
         out = np.zeros((len(x), *self.mask.shape))
         for i, values in zip(needed, predicted, strict=True):
             t = self.tracks[i]
@@ -156,7 +170,7 @@ class InstantProblem(Problem):
     def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "InstantProblem":
         """See `Problem`."""
         out = copy.copy(self)
-        predicted = self.evaluate(plant, x[None], self.tracks)
+        predicted = self.along(plant, x[None], self.tracks)
         out.tracks = [
             Track(**{**t.__dict__, "measured": p[0] + rng.normal(size=t.measured.shape) * t.noise})
             for t, p in zip(self.tracks, predicted, strict=True)

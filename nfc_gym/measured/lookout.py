@@ -8,6 +8,7 @@ from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screen, Screened, screen_all
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.conditions import MARK
 
 _FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block
 _ENOUGH = 12  # blocks that such a thinning must leave
@@ -31,8 +32,8 @@ class Lookout:
 
     def screen(self, screen: Screen, pool: Sequence[Effect]) -> list[Screened]:
         """Candidates that are not at work yet, by what they gain as far as straight lines tell, best first."""
-        taken = {e.id.removesuffix(":each") for e in screen.current.plant.effects}
-        left = [e for e in pool if e.id not in taken and (e.id not in self.hopeless or len(e.where) > 1)]
+        taken = {_plain(e) for e in screen.current.plant.effects}
+        left = [e for e in pool if _plain(e) not in taken and (e.id not in self.hopeless or len(e.where) > 1)]
         self.say(f"screening {len(left)} candidates")
         found = screen_all(screen, self._promising(screen, left))
         # Places that show nothing at all are not looked at again; sets of places stay, since they stand for many.
@@ -72,3 +73,8 @@ class Lookout:
         families = {r.effect.family: r.effect for r in reversed(rough)}
         best = [r.effect for r in rough[:_FIELD]]
         return best + [e for e in families.values() if e not in best]
+
+
+def _plain(effect: Effect) -> str:
+    """Id without the mark of values that differ by place or condition."""
+    return effect.id.removesuffix(":each").removesuffix(MARK)

@@ -75,7 +75,7 @@ def _predict(
     kind = InverseProblem if mode == "inverse" else ForwardProblem
     states = [bench.states[log.name] for log in logs]
     problem = kind(bench.plant.model, logs, states, bench.dataset.mapping.segments.length)
-    values = problem.evaluate(plant, x[None], problem.tracks)
+    values = problem.along(plant, x[None], problem.tracks)
     return {log.name: v[0][:, 0] if v.shape[-1] == 1 else v[0] for log, v in zip(logs, values, strict=True)}
 
 

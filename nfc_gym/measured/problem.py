@@ -178,6 +178,7 @@ class RolloutProblem(Problem):
         self, plant: Plant, x: Array, segments: Segments, observers: Sequence[Observer]
     ) -> tuple[list[Array], Trajectory]:
         """What each channel would report along a roll-out, (P, S, K + 1, dim) each, sensor effects included."""
+        plant, x = plant.under(x, segments.condition)
         traj = plant.shoot(x, segments, sensors=any(o.needs_sensors for o in observers))
         thetas = plant.split(x)[1]
         out = []
@@ -300,11 +301,13 @@ def _map(segments: Segments, rows, qpos: Array, qvel: Array) -> Segments:
 
 
 def _pick(segments: Segments, index: NDArray[np.intp]) -> Segments:
-    return _map(segments, lambda a: a[index], segments.qpos[index], segments.qvel[index])
+    picked = _map(segments, lambda a: a[index], segments.qpos[index], segments.qvel[index])
+    return picked if segments.condition is None else replace(picked, condition=segments.condition[index])
 
 
 def _repeat(segments: Segments, n: int, qpos: Array, qvel: Array) -> Segments:
-    return _map(segments, lambda a: np.concatenate([a] * n), qpos, qvel)
+    many = _map(segments, lambda a: np.concatenate([a] * n), qpos, qvel)
+    return many if segments.condition is None else replace(many, condition=np.tile(segments.condition, n))
 
 
 def _refine(segments: Segments) -> Segments:

@@ -10,6 +10,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from nfc_gym.measured.box import box
 from nfc_gym.measured.fit import Fit, fit
@@ -18,6 +19,7 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.effects.base import Effect, overrides
 
 Array = NDArray[np.float64]
+_FAR = 4.0  # probing sizes beyond which a secant is not believed
 _SCOUT = 0.7  # spread of a scout's draws, in scaled parameters
 
 
@@ -178,7 +180,7 @@ class Screen:
         size = (probe - effect.null)[np.arange(len(probe)), sizing]
         low, high = (effect.low - effect.null)[sizing] / size, (effect.high - effect.null)[sizing] / size
         low, high = np.minimum(low, high), np.maximum(low, high)
-        multiple = np.clip(solution, np.maximum(low, -4.0), np.minimum(high, 4.0))
+        multiple = _bounded(columns, -self.projected, solution, np.maximum(low, -_FAR), np.minimum(high, _FAR))
         theta = probe[0].copy()
         theta[sizing] = effect.null[sizing] + multiple * size
         return self._gain(columns, multiple), np.clip(theta, effect.low, effect.high), multiple
@@ -207,6 +209,22 @@ class Screen:
         mean = np.maximum(gains.mean(1), 1e-12)
         luckiest = float(np.quantile((gains / mean[:, None]).max(0), 0.99))
         return {s.effect.id: luckiest * float(m) for s, m in zip(kept, mean, strict=True)}
+
+
+def _bounded(columns: Array, target: Array, free: Array, low: Array, high: Array) -> Array:
+    """Multiples (k,) of columns (n, k) that come nearest to a target within bounds; `free` is the answer without them.
+
+    Cutting the free answer's entries one by one would leave a law's force without the drag that balances it.
+    """
+    norms = np.linalg.norm(columns, axis=0)
+    shows = norms > 1e-8 * norms.max()
+    free = np.where(shows, free, 0.0)
+    if ((free >= low) & (free <= high)).all():
+        return free
+    small = np.asarray(np.linalg.qr(np.column_stack([columns[:, shows], target]), mode="r"), np.float64)
+    out = np.zeros(len(free))
+    out[shows] = lsq_linear(small[:, :-1], small[:, -1], (low[shows], high[shows])).x
+    return out
 
 
 def _span(columns: Array) -> Array:

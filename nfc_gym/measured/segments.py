@@ -150,4 +150,5 @@ def lay(
         exogenous={k: lane("exogenous", k) for k in logs[0].exogenous},
         known=known,
         servo=servo,
+        condition=np.array([logs[i].condition for i in where.log]),
     )

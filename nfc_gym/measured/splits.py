@@ -27,13 +27,14 @@ class Source:
     Attributes:
       name: unique; the stem, or the path below the mapping's folder where two stems are alike.
       split: fit, select, verify, or auto where the split rule decides.
-      group: empty where none was given.
+      group, condition: empty where none was given.
     """
 
     name: str
     path: Path
     split: str
     group: str
+    condition: str = ""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def find_logs(mapping: Mapping, folder: Path) -> list[Source]:
     Raises:
       InputError: nothing matches, a file is listed twice, a group's pattern does not match, `splits` names other files.
     """
-    found: dict[Path, tuple[LogEntry, str, str]] = {}
+    found: dict[Path, tuple[LogEntry, str, str, str]] = {}
     for entry in mapping.logs:
         paths = _matches(entry, folder)
         assigned = _read_splits(folder / entry.splits, paths) if entry.splits else {}
@@ -74,7 +75,8 @@ def find_logs(mapping: Mapping, folder: Path) -> list[Source]:
                 )
             name = assigned.get(path.stem, entry.split)
             split, group = (name, "") if name in (*SPLITS, "auto") else ("auto", name)
-            found[path] = entry, split, _group(entry, path) or group
+            given = _named(entry.group, path, "group") or group
+            found[path] = entry, split, given, _named(entry.condition, path, "condition")
     stems = Counter(path.stem for path in found)
 
     def name_of(path: Path) -> str:
@@ -83,7 +85,7 @@ def find_logs(mapping: Mapping, folder: Path) -> list[Source]:
         inside = path.relative_to(folder) if path.is_relative_to(folder) else path
         return inside.with_suffix("").as_posix()
 
-    sources = [Source(name_of(path), path, split, group) for path, (_, split, group) in found.items()]
+    sources = [Source(name_of(path), path, *rest) for path, (_, *rest) in found.items()]
     name, count = Counter(source.name for source in sources).most_common(1)[0]
     if count > 1:
         raise InputError(f"logs: {count} files would all be called {name!r}; rename them")
@@ -109,13 +111,14 @@ def _matches(entry: LogEntry, folder: Path) -> list[Path]:
     return matches
 
 
-def _group(entry: LogEntry, path: Path) -> str:
-    if entry.group is None:
+def _named(pattern: str | None, path: Path, what: str) -> str:
+    """What a pattern's round brackets hold of a file name."""
+    if pattern is None:
         return ""
-    match = re.search(entry.group, path.stem)
+    match = re.search(pattern, path.stem)
     if match is None or not match[1]:
         raise InputError(
-            f"logs: group pattern {entry.group!r} does not match the file name {path.stem!r}; widen the pattern"
+            f"logs: {what} pattern {pattern!r} does not match the file name {path.stem!r}; widen the pattern"
         )
     return match[1]
 

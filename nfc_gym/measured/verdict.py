@@ -14,6 +14,7 @@ from nfc_gym.measured.metric import metric
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.rounds import Round
 from nfc_gym.measured.search import Found
+from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import Each
 from nfc_gym.physics.rollout import Plant
 
@@ -187,6 +188,7 @@ def effect_rows(
                 "share_of_excess": shares.get(effect.id, 0.0),
                 "equivalents": equivalents.get(effect.id, []),
                 "own_values": isinstance(effect, Each),
+                **({"conditions": list(effect.conditions)} if isinstance(effect, Conditioned) else {}),
                 "parameters": {
                     p.name: {
                         "value": float(t),

@@ -14,8 +14,10 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from nfc_gym.core.errors import InputError
 from nfc_gym.physics.acting import Acting
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import ParameterSpace, resolve, write_field
 
@@ -47,6 +49,7 @@ class Segments:
       servo: per `Servo`, its gain, supply and damping, (S, H + K) each.
       settle: steps for which the first command is held before the start; velocities and hidden states are then kept,
         the positions go back to the measured ones. 0 starts at the measured velocities.
+      condition: (S,) label of the condition that each segment was recorded in.
     """
 
     dt: float
@@ -58,6 +61,7 @@ class Segments:
     known: Mapping[tuple[str, tuple[str, ...]], Array] = field(default_factory=dict)
     servo: Sequence[tuple[Servo, Mapping[str, Array]]] = ()
     settle: int = 0
+    condition: NDArray[np.str_] | None = None
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -131,6 +135,32 @@ class Plant:
         psi, parts = self.split(coordinates)
         return np.concatenate([psi, *(e.unchart(c) for e, c in zip(self.effects, parts, strict=True))], -1)
 
+    def under(self, x: Array, labels: NDArray[np.str_] | None) -> "tuple[Plant, Array]":
+        """The machine in the conditions of some segments: effects that differ between them have one value each.
+
+        Args:
+          x: (P, size) full parameter vectors.
+          labels: (S,) conditions.
+
+        Returns:
+          This plant and x where no effect differs; else a plant of the effects inside, and x (P, S, size').
+        """
+        if x.ndim == 3 or not any(isinstance(e, Conditioned) for e in self.effects):
+            return self, x
+        if labels is None:
+            raise InputError("these segments have no condition, and effects of the model differ between conditions")
+        psi, thetas = self.split(x)
+        parts = [np.broadcast_to(psi[:, None], (len(x), len(labels), psi.shape[-1]))]
+        effects: list[Effect] = []
+        for effect, theta in zip(self.effects, thetas, strict=True):
+            if isinstance(effect, Conditioned):
+                parts.append(theta[:, effect.columns[effect.index(labels)]])
+                effects.append(effect.inner)
+            else:
+                parts.append(np.broadcast_to(theta[:, None], (len(x), len(labels), theta.shape[-1])))
+                effects.append(effect)
+        return self.with_effects(effects), np.concatenate(parts, -1)
+
     def write(self, fields: ModelFields, x: Array) -> None:
         """Psi and the effects' model edits into one model, x (size,), or a batch, x (nsim, size)."""
         psi, thetas = self.split(x)
@@ -146,6 +176,9 @@ class Plant:
           segments: starts, commands and signals.
           sensors: record `sensordata` too.
         """
+        plant, x = self.under(x, segments.condition)
+        if plant is not self:
+            return plant.shoot(x, segments, sensors)
         width = self.model.nq + self.model.nv + (self.model.nsensordata if sensors else 0)
         turn = max(1, int(_ROW_BYTES / (8 * len(segments) * (segments.steps + 1) * width)))
         parts = [self._shoot(x[i : i + turn], segments, sensors) for i in range(0, len(x), turn)]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.acting import Acting
 from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
@@ -38,20 +39,31 @@ def recorded(effects: Given) -> list[dict[str, Any]] | str:
     return [to_row(*e) if isinstance(e, tuple) else dict(e) for e in effects]
 
 
-def bound(effects: Given, model: mujoco.MjModel) -> tuple[list[Effect], list[Array]]:
-    """Effects of their own, bound to a model, and their values.
+def bound(effects: Given, model: mujoco.MjModel, condition: str | None = None) -> tuple[list[Effect], list[Array]]:
+    """Effects of their own, bound to a model, and their values in a condition.
 
     Raises:
       InputError: a row, a family, a place or a parameter that does not exist, or values of another number.
     """
     given = read_effects(effects)["effects"] if isinstance(effects, str | os.PathLike) else effects
     pairs = [copy.deepcopy(e) if isinstance(e, tuple) else from_row(e) for e in given]
+    pairs = [_in_condition(*pair, condition) for pair in pairs]
     for effect, theta in pairs:
         if np.shape(theta) != (len(effect.params),) or not np.isfinite(theta).all():
             names = ", ".join(p.name for p in effect.params)
             raise InputError(f"ApplyEffects: {effect.id} takes finite values of {names}, got {theta}")
         effect.bind(model)
     return [e for e, _ in pairs], [np.asarray(t, float) for _, t in pairs]
+
+
+def _in_condition(effect: Effect, theta: Array, condition: str | None) -> tuple[Effect, Array]:
+    """The effect with its values of one condition, where they differ."""
+    if not isinstance(effect, Conditioned) or np.shape(theta) != (len(effect.params),):
+        return effect, theta
+    if condition is None:
+        known = ", ".join(effect.conditions)
+        raise InputError(f"ApplyEffects: {effect.id} differs between conditions: say condition=, one of {known}")
+    return effect.inner, effect.inside(np.asarray(theta, float), condition)
 
 
 def check_signals(effects: Sequence[Effect], exogenous: Mapping[str, Signal]) -> None:
@@ -69,12 +81,14 @@ class Application:
     Args:
       sim: the simulation.
       given: as `ApplyEffects` takes them.
-      exogenous: as `ApplyEffects` takes them.
+      exogenous, condition: as `ApplyEffects` takes them.
     """
 
-    def __init__(self, sim: Simulation, given: Given, exogenous: Mapping[str, Signal] | None) -> None:
+    def __init__(
+        self, sim: Simulation, given: Given, exogenous: Mapping[str, Signal] | None, condition: str | None = None
+    ) -> None:
         self.sim, self.exogenous = sim, dict(exogenous or {})
-        self.effects, values = bound(given, sim.nominal)
+        self.effects, values = bound(given, sim.nominal, condition)
         self.thetas = [np.broadcast_to(t, (*sim.shape, len(t))) for t in values]
         check_signals(self.effects, self.exogenous)
         self.reads = any(e.signals for e in self.effects)
@@ -136,6 +150,7 @@ class ApplyEffects(EnvWrapper):
         of an `effects.yaml`. They act in this order.
       exogenous: signals that effects read: name -> a number, or a function of the episode's time in s (`exo:time` is
         given).
+      condition: which condition's values effects that differ between conditions have.
 
     Commands are changed, dry friction and forces written before every physics step; model edits are made at each reset,
     on top of psi; hidden states (delays, lags, heat) begin settled at an episode's first command. Effects on sensors
@@ -146,10 +161,16 @@ class ApplyEffects(EnvWrapper):
         stepped so.
     """
 
-    def __init__(self, env: gym.Env, effects: Given, exogenous: Mapping[str, Signal] | None = None) -> None:
-        super().__init__(env, effects=effects, exogenous=exogenous)
+    def __init__(
+        self,
+        env: gym.Env,
+        effects: Given,
+        exogenous: Mapping[str, Signal] | None = None,
+        condition: str | None = None,
+    ) -> None:
+        super().__init__(env, effects=effects, exogenous=exogenous, condition=condition)
         self.sim = simulation_of(env, "ApplyEffects")
-        self.application = Application(self.sim, effects, exogenous)
+        self.application = Application(self.sim, effects, exogenous, condition)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -168,13 +189,14 @@ class ApplyEffects(EnvWrapper):
         path: str | os.PathLike[str],
         exogenous: Mapping[str, Signal] | None = None,
         any_model: bool = False,
+        condition: str | None = None,
     ) -> "ApplyEffects":
         """The effects of an `effects.yaml`, for an environment whose model is the `model.xml` beside it.
 
         Args:
           env: the environment.
           path: an `effects.yaml`.
-          exogenous: as for the constructor.
+          exogenous, condition: as for the constructor.
           any_model: put them into another model too.
 
         Raises:
@@ -183,7 +205,7 @@ class ApplyEffects(EnvWrapper):
         """
         if not any_model:
             check_model(env, os.fspath(path))
-        return cls(env, os.fspath(path), exogenous)
+        return cls(env, os.fspath(path), exogenous, condition)
 
     def recorded(self, name: str, value: Any) -> Any:
         """See `EnvWrapper`."""
@@ -204,10 +226,16 @@ class VectorApplyEffects(VectorEnvWrapper):
     Signals that are functions are given the episodes' times (n,).
     """
 
-    def __init__(self, env: VectorEnv, effects: Given, exogenous: Mapping[str, Signal] | None = None) -> None:
-        super().__init__(env, effects=effects, exogenous=exogenous)
+    def __init__(
+        self,
+        env: VectorEnv,
+        effects: Given,
+        exogenous: Mapping[str, Signal] | None = None,
+        condition: str | None = None,
+    ) -> None:
+        super().__init__(env, effects=effects, exogenous=exogenous, condition=condition)
         self.sim = batch_simulation_of(env, "ApplyEffects")
-        self.application = Application(self.sim, effects, exogenous)
+        self.application = Application(self.sim, effects, exogenous, condition)
 
     def recorded(self, name: str, value: Any) -> Any:
         """See `EnvWrapper`."""

@@ -38,6 +38,8 @@ class Param:
       resolution: a size below which nobody would speak of the effect.
       natural: True where the bounds are nature's own (a share of one), and not merely beyond all that is plausible: a
         fit may then rightly end there.
+      ambient: True where the value belongs to the day and not to the machine (the wind, not the drag): it may differ
+        from one condition of the logs to another.
     """
 
     name: str
@@ -49,6 +51,7 @@ class Param:
     shape: bool = False
     resolution: float = 0.0
     natural: bool = False
+    ambient: bool = False
 
 
 @dataclass(frozen=True)

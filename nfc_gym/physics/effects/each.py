@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Rows, overrides
+from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.fields import ModelFields
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ def each(members: Sequence[Effect]) -> Each:
 
 def split(effect: Effect, plant: "Plant") -> tuple[Effect, NDArray[np.intp]] | None:
     """A tied effect of several places as `Each`, and the old parameter each new one starts from; None if it cannot."""
-    if isinstance(effect, Each) or len(effect.where) < 2 or effect.generic:
+    if isinstance(effect, Each | Conditioned) or len(effect.where) < 2 or effect.generic:
         return None
     members = [type(effect)((name,), effect.params) for name in effect.where]
     together = each(members)

@@ -27,7 +27,7 @@ class ExternalForce(Effect):
 
     family = "external_force"
     summary = "Constant external force"
-    PARAMS = tuple(Param(axis, "N", -1e5, 1e5, probes=(0.1,)) for axis in "xyz")
+    PARAMS = tuple(Param(axis, "N", -1e5, 1e5, probes=(0.1,), ambient=True) for axis in "xyz")
     ON_JOINT = (Param("force", "N m", -1e5, 1e5, probes=(0.1,)),)
 
     @classmethod
@@ -86,7 +86,7 @@ class Wind(Effect):
     covers = ("external_force",)  # a gale on hardly any drag
     summary = "Steady wind"
     PARAMS = (
-        *(Param(f"push_{axis}", "N", -1e5, 1e5, probes=(0.1,)) for axis in "xyz"),
+        *(Param(f"push_{axis}", "N", -1e5, 1e5, probes=(0.1,), ambient=True) for axis in "xyz"),
         Param("drag", "N s/m", 0.0, 1e4, probes=(0.1,)),
     )
 
@@ -128,8 +128,8 @@ class Slope(Effect):
     family = "slope"
     summary = "Gravity tilted against the model's vertical"
     PARAMS = (
-        Param("roll", "rad", -0.6, 0.6, probes=(0.05,), resolution=1e-3),
-        Param("pitch", "rad", -0.6, 0.6, probes=(0.05,), resolution=1e-3),
+        Param("roll", "rad", -0.6, 0.6, probes=(0.05,), resolution=1e-3, ambient=True),
+        Param("pitch", "rad", -0.6, 0.6, probes=(0.05,), resolution=1e-3, ambient=True),
     )
 
     def model(self, fields: ModelFields, theta: Array) -> None:
