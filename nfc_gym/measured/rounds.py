@@ -21,13 +21,23 @@ _FINALISTS = 4  # candidates that are judged again under the sharper metric
 
 @dataclass
 class Round:
-    """What one round of the search saw, for the report."""
+    """What one round of the search saw, for the report.
+
+    Attributes:
+      accepted: ids of the laws that it added.
+      share: of the misfit on the selection logs that they explain.
+      ranking: its candidates.
+      equivalents: ids of what explains the data as well.
+      reason: why nothing was accepted.
+      exchanged: id of the earlier law whose place the accepted one took.
+    """
 
     accepted: list[str]
     share: float
     ranking: list[dict] = field(default_factory=list)
     equivalents: list[str] = field(default_factory=list)
     reason: str = ""
+    exchanged: str = ""
 
 
 class Contest:

@@ -16,6 +16,7 @@ from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.rounds import Contest, Round
 from nfc_gym.measured.screen import Screen, Screened
 from nfc_gym.measured.settle import settle
+from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects.base import Effect
 
 Say = Callable[[str], None]
@@ -27,12 +28,14 @@ class Options:
 
     Attributes:
       most: effects at most.
+      swaps: exchanges of an earlier law at most.
       worth: share of the excess that an effect must explain to be named.
       short: candidates refitted in each round.
       seed: of bootstrap and chance draws.
     """
 
     most: int = 8
+    swaps: int = 2
     worth: float = 0.02
     short: int = 8
     seed: int = 0
@@ -94,9 +97,11 @@ class Search:
             screened = self.lookout.closer(screen, self.lookout.screen(screen, self.named))
             outcome, best = Contest(arena, screen, screened, self.options.short, self.options.worth).hold()
             rounds.append(outcome)
-            if best is None or len(arena.current.plant.effects) >= self.options.most:
+            full = len(arena.current.plant.effects) >= self.options.most
+            better = best.fitted if best is not None and not full else self._exchange(arena, rounds)
+            if better is None:
                 break
-            arena = self.settle(best.fitted)
+            arena = self.settle(better)
             current = self._prune(arena)
             if current is not arena.current:
                 arena = self.settle(current, polished=True)
@@ -107,6 +112,20 @@ class Search:
             self.say("a generic law explains clearly more than all named effects: none is claimed")
             current = fit(self.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6)
         return Found(calibrated, current, rounds, generic, screened)
+
+    def _exchange(self, arena: Arena, rounds: list[Round]) -> Fit | None:
+        """A model in which another law took the place of an earlier one, if that is clearly better."""
+        if sum(bool(r.exchanged) for r in rounds) >= self.options.swaps:
+            return None
+        found = swapped(arena, self.lookout, self.named, self.options.worth, self.say)
+        if found is None:
+            return None
+        gone, come = (
+            [e.id for e in one.plant.effects if e not in other.plant.effects]
+            for one, other in ((arena.current, found), (found, arena.current))
+        )
+        rounds.append(Round(come, 0.0, exchanged=", ".join(gone)))
+        return found
 
     def _prune(self, arena: Arena) -> Fit:
         """Drop earlier effects that the later ones have made superfluous."""
