@@ -183,7 +183,7 @@ def _round(r: Row) -> Row:
         for c in r.get("ranking") or []
     ]
     # A plainer law that does what the best-ranked one does is refitted after the ranking, and has no row of its own.
-    plainer = bool(taken) and not any(row["accepted"] for row in rows)
+    plainer = bool(taken and rows) and not any(row["accepted"] for row in rows)
     return {"accepted": taken, "plainer": plainer, "reason": r.get("reason") or "", "rows": rows}
 
 

@@ -124,7 +124,8 @@ class Search:
             [e.id for e in one.plant.effects if e not in other.plant.effects]
             for one, other in ((arena.current, found), (found, arena.current))
         )
-        rounds.append(Round(come, 0.0, exchanged=", ".join(gone)))
+        place = ", ".join(gone)
+        rounds.append(Round(come, 0.0, reason=f"in place of {place}, beside the others", exchanged=place))
         return found
 
     def _prune(self, arena: Arena) -> Fit:
