@@ -62,8 +62,8 @@ class _JointFriction(Effect):
 
 def level_size(force: float) -> dict[str, Any]:
     """Bounds and probing sizes of a friction level, from the joint's typical force."""
-    # A joint that moves at all has less friction than what pushes it; the typical push is below the largest.
-    return {"probes": (0.05 * force, 0.2 * force), "high": 5 * force, "resolution": 2e-3 * force}
+    # A joint that moves at all has less friction than what pushes it, and the largest push is about thrice the typical.
+    return {"probes": (0.05 * force, 0.2 * force), "high": 3 * force, "resolution": 2e-3 * force}
 
 
 class Coulomb(_JointFriction):

@@ -23,7 +23,7 @@ class Thermal(Effect):
     family = "thermal"
     summary = "Drive fades as it warms up"
     PARAMS = (
-        Param("fade", "1", -0.5, 0.9, probes=(0.05, 0.2), resolution=0.002),
+        Param("fade", "1", 0.0, 0.9, probes=(0.05, 0.2), resolution=0.002),
         Param("time_constant", "s", 0.05, 300.0, probes=(0.5, 3.0, 20.0), shape=True),
         Param("reference", "1", 1e-6, 1e6, probes=(1.0,), shape=True),
     )
