@@ -1,7 +1,7 @@
 """The six recorded machines: prepare the logs, close the loop on each, predict, score, print a table with the goals.
 
     python benchmarks/measured_sets.py --data ../shared [--sets emps ...] [--work DIR] [--jobs N] [--json FILE]
-                                       [--quick]
+                                       [--figures docs/machines] [--quick]
 
 The recordings, their splits and their scores are those of `score/recordings.py` in the data folder; everything that is
 particular to a machine is in its folder under `benchmarks/measured/`: the model to start from, and a mapping file.
@@ -26,6 +26,14 @@ SETS = {
     "dfki_double_pendulum": ("inverse", (0.281,), (0.217,), (0.205,)),
     "nanobench_crazyflie": ("forward", (0.254,), (0.217,), (0.205,)),
     "quadruped_go2": ("rollout", (0.0373,), (0.0098,), (0.0085,)),
+}
+TITLES = {
+    "skidsteer_husky": "Clearpath Husky",
+    "bam_xl330": "Dynamixel XL330",
+    "emps": "EMPS ball screw",
+    "dfki_double_pendulum": "double pendulum",
+    "nanobench_crazyflie": "Crazyflie 2.1",
+    "quadruped_go2": "Unitree Go2 legs",
 }
 # The scorer prints the figures of single groups first; the goals are about the last ones.
 STAGES = ("nominal", "calibrated", "extended")
@@ -90,6 +98,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--figures", type=Path, metavar="FOLDER", help="draw one picture a set there")
     parser.add_argument("--quick", action="store_true", help="one set, as an end-to-end check within minutes")
     args = parser.parse_args()
     if not (args.data / "score" / "recordings.py").exists():
@@ -102,6 +111,11 @@ def main() -> None:
         began = time.monotonic()
         figures = run_set(name, args.data, args.work, args.jobs, args.seed)
         seconds = time.monotonic() - began
+        if args.figures:
+            from measured.figure import draw  # matplotlib, of which nothing else here knows
+
+            files = {stage: args.work / name / f"{stage}.npz" for stage in STAGES}
+            draw(args.work / name / "mapping.yaml", SETS[name][0], files, TITLES[name], args.figures / f"{name}.png")
         _, start, reference, goals = SETS[name]
         for i, goal in enumerate(goals):
             rows.append(
