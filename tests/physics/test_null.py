@@ -143,6 +143,7 @@ def test_only_and_exclude() -> None:
         "generic_position",
         "generic_velocity",
         "generic_time",
+        "generic_memory",
     }
 
 
