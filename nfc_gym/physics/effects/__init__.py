@@ -30,8 +30,8 @@ from nfc_gym.physics.effects.timing import Delay, Lag
 __all__ = ["FAMILIES", "Context", "Effect", "Forces", "Param", "Scales", "build", "complete_inertia", "propose"]
 
 _TYPES: tuple[type[Effect], ...] = (
-    Coulomb, Stribeck, LoadFriction, DirectionalFriction, DampingPoly, Armature, SpringOffset, Hysteresis, Backlash, Cogging,
-    Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
+    Coulomb, Stribeck, LoadFriction, DirectionalFriction, DampingPoly, Armature, SpringOffset, Hysteresis, Backlash,
+    Cogging, Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
     Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, Gust, RotorDrag, GroundEffect, ExternalForce, Slope,
     Slip, FrictionPatch, Compliance, Sinkage, SensorBias, SensorGain, SensorDelay, Misalignment,
     GenericPosition, GenericVelocity, GenericTime, GenericMemory,

@@ -3,8 +3,8 @@
 The same object is calibrated, wrapped around an environment, saved beside a model and named in a report. It acts
 through one or more hooks. Every hook is a pure function over arrays with any leading batch shape `...`; `theta` is
 (..., k), the effect's parameters in the order of `params`. In one physics step hooks run in this order: `action` on the
-command, `model` (once, at set-up), `follow`, `friction`, `modulate` and `force` on the state before the step, `sense` on
-what is measured.
+command, `model` (once, at set-up), `follow`, `friction`, `modulate` and `force` on the state before the step, `sense`
+on what is measured.
 
 What a joint went through before (a spring that yielded, a rotor within its play) is kept by `rest` and `follow`, and
 `force` and `modulate` find it in `Context.memory`. Where logs tell how the joints moved before a segment starts,
@@ -231,7 +231,7 @@ class Effect(ABC):
         raise NotImplementedError
 
     def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
-        """Change the fields of `MODULATES`, (..., *shape), in place for the coming step, starting from what is there."""
+        """Change the fields of `MODULATES`, (..., *shape), in place for the coming step, from what is there."""
         raise NotImplementedError
 
     def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:

@@ -147,9 +147,10 @@ class GenericTime(_Generic):
 class GenericMemory(_Generic):
     """A force with memory in a joint, of whatever law: sum_k c_k w_k over two kinds of hidden states.
 
-    The first three depend on the joint's way alone: elements that yield (Dahl's) within 3, 20 and 70 % of its excursion,
-    of which a sum has a loop of any shape (a Maxwell-slip model, Iwan, J. Applied Mechanics 33, 1966). The others forget
-    with time: the joint's speed, smoothed over 0.02, 0.1 and 0.4 s, as relaxing materials have it (a Prony series).
+    The first three depend on the joint's way alone: elements that yield (Dahl's) within 3, 20 and 70 % of its
+    excursion, of which a sum has a loop of any shape (a Maxwell-slip model, Iwan, J. Applied Mechanics 33, 1966). The
+    others forget with time: the joint's speed, smoothed over 0.02, 0.1 and 0.4 s, as relaxing materials have it (a
+    Prony series).
     """
 
     family = "generic_memory"

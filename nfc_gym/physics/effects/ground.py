@@ -5,7 +5,7 @@ The ground is every colliding geom that stands still: those of the world and of 
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -60,10 +60,10 @@ class OnGround(Effect):
 class FrictionPatch(OnGround):
     """A place on the ground, an ellipse in the world's x and y, where sliding friction is (1 - lost) of that elsewhere.
 
-    The friction of each geom that touches the ground is written anew in every step, by where its middle is; the edge is
-    a fifth of the radius wide. Between geoms of one priority MuJoCo takes the larger friction, so while a machine stands
-    in the patch its geoms take over the ground's friction, and the ground's is 0. Geoms over which the ground has
-    priority cannot be told apart and keep theirs.
+    The friction of each geom that touches the ground is written anew in every step, by where its middle is; the edge
+    is a fifth of the radius wide. Between geoms of one priority MuJoCo takes the larger friction, so while a machine
+    stands in the patch its geoms take over the ground's friction, and the ground's is 0. Geoms over which the ground
+    has priority cannot be told apart and keep theirs.
     """
 
     family = "friction_patch"
@@ -140,8 +140,9 @@ class Compliance(OnGround):
     """Ground contact that is softer: its natural frequency over 1 + softness, its damping ratio times 1 + damping.
 
     MuJoCo's own contact says both through `solref`, in either of its forms; they are written to whoever rules the
-    contact: what touches the ground where that has priority or the direct form, else both. A mass that rests on a contact of
-    frequency f and impedance d sinks by (1 - d) g / (2 pi f)^2, as on a spring of stiffness m (2 pi f)^2 / (1 - d).
+    contact: what touches the ground where that has priority or the direct form, else both. A mass that rests on a
+    contact of frequency f and impedance d sinks by (1 - d) g / (2 pi f)^2, as on a spring of stiffness
+    m (2 pi f)^2 / (1 - d). Softer contact also creeps more under a sideways load.
     """
 
     family = "compliance"

@@ -17,7 +17,8 @@ class Gust(Effect):
     """Force push (1 - cos(2 pi (t - start) / length)) / 2 on a body for start < t < start + length, else none.
 
     The one-minus-cosine gust of airworthiness practice (14 CFR 25.341(a), MIL-F-8785C 3.7.2) as the force at its peak,
-    in the world at the centre of mass; t is the time since the log or the episode began. Its impulse is push * length / 2.
+    in the world at the centre of mass; t is the time since the log or the episode began. Its impulse is
+    push * length / 2.
     """
 
     family = "gust"
