@@ -12,10 +12,11 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.measured.observe import Observer, observer
+from nfc_gym.physics.activations import advance_activations
 from nfc_gym.physics.effects.base import Context, Forces, overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.past import trace
-from nfc_gym.physics.rollout import Plant, advance_activations
+from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 

@@ -5,6 +5,7 @@ are one substep behind the state, exactly as they are in an `MjData` between two
 around a single environment and this roll-out agree bit for bit.
 """
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +16,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from nfc_gym.physics.acting import Acting
+from nfc_gym.physics.activations import advance_activations, delayed, fill_delays, longest_delay
 from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import ParameterSpace, resolve, write_field
@@ -260,17 +262,21 @@ class _Run:
             for k in range(lead.shape[1]):
                 acting.command(self._tile(lead[:, k]), signals, step)
             acting.settle_quick()
+        model, recent = self.plant.model, deque[Array](maxlen=longest_delay(self.plant.model) + 1)
         for k in range(-segments.history, 0):
             exogenous = self._exogenous(k)
             ctrl = self._command(k, exogenous)
+            recent.append(ctrl)
             settle = k == -segments.history
-            advance_activations(self.plant.model, ctrl, self.batch.act, segments.dt, settle)
+            advance_activations(model, delayed(model, recent, segments.dt), self.batch.act, segments.dt, settle)
             if past is not None and acting.tracking:
                 q, v = map(self._tile, past.motion(k + segments.history))
                 for effect, theta in zip(self.plant.effects, self.thetas, strict=True):
                     if overrides(effect, "unsense"):
                         q, v = effect.unsense(q, v, theta)
                 acting.recall(q, v, self._serve(k, ctrl, q, v), exogenous)
+        if recent and longest_delay(model):
+            fill_delays(model, recent, self.batch.bind("history"))
 
     def _advance(self, k: int, first: bool) -> None:
         """One physics step under the command of step k."""
@@ -281,6 +287,8 @@ class _Run:
         # Without a history actuator states begin settled.
         if first and self.segments.history == 0 and self.segments.settle == 0:
             advance_activations(model, batch.ctrl, batch.act, self.segments.dt, settle=True)
+            if longest_delay(model):
+                fill_delays(model, [batch.ctrl], batch.bind("history"))
         if self.acting.pushing:
             batch.qfrc_applied[...] = 0
             batch.xfrc_applied[...] = 0
@@ -299,16 +307,3 @@ class _Run:
         return Trajectory(
             shape(qpos), shape(qvel), None if sensed is None else shape(sensed), stable.reshape(self.count, size)
         )
-
-
-def advance_activations(model: mujoco.MjModel, ctrl: Array, act: Array, dt: float, settle: bool) -> None:
-    """One step of first-order actuator states (..., na) under commands (..., nu), in place; `settle`: held for ever."""
-    filters = {int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)}
-    for i in range(model.nu):
-        if int(model.actuator_dyntype[i]) not in filters:
-            continue
-        limited = bool(model.actuator_ctrllimited[i])
-        target = np.clip(ctrl[..., i], *model.actuator_ctrlrange[i]) if limited else ctrl[..., i]
-        at = int(model.actuator_actadr[i])
-        keep = 0.0 if settle else float(np.exp(-dt / max(model.actuator_dynprm[i, 0], 1e-9)))
-        act[..., at] = target + keep * (act[..., at] - target)

@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales, actuator_names, index, joint_dofs
@@ -39,7 +40,7 @@ class Drive:
       actuators: (n,) ids, each of a scalar joint.
     """
 
-    def __init__(self, model: mujoco.MjModel, actuators: Array) -> None:
+    def __init__(self, model: mujoco.MjModel, actuators: NDArray[np.intp]) -> None:
         joints = model.actuator_trnid[actuators, 0]
         self.rows = index(actuators)
         self.q, self.v = (

@@ -79,9 +79,10 @@ class Sinkage(OnGround):
         out.xfrc[..., self.bodies, :3] -= held[..., None] * velocity
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        if self.resistance is not None and theta[self.resistance].any():
+        values = {p.name: float(t) for p, t in zip(self.params, theta, strict=True)}
+        depth = values.get("depth", 0.0)
+        if values.get("resistance", 0.0) != 0:
             return False
-        depth = float(theta[self.depth].sum()) if self.depth is not None else 0.0
         for geom in spec.geoms:
             touches = geom.contype or geom.conaffinity
             if geom.name in self.where or (self.where == ("ground",) and touches and _still(geom.parent)):
