@@ -122,7 +122,8 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
         for k in first.channels
     }
     command = motion.ctrl.std(0) + 0.1 * np.abs(motion.ctrl).mean(0)
-    return Scales(force, rms(motion.qvel), command, rms(acting), first.interval, exogenous, channels)
+    ends = [f(np.stack([f(bench.states[log.name].qpos, 0) for log in logs]), 0) for f in (np.min, np.max)]
+    return Scales(force, rms(motion.qvel), command, rms(acting), first.interval, exogenous, channels, *ends)
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,8 @@ def candidates(bench: Bench, logs: Sequence[Log]) -> list[Effect]:
         # Forces are predicted from motion: an effect on commands shows only if it can say what it would ask for.
         hidden = lambda e: (overrides(e, "action") and not overrides(e, "demand")) or overrides(e, "sense")  # noqa: E731
         found = [e for e in found if not hidden(e)]
+    if bench.mode != "rollout":  # these change how the next step is made, not what a moment shows
+        found = [e for e in found if not overrides(e, "modulate")]
     available = set(logs[0].exogenous)
     found = [e for e in found if set(e.signals) <= available]
     return found + conditioned(found, sorted({log.condition for log in logs}))

@@ -16,6 +16,7 @@ from nfc_gym.measured.entries import Measured, Servo
 from nfc_gym.measured.mapping import Mapping, Split, load_mapping
 from nfc_gym.measured.readers import read_table
 from nfc_gym.measured.splits import Fold, Source, divide, find_logs
+from nfc_gym.physics.effects.base import TIME
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -126,6 +127,7 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
         k: attempt(f"exogenous.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.exogenous.items()
     }
     channels = {k: attempt(f"channels.{k}", lambda k=k, c=c: _channel(k, c, columns)) for k, c in m.channels.items()}
+    exogenous.setdefault(TIME, time)  # that of the whole file, where a split by time cuts it
     known = {
         f"{k.field}:{'+'.join(k.of)}": attempt(
             f"known.{k.field}",

@@ -1,6 +1,7 @@
 """Forward problems: what sensors read at the measured states and commands."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -11,9 +12,11 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.measured.observe import Observer, observer
+from nfc_gym.physics.activations import advance_activations
 from nfc_gym.physics.effects.base import Context, Forces, overrides
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.physics.rollout import Plant, advance_activations
+from nfc_gym.physics.past import trace
+from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 
@@ -78,7 +81,10 @@ class ForwardProblem(InstantProblem):
                 plant.model, tracks[0].dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, derived, fields.__getitem__
             )
             out = Forces(np.zeros_like(batch.qfrc_applied), np.zeros_like(batch.xfrc_applied))
+            ends, side_by_side = np.cumsum([0, *lengths]), samples * np.arange(count)
+            order = [np.arange(a, b)[:, None] + side_by_side for a, b in pairwise(ends)]
             for effect, theta in pushing:
+                ctx.memory = trace(effect, ctx, theta, order) if overrides(effect, "follow") else None
                 effect.force(ctx, theta, out)
             batch.qfrc_applied[...], batch.xfrc_applied[...] = out.qfrc, out.xfrc
             batch.forward()

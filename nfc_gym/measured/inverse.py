@@ -14,6 +14,7 @@ from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.physics.effects.base import Context, Forces, actuator_names, overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import resolve, write_field
+from nfc_gym.physics.past import trace
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -90,8 +91,11 @@ def actuator_forces(plant: Plant, x: Array, t: Track) -> Array:
     if pushing:
         motion.fields["qfrc_actuator"] = force
         out = Forces(np.zeros((len(t.time), model.nv)), np.zeros((len(t.time), model.nbody, 6)))
+        moments = np.arange(len(t.time))[:, None]
         for effect, theta in pushing:
-            effect.force(ctx, np.broadcast_to(theta, (len(t.time), len(theta))), out)
+            values = np.broadcast_to(theta, (len(t.time), len(theta)))
+            ctx.memory = trace(effect, ctx, values, [moments]) if overrides(effect, "follow") else None
+            effect.force(ctx, values, out)
         force = force - out.qfrc - motion.carried(out.xfrc)
     dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     actuation = force[:, dofs] / model.actuator_gear[:, 0]

@@ -18,6 +18,7 @@ from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.measured.segments import Cut, Layout, cut, lay
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import overrides
+from nfc_gym.physics.past import Past
 from nfc_gym.physics.rollout import Plant, Segments, Servo, Trajectory
 from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
 
@@ -288,7 +289,7 @@ class RolloutProblem(Problem):
         return out
 
 
-def _map(segments: Segments, rows, qpos: Array, qvel: Array) -> Segments:
+def _map(segments: Segments, rows, qpos: Array, qvel: Array, past: Past | None) -> Segments:
     return replace(
         segments,
         qpos=qpos,
@@ -297,22 +298,26 @@ def _map(segments: Segments, rows, qpos: Array, qvel: Array) -> Segments:
         exogenous={k: rows(v) for k, v in segments.exogenous.items()},
         known={k: rows(v) for k, v in segments.known.items()},
         servo=[(law, {n: rows(v) for n, v in terms.items()}) for law, terms in segments.servo],
+        past=past,
     )
 
 
 def _pick(segments: Segments, index: NDArray[np.intp]) -> Segments:
-    picked = _map(segments, lambda a: a[index], segments.qpos[index], segments.qvel[index])
+    past = segments.past and segments.past.pick(index)
+    picked = _map(segments, lambda a: a[index], segments.qpos[index], segments.qvel[index], past)
     return picked if segments.condition is None else replace(picked, condition=segments.condition[index])
 
 
 def _repeat(segments: Segments, n: int, qpos: Array, qvel: Array) -> Segments:
-    many = _map(segments, lambda a: np.concatenate([a] * n), qpos, qvel)
+    past = segments.past and segments.past.repeat(n)
+    many = _map(segments, lambda a: np.concatenate([a] * n), qpos, qvel, past)
     return many if segments.condition is None else replace(many, condition=np.tile(segments.condition, n))
 
 
 def _refine(segments: Segments) -> Segments:
     """The same segments on a grid of half the step; commands are held, as on the coarse grid."""
-    fine = _map(segments, lambda a: np.repeat(a, 2, axis=1), segments.qpos, segments.qvel)
+    past = segments.past and segments.past.refine()
+    fine = _map(segments, lambda a: np.repeat(a, 2, axis=1), segments.qpos, segments.qvel, past)
     return replace(fine, dt=segments.dt / 2, history=2 * segments.history, settle=2 * segments.settle)
 
 

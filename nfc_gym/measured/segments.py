@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.states import States
+from nfc_gym.physics.effects.base import TIME
+from nfc_gym.physics.past import Before, Past
 from nfc_gym.physics.rollout import Segments, Servo
 
 Array = NDArray[np.float64]
+_LEAD = 200  # steps that a log's commands before the history are thinned to
 
 
 @dataclass(frozen=True)
@@ -147,8 +150,48 @@ def lay(
         qpos=np.stack([states[i].qpos[s] for i, s in zip(where.log, where.start, strict=True)]),
         qvel=np.stack([states[i].qvel[s] for i, s in zip(where.log, where.start, strict=True)]),
         ctrl=ctrl,
-        exogenous={k: lane("exogenous", k) for k in logs[0].exogenous},
+        exogenous={k: lane("exogenous", k, k == TIME) for k in logs[0].exogenous},
         known=known,
         servo=servo,
         condition=np.array([logs[i].condition for i in where.log]),
+        past=Past(_Backwards(model, tuple(logs), tuple(states), where, layout), np.arange(len(where.log))),
     )
+
+
+@dataclass(frozen=True)
+class _Backwards:
+    """What came before some of the starts of a `Cut`."""
+
+    model: mujoco.MjModel
+    logs: tuple[Log, ...]
+    states: tuple[States, ...]
+    where: Cut
+    layout: Layout
+
+    def __call__(self, index: NDArray[np.intp]) -> Before:
+        dt = self.layout.dt
+        offsets = np.arange(-round(self.layout.history / dt), 1) * dt
+        of = [
+            (self.logs[i], self.states[i], s)
+            for i, s in zip(self.where.log[index], self.where.start[index], strict=True)
+        ]
+        motion = [_motion(log, states, log.time[s] + offsets) for log, states, s in of]
+        lengths = np.array([log.time[s] + offsets[0] - log.time[0] for log, _, s in of])
+        longest = max(float(lengths.max(initial=0.0)), 0.0)
+        count = min(_LEAD, int(np.ceil(longest / dt)))
+        step = longest / count if count else 0.0
+        lead = np.zeros((len(index), count, self.model.nu))
+        for row, (log, _, s) in enumerate(of):
+            at = log.time[s] + offsets[0] - (np.arange(count, 0, -1) - 0.5) * step
+            for key, values in log.controls.items():
+                a = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, key.removeprefix("ctrl:"))
+                lead[row, :, a] = resample(log.time, values, at, False)
+        return Before(np.stack([q for q, _ in motion]), np.stack([v for _, v in motion]), lead, step)
+
+
+def _motion(log: Log, states: States, at: Array) -> tuple[Array, Array]:
+    """Estimated (n, nq) and (n, nv) at times (n,), linearly between samples; at rest before the log begins."""
+    high = np.clip(np.searchsorted(log.time, at, side="right"), 1, len(log) - 1)
+    share = np.clip((at - log.time[high - 1]) / (log.time[high] - log.time[high - 1]), 0, 1)[:, None]
+    q, v = ((1 - share) * a[high - 1] + share * a[high] for a in (states.qpos, states.qvel))
+    return q, np.where((at < log.time[0] - 1e-9)[:, None], 0.0, v)

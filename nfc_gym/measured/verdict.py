@@ -136,7 +136,8 @@ def unexplained(v: Verified, found: Found) -> dict[str, Any] | None:
     generic = next((r for r in last.ranking if r["generic"]), None)
     if found.generic is not None and generic is not None:
         law, where = generic["id"].split(":", 1)
-        text = f"looks like a function of {where} ({law.replace('_', ' ')})"
+        memory = "looks like a force with memory in" if law == "generic_memory" else "looks like a function of"
+        text = f"{memory} {where} ({law.replace('_', ' ')})"
     return {
         "coordinate": place if place.startswith("sensor") else f"{place} ({group})",
         "where": place,

@@ -15,6 +15,7 @@ from nfc_gym.physics.effects.base import Context, Effect, Forces, overrides
 from nfc_gym.physics.fields import ModelFields
 
 Array = NDArray[np.float64]
+_ANEW = object()  # in place of a hidden state that the next command settles
 
 
 class Engine(Protocol):
@@ -60,21 +61,28 @@ class Acting:
         self.commanding = [(e, theta) for e, theta in pairs if overrides(e, "action")]
         self.rubbing = [(e, theta) for e, theta in pairs if overrides(e, "friction")]
         self.pushing = [(e, theta) for e, theta in pairs if overrides(e, "force")]
+        self.varying = [(e, theta) for e, theta in pairs if overrides(e, "modulate")]
+        self.tracking = [(e, theta) for e, theta in pairs if overrides(e, "follow")]
+        self.acts = bool(self.rubbing or self.pushing or self.varying)
         self.memories: list[Any] = []
+        self.traces: dict[Effect, Any] = {}
         self.derived: set[str] = set()
         self.nominal: dict[str, Array] = {}
         self.fresh: NDArray[np.bool_] | None = None
         self.shown: tuple[Context, Forces] | None = None
         self.loss = self.fields["dof_frictionloss"] if self.rubbing else np.zeros(0)
         self.base_friction = self.loss.copy()
+        self.varied = {n: self.fields[n] for e, _ in self.varying for n in e.MODULATES}
+        self.base = {n: live.copy() for n, live in self.varied.items()}
 
     def restart(self, rows: NDArray[np.bool_] | None = None) -> None:
         """Episodes begin, of all simulations or of the `rows` (n,): hidden states are settled by the next command.
 
-        The model's dry friction as it is now becomes what the effects add to.
+        The model's fields as they are now become what the effects add to.
         """
         if rows is None or rows.all():
             self.memories.clear()
+            self.traces.clear()
             self.derived.clear()
             rows = None
         self.fresh, self.shown = rows, None
@@ -82,34 +90,70 @@ class Acting:
         if self.rubbing:
             self.loss = loss = self.fields["dof_frictionloss"]
             self.base_friction = loss.copy() if rows is None else np.where(rows[:, None], loss, self.base_friction)
+        for name, base in self.base.items():
+            self.varied[name] = live = self.fields[name]
+            self.base[name] = live.copy() if rows is None else _merged(live, base, rows)
 
-    def command(self, ctrl: Array, exogenous: Mapping[str, Array]) -> Array:
-        """The command (..., nu) of a step after the effects on it; the first one settles their hidden states."""
+    def settle_quick(self) -> None:
+        """Hidden states of commands begin anew with the next one, but for the slow ones."""
+        self.memories = [m if e.slow else _ANEW for m, (e, _) in zip(self.memories, self.commanding, strict=True)]
+
+    def command(self, ctrl: Array, exogenous: Mapping[str, Array], dt: float | None = None) -> Array:
+        """The command (..., nu) of a step after the effects on it; the first one settles their hidden states.
+
+        Args:
+          ctrl: (..., nu).
+          exogenous: signals, (...,) each.
+          dt: how long it is held, default a physics step.
+        """
+        dt = dt or self.dt
         for slot, (effect, theta) in enumerate(self.commanding):
             if len(self.memories) == slot:
-                self.memories.append(effect.state0(ctrl.shape[:-1], ctrl, theta, self.dt))
+                self.memories.append(_ANEW)
+            if self.memories[slot] is _ANEW:
+                self.memories[slot] = effect.state0(ctrl.shape[:-1], ctrl, theta, dt)
             elif self.fresh is not None:
-                settled = effect.state0(ctrl.shape[:-1], ctrl, theta, self.dt)
+                settled = effect.state0(ctrl.shape[:-1], ctrl, theta, dt)
                 self.memories[slot] = _merged(settled, self.memories[slot], self.fresh)
-            ctrl, self.memories[slot] = effect.action(ctrl, theta, self.memories[slot], exogenous, self.dt)
+            ctrl, self.memories[slot] = effect.action(ctrl, theta, self.memories[slot], exogenous, dt)
         return ctrl
 
+    def recall(self, q: Array, v: Array, ctrl: Array, exogenous: Mapping[str, Array]) -> None:
+        """A step of the measured past, (..., nq), (..., nv), (..., nu): only hidden states of forces go along."""
+        self._follow(Context(self.model, self.dt, q, v, ctrl, exogenous, _unmeasured, self._nominal), None)
+
+    def _follow(self, ctx: Context, fresh: NDArray[np.bool_] | None) -> None:
+        """Hidden states of forces for the step that begins at `ctx`."""
+        for effect, theta in self.tracking:
+            if effect not in self.traces:
+                self.traces[effect] = effect.rest(ctx, theta)
+            elif fresh is not None:
+                self.traces[effect] = _merged(effect.rest(ctx, theta), self.traces[effect], fresh)
+            self.traces[effect] = effect.follow(ctx, theta, self.traces[effect])
+
     def push(self, ctrl: Array, exogenous: Mapping[str, Array]) -> None:
-        """Write the dry friction of the coming step and add its forces to what is applied already."""
-        if self.fresh is not None:
-            fresh, self.fresh = self.fresh, None
-            if self.derived:
-                self.engine.forward(np.flatnonzero(fresh))
-        if not (self.rubbing or self.pushing):
+        """Write the fields of the coming step and add its forces to what is applied already."""
+        fresh, self.fresh = self.fresh, None
+        if fresh is not None and self.derived:
+            self.engine.forward(np.flatnonzero(fresh))
+        if not self.acts:
             return
         ctx, out = self.shown or self._show(ctrl, exogenous)
         ctx.ctrl, ctx.exogenous = ctrl, exogenous
+        if self.tracking:
+            self._follow(ctx, fresh)
         if self.rubbing:
             self.loss[...] = self.base_friction
             for effect, theta in self.rubbing:
                 dofs, level = effect.friction(ctx, theta)
                 self.loss[..., dofs] += level
+        for name, live in self.varied.items():
+            live[...] = self.base[name]
+        for effect, theta in self.varying:
+            ctx.memory = self.traces.get(effect)
+            effect.modulate(ctx, theta, self.varied)
         for effect, theta in self.pushing:
+            ctx.memory = self.traces.get(effect)
             effect.force(ctx, theta, out)
 
     def _show(self, ctrl: Array, exogenous: Mapping[str, Array]) -> tuple[Context, Forces]:
@@ -133,11 +177,16 @@ class Acting:
         return array
 
     def _nominal(self, name: str) -> Array:
-        """A model field; these arrays are live too, but for the friction that `push` writes to."""
+        """A model field; these arrays are live too, but for those that `push` writes to."""
         if name not in self.nominal:
             rubbed = self.rubbing and name == "dof_frictionloss"
-            self.nominal[name] = self.base_friction if rubbed else self.fields[name]
+            kept = self.base_friction if rubbed else self.base.get(name)
+            self.nominal[name] = self.fields[name] if kept is None else kept
         return self.nominal[name]
+
+
+def _unmeasured(name: str) -> Array:
+    raise LookupError(f"a measured past has no {name}: `follow` reads q, v, ctrl and signals alone")
 
 
 def _merged(new: Any, old: Any, rows: NDArray[np.bool_]) -> Any:

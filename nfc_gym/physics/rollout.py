@@ -5,6 +5,7 @@ are one substep behind the state, exactly as they are in an `MjData` between two
 around a single environment and this roll-out agree bit for bit.
 """
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,10 +17,12 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.acting import Acting
-from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.activations import advance_activations, delayed, fill_delays, longest_delay
+from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import ParameterSpace, resolve, write_field
+from nfc_gym.physics.past import Past
 
 Array = NDArray[np.float64]
 _ROW_BYTES = 300_000_000  # recorded trajectories of one call; more parameter vectors are run in turns
@@ -50,6 +53,8 @@ class Segments:
       settle: steps for which the first command is held before the start; velocities and hidden states are then kept,
         the positions go back to the measured ones. 0 starts at the measured velocities.
       condition: (S,) label of the condition that each segment was recorded in.
+      past: what was measured before the starts. Without it, or with no history, joints with a memory begin at rest,
+        and slow states of the drives settled at the history's first command.
     """
 
     dt: float
@@ -62,6 +67,7 @@ class Segments:
     servo: Sequence[tuple[Servo, Mapping[str, Array]]] = ()
     settle: int = 0
     condition: NDArray[np.str_] | None = None
+    past: Past | None = None
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -216,6 +222,7 @@ class _Run:
             q, v = effect.unsense(q, v, theta)
         self.batch.qpos[...], self.batch.qvel[...] = q, v
         self.acting = Acting(model, plant.effects, self.thetas, self.fields, self.batch, segments.dt)
+        self.reads = {s for e in plant.effects for s in e.signals}
         if sensors:
             self.batch.bind("sensordata")
 
@@ -239,17 +246,18 @@ class _Run:
         return self.acting.command(ctrl, exogenous)
 
     def _exogenous(self, k: int) -> dict[str, Array]:
-        return {n: self._tile(s[:, self.segments.history + k]) for n, s in self.segments.exogenous.items()}
+        signals = self.segments.exogenous
+        return {n: self._tile(signals[n][:, self.segments.history + k]) for n in signals if n in self.reads}
 
-    def _serve(self, k: int, ctrl: Array) -> Array:
+    def _serve(self, k: int, ctrl: Array, q: Array, v: Array) -> Array:
         """Firmware servos turn targets into commands."""
         if not self.segments.servo:
             return ctrl
         ctrl = ctrl.copy()
         at = self.segments.history + k
         for servo, terms in self.segments.servo:
-            wish = self._tile(terms["gain"][:, at]) * (ctrl[:, servo.actuator] - self.batch.qpos[:, servo.qpos])
-            wish = wish - self._tile(terms["damping"][:, at]) * self.batch.qvel[:, servo.dof]
+            wish = self._tile(terms["gain"][:, at]) * (ctrl[:, servo.actuator] - q[:, servo.qpos])
+            wish = wish - self._tile(terms["damping"][:, at]) * v[:, servo.dof]
             ctrl[:, servo.actuator] = self._tile(terms["supply"][:, at]) * np.clip(wish, -servo.limit, servo.limit)
         return ctrl
 
@@ -257,14 +265,7 @@ class _Run:
         """Step through all segments at once."""
         model, batch, steps = self.plant.model, self.batch, self.segments.steps
         rows = batch.nsim
-        for k in range(-self.segments.history, 0):
-            advance_activations(
-                model,
-                self._command(k, self._exogenous(k)),
-                batch.act,
-                self.segments.dt,
-                settle=k == -self.segments.history,
-            )
+        self._remember()
         qpos, qvel = np.empty((steps + 1, rows, model.nq)), np.empty((steps + 1, rows, model.nv))
         sensed = np.empty((steps + 1, rows, model.nsensordata)) if self.sensors else None
         if self.segments.settle:
@@ -285,15 +286,42 @@ class _Run:
             sensed[steps] = batch.sensordata
         return self._result(qpos, qvel, sensed)
 
+    def _remember(self) -> None:
+        """Lead the hidden states through what was commanded and measured before the starts."""
+        segments, past, acting = self.segments, self.segments.past, self.acting
+        if past is not None and segments.history and any(e.slow for e, _ in acting.commanding):
+            lead, step = past.lead
+            signals = self._exogenous(-segments.history)
+            for k in range(lead.shape[1]):
+                acting.command(self._tile(lead[:, k]), signals, step)
+            acting.settle_quick()
+        model, recent = self.plant.model, deque[Array](maxlen=longest_delay(self.plant.model) + 1)
+        for k in range(-segments.history, 0):
+            exogenous = self._exogenous(k)
+            ctrl = self._command(k, exogenous)
+            recent.append(ctrl)
+            settle = k == -segments.history
+            advance_activations(model, delayed(model, recent, segments.dt), self.batch.act, segments.dt, settle)
+            if past is not None and acting.tracking:
+                q, v = map(self._tile, past.motion(k + segments.history))
+                for effect, theta in zip(self.plant.effects, self.thetas, strict=True):
+                    if overrides(effect, "unsense"):
+                        q, v = effect.unsense(q, v, theta)
+                acting.recall(q, v, self._serve(k, ctrl, q, v), exogenous)
+        if recent and longest_delay(model):
+            fill_delays(model, recent, self.batch.bind("history"))
+
     def _advance(self, k: int, first: bool) -> None:
         """One physics step under the command of step k."""
         model, batch, exogenous = self.plant.model, self.batch, self._exogenous(k)
         for bound, values in self.varying:
             write_field(self.fields, bound, self._tile(values[:, self.segments.history + k]))
-        batch.ctrl[...] = self._serve(k, self._command(k, exogenous))
+        batch.ctrl[...] = self._serve(k, self._command(k, exogenous), batch.qpos, batch.qvel)
         # Without a history actuator states begin settled.
         if first and self.segments.history == 0 and self.segments.settle == 0:
             advance_activations(model, batch.ctrl, batch.act, self.segments.dt, settle=True)
+            if longest_delay(model):
+                fill_delays(model, [batch.ctrl], batch.bind("history"))
         if self.acting.pushing:
             batch.qfrc_applied[...] = 0
             batch.xfrc_applied[...] = 0
@@ -312,16 +340,3 @@ class _Run:
         return Trajectory(
             shape(qpos), shape(qvel), None if sensed is None else shape(sensed), stable.reshape(self.count, size)
         )
-
-
-def advance_activations(model: mujoco.MjModel, ctrl: Array, act: Array, dt: float, settle: bool) -> None:
-    """One step of first-order actuator states (..., na) under commands (..., nu), in place; `settle`: held for ever."""
-    filters = {int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)}
-    for i in range(model.nu):
-        if int(model.actuator_dyntype[i]) not in filters:
-            continue
-        limited = bool(model.actuator_ctrllimited[i])
-        target = np.clip(ctrl[..., i], *model.actuator_ctrlrange[i]) if limited else ctrl[..., i]
-        at = int(model.actuator_actadr[i])
-        keep = 0.0 if settle else float(np.exp(-dt / max(model.actuator_dynprm[i, 0], 1e-9)))
-        act[..., at] = target + keep * (act[..., at] - target)

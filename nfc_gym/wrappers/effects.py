@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.acting import Acting
-from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.base import TIME, Effect, overrides
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.fields import ModelFields
@@ -70,7 +70,7 @@ def check_signals(effects: Sequence[Effect], exogenous: Mapping[str, Signal]) ->
     """Refuse effects that read a signal which nobody gives."""
     for effect in effects:
         for name in effect.signals:
-            if name not in exogenous and name != "exo:time":
+            if name not in exogenous and name != TIME:
                 given = ", ".join(exogenous) or "none"
                 raise InputError(f"ApplyEffects: {effect.id} reads {name!r}: give it in `exogenous`; given: {given}")
 
@@ -96,7 +96,7 @@ class Application:
         self.acting = Acting(sim.nominal, self.effects, self.thetas, sim.fields, sim, dt)
         if any(overrides(e, "model") for e in self.effects):
             sim.edits.add(self._edit, rank=1)
-        if self.acting.commanding or self.acting.rubbing or self.acting.pushing:
+        if self.acting.commanding or self.acting.acts:
             sim.attach("ApplyEffects")
             sim.on_control.add(self._begin)
             sim.on_substep.add(self._act)
@@ -138,7 +138,7 @@ class Application:
     def _signals(self) -> dict[str, Any]:
         time = np.asarray(self.sim.bind("time"), float)
         given = {n: np.asarray(s(time) if callable(s) else s, float) for n, s in self.exogenous.items()}
-        return {"exo:time": time, **{n: np.broadcast_to(v, self.sim.shape) for n, v in given.items()}}
+        return {TIME: time, **{n: np.broadcast_to(v, self.sim.shape) for n, v in given.items()}}
 
 
 class ApplyEffects(EnvWrapper):

@@ -74,6 +74,8 @@ def zoo_scales(model: mujoco.MjModel) -> Scales:
             "body:craft:linvel": (0.3, 1e-3),
             "sensor:acc": (1.0, 0.1),
         },
+        low=model.qpos0 - 1.0,
+        high=model.qpos0 + 1.0,
     )
 
 

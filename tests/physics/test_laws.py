@@ -12,7 +12,7 @@ from nfc_gym.physics.effects.base import index, limited, overrides
 
 MODEL = zoo()
 CANDIDATES = candidates(MODEL)
-HOOKS = ("action", "friction", "force")
+HOOKS = ("action", "friction", "modulate", "force")
 ACTING = [f for f, found in CANDIDATES.items() if any(overrides(found[0], h) for h in HOOKS)]
 ROWS, STEPS = 5, 12
 RNG = np.random.default_rng(5)
@@ -32,7 +32,7 @@ def _states() -> dict[str, np.ndarray]:
 
 
 STATES = _states()
-SIGNALS = {"exo:supply": RNG.uniform(10, 12, ROWS), "exo:time": RNG.uniform(0, 3, ROWS)}
+SIGNALS = {"exo:supply": RNG.uniform(10, 12, ROWS), "exo:time": RNG.uniform(0, 0.3, ROWS)}
 
 
 def _felt(effect: Effect, theta: np.ndarray, row: Any) -> list[np.ndarray]:
@@ -56,6 +56,16 @@ def _felt(effect: Effect, theta: np.ndarray, row: Any) -> list[np.ndarray]:
             made.append(reached)
     if overrides(effect, "friction"):
         made.append(effect.friction(ctx, theta)[1])
+    if overrides(effect, "follow"):
+        ctx.memory = effect.rest(ctx, theta)
+        for k in range(STEPS):
+            ctx.v, ctx.ctrl = np.cos(k) * v, np.sin(k) * ctrl
+            ctx.memory = effect.follow(ctx, theta, ctx.memory)
+        made += ctx.memory if isinstance(ctx.memory, tuple) else [ctx.memory]
+    if overrides(effect, "modulate"):
+        fields = {n: nominal(n).copy() for n in effect.MODULATES}
+        effect.modulate(ctx, theta, fields)
+        made += [fields[n] - nominal(n) for n in effect.MODULATES]
     if overrides(effect, "force"):
         effect.force(ctx, theta, out)
     return [*made, out.qfrc, out.xfrc]

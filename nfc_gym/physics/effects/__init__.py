@@ -8,16 +8,21 @@ import numpy as np
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import DragLinear, DragQuadratic
+from nfc_gym.physics.effects.backlash import Backlash
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
 from nfc_gym.physics.effects.command import DeadZone, Offset, Saturation, SupplySag
 from nfc_gym.physics.effects.drive import Gain, Loss, TorqueSpeed
 from nfc_gym.physics.effects.friction import Coulomb, DirectionalFriction, LoadFriction, Stribeck
-from nfc_gym.physics.effects.generic import GenericPosition, GenericTime, GenericVelocity
+from nfc_gym.physics.effects.generic import GenericMemory, GenericPosition, GenericTime, GenericVelocity
+from nfc_gym.physics.effects.ground import Compliance, FrictionPatch
+from nfc_gym.physics.effects.gust import Gust
+from nfc_gym.physics.effects.hysteresis import Hysteresis
 from nfc_gym.physics.effects.inertial import ComShift, Inertia, Payload, complete_inertia
 from nfc_gym.physics.effects.joint import Armature, Cogging, DampingPoly, SpringOffset
 from nfc_gym.physics.effects.load import ExternalForce, Slope, Wind
 from nfc_gym.physics.effects.rotor import GroundEffect, RotorDrag
 from nfc_gym.physics.effects.sensors import Misalignment, SensorBias, SensorDelay, SensorGain
+from nfc_gym.physics.effects.sinkage import Sinkage
 from nfc_gym.physics.effects.slip import Slip
 from nfc_gym.physics.effects.thermal import Thermal
 from nfc_gym.physics.effects.timing import Delay, Lag
@@ -25,10 +30,11 @@ from nfc_gym.physics.effects.timing import Delay, Lag
 __all__ = ["FAMILIES", "Context", "Effect", "Forces", "Param", "Scales", "build", "complete_inertia", "propose"]
 
 _TYPES: tuple[type[Effect], ...] = (
-    Coulomb, Stribeck, LoadFriction, DirectionalFriction, DampingPoly, Armature, SpringOffset, Cogging,
-    Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
-    Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, RotorDrag, GroundEffect, ExternalForce, Slope,
-    Slip, SensorBias, SensorGain, SensorDelay, Misalignment, GenericPosition, GenericVelocity, GenericTime,
+    Coulomb, Stribeck, LoadFriction, DirectionalFriction, DampingPoly, Armature, SpringOffset, Hysteresis, Backlash,
+    Cogging, Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
+    Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, Gust, RotorDrag, GroundEffect, ExternalForce, Slope,
+    Slip, FrictionPatch, Compliance, Sinkage, SensorBias, SensorGain, SensorDelay, Misalignment,
+    GenericPosition, GenericVelocity, GenericTime, GenericMemory,
 )  # fmt: skip
 
 FAMILIES: dict[str, type[Effect]] = {t.family: t for t in _TYPES}

@@ -3,7 +3,12 @@
 The same object is calibrated, wrapped around an environment, saved beside a model and named in a report. It acts
 through one or more hooks. Every hook is a pure function over arrays with any leading batch shape `...`; `theta` is
 (..., k), the effect's parameters in the order of `params`. In one physics step hooks run in this order: `action` on the
-command, `model` (once, at set-up), `friction` and `force` on the state before the step, `sense` on what is measured.
+command, `model` (once, at set-up), `follow`, `friction`, `modulate` and `force` on the state before the step, `sense`
+on what is measured.
+
+What a joint went through before (a spring that yielded, a rotor within its play) is kept by `rest` and `follow`, and
+`force` and `modulate` find it in `Context.memory`. Where logs tell how the joints moved before a segment starts,
+`follow` is led along that motion first; elsewhere it begins from `rest`, as it does at an episode's reset.
 
 At its null value an effect leaves the simulator's result unchanged bit for bit, by arithmetic and not by skipping it.
 """
@@ -23,6 +28,7 @@ from nfc_gym.physics.names import names as names_in
 
 Array = NDArray[np.float64]
 Rows = slice | NDArray[np.intp]  # what picks rows of an array, see `index`
+TIME = "exo:time"  # seconds since the log, or the episode, began: a signal that every log has
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,7 @@ class Scales:
       interval: median time between samples, s.
       exogenous: names of the exogenous signals that the logs carry, with their median value.
       channels: names of the measured channels, with (spread, noise) of each.
+      low, high: (nq,) bounds of the motion's coordinates, None where unknown.
     """
 
     force: Array
@@ -75,6 +82,8 @@ class Scales:
     interval: float
     exogenous: Mapping[str, float] = field(default_factory=dict)
     channels: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    low: Array | None = None
+    high: Array | None = None
 
 
 @dataclass
@@ -89,6 +98,7 @@ class Context:
       exogenous: measured signals by name, (...,).
       data: derived field of `MjData` by name, (..., *shape), one substep behind the state as after `mj_step`.
       nominal: a model field of the simulation before any per-step hook wrote to it, (..., *shape).
+      memory: hidden state of the effect whose `force` or `modulate` is called, as its `follow` made it for this step.
     """
 
     model: mujoco.MjModel
@@ -99,6 +109,7 @@ class Context:
     exogenous: Mapping[str, Array]
     data: Callable[[str], Array]
     nominal: Callable[[str], Array]
+    memory: Any = None
 
 
 @dataclass
@@ -125,6 +136,10 @@ class Effect(ABC):
     simpler: ClassVar[tuple[tuple[str, ...], ...]] = ()
     # Families that are special cases of this law at the same place: beside them it is no further alternative.
     covers: ClassVar[tuple[str, ...]] = ()
+    # Model fields that `modulate` writes to.
+    MODULATES: ClassVar[tuple[str, ...]] = ()
+    # Whether the hidden state of `action` outlives the history before a segment: it then begins where the log does.
+    slow: ClassVar[bool] = False
     # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
     PARAMS: ClassVar[tuple[Param, ...]] = ()
 
@@ -206,6 +221,21 @@ class Effect(ABC):
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:  # noqa: B027 (a hook: does nothing by design)
         """Add generalised forces or body wrenches for the coming step."""
+
+    def rest(self, ctx: Context, theta: Array) -> Any:
+        """Hidden state of a joint whose past is unknown, one step before `ctx`."""
+        return None
+
+    def follow(self, ctx: Context, theta: Array, memory: Any) -> Any:
+        """Hidden state for the step that begins at `ctx`, from that of the step before.
+
+        It reads q, v, ctrl and signals alone: along a measured past there is no simulation to take `data` from.
+        """
+        raise NotImplementedError
+
+    def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
+        """Change the fields of `MODULATES`, (..., *shape), in place for the coming step, from what is there."""
+        raise NotImplementedError
 
     def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
         """Inverse mode: forces (T, nu) that a motion needs of the actuators -> those commanded. theta (k,)."""

@@ -157,7 +157,7 @@ class TorqueSpeed(Effect):
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         known = actuator_names(model)
-        fit = [n for n in plain(model) if _peak(model, known.index(n)) > 0 and _on_scalar(model, known.index(n))]
+        fit = [n for n in plain(model) if _peak(model, known.index(n)) > 0 and on_scalar(model, known.index(n))]
         out: list[Effect] = []
         for where in actuator_places(model, fit):
             dofs = [int(model.jnt_dofadr[model.actuator_trnid[known.index(n), 0]]) for n in where]
@@ -167,7 +167,8 @@ class TorqueSpeed(Effect):
         return out
 
 
-def _on_scalar(model: mujoco.MjModel, actuator: int) -> bool:
+def on_scalar(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator moves one hinge or slide joint."""
     if int(model.actuator_trntype[actuator]) != _JOINT:
         return False
     return int(model.jnt_type[model.actuator_trnid[actuator, 0]]) >= int(mujoco.mjtJoint.mjJNT_SLIDE)

@@ -1,6 +1,6 @@
 """An effect with a value of its own at each of several places: several single-place effects that act as one."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,11 @@ from nfc_gym.physics.fields import ModelFields
 if TYPE_CHECKING:
     from nfc_gym.physics.rollout import Plant
 
-_HOOKS = ("spec", "model", "action", "friction", "force", "demand", "sense", "unsense", "chart", "unchart")
+_HOOKS = (
+    "spec", "model", "action", "rest", "follow", "friction", "modulate", "force", "demand", "sense", "unsense", "chart",
+    "unchart",
+)  # fmt: skip
+_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "slow")
 
 
 class Each(Effect):
@@ -80,10 +84,30 @@ class Each(Effect):
         both = [m.friction(ctx, t) for m, t in zip(self.members, self._theta(theta), strict=True)]
         return np.concatenate([self._dofs[d] for d, _ in both]), np.concatenate([level for _, level in both], -1)
 
+    def rest(self, ctx: Context, theta: Array) -> Any:
+        """See `Effect`."""
+        return [m.rest(ctx, t) for m, t in zip(self.members, self._theta(theta), strict=True)]
+
+    def follow(self, ctx: Context, theta: Array, memory: Any) -> Any:
+        """See `Effect`."""
+        return [m.follow(ctx, t, o) for m, t, o in zip(self.members, self._theta(theta), memory, strict=True)]
+
+    def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
+        """See `Effect`."""
+        for m, t in self._recalling(ctx, theta):
+            m.modulate(ctx, t, fields)
+
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         """See `Effect`."""
-        for m, t in zip(self.members, self._theta(theta), strict=True):
+        for m, t in self._recalling(ctx, theta):
             m.force(ctx, t, out)
+
+    def _recalling(self, ctx: Context, theta: Array) -> Iterator[tuple[Effect, Array]]:
+        """Each member and its values, with its own hidden state in `ctx`."""
+        memories = ctx.memory if ctx.memory is not None else [None] * len(self.members)
+        for m, t, memory in zip(self.members, self._theta(theta), memories, strict=True):
+            ctx.memory = memory
+            yield m, t
 
     def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
         """See `Effect`."""
@@ -104,7 +128,7 @@ def each(members: Sequence[Effect]) -> Each:
     """An `Each` that implements just the hooks its members' family implements."""
     first = members[0]
     name = f"Each{type(first).__name__}"
-    body: dict[str, Any] = {k: getattr(first, k) for k in ("family", "summary", "generic", "simpler")}
+    body: dict[str, Any] = {k: getattr(first, k) for k in _TRAITS}
     body |= {hook: getattr(Effect, hook) for hook in _HOOKS if not overrides(first, hook)}
     return type(name, (Each,), body)(members)
 

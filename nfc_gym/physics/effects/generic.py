@@ -1,4 +1,4 @@
-"""Generic alternatives: a smooth function of one variable as a force on one degree of freedom.
+"""Generic alternatives: a smooth function of one variable, or of a joint's past, as a force on one degree of freedom.
 
 They stand for whatever the library lacks. One that beats every named effect says where, and as a function of what, the
 model is wrong, without a claim about the cause. `where` is a scalar joint, or one of the six components of a free
@@ -7,15 +7,17 @@ joint, written `name[0]` to `name[5]`.
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
-from nfc_gym.physics.effects.places import sized
+from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.hysteresis import dahl, excursion
+from nfc_gym.physics.effects.places import joint_scales, sized
 from nfc_gym.physics.fields import names_of, object_id
 
-TIME = "exo:time"  # seconds since the log began, where the logs carry it
 _COUNT = 6
 _FREE, _HINGE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_HINGE)
 
@@ -120,7 +122,7 @@ class GenericVelocity(_Generic):
 
 
 class GenericTime(_Generic):
-    """A force that depends on the time since the log began, read from the signal `exo:time`."""
+    """A force that depends on the time since the log began."""
 
     family = "generic_time"
     summary = "A force that depends on time"
@@ -140,3 +142,41 @@ class GenericTime(_Generic):
             return []
         end = max(2 * float(scales.exogenous[TIME]), 1e-3)  # the signal's median lies half-way through the log
         return [cls._on(place, dof, scales, 0.0, end) for place, dof, _ in coordinates(model)]
+
+
+class GenericMemory(_Generic):
+    """A force with memory in a joint, of whatever law: sum_k c_k w_k over two kinds of hidden states.
+
+    The first three depend on the joint's way alone: elements that yield (Dahl's) within 3, 20 and 70 % of its
+    excursion, of which a sum has a loop of any shape (a Maxwell-slip model, Iwan, J. Applied Mechanics 33, 1966). The
+    others forget with time: the joint's speed, smoothed over 0.02, 0.1 and 0.4 s, as relaxing materials have it (a
+    Prony series).
+    """
+
+    family = "generic_memory"
+    summary = "A force with memory"
+    YIELDING, FORGETTING = np.array([0.03, 0.2, 0.7]), np.array([0.02, 0.1, 0.4])
+    reach, top = 1.0, 1.0
+
+    def rest(self, ctx: Context, theta: Array) -> Any:
+        return np.zeros((*ctx.v.shape[:-1], _COUNT))
+
+    def follow(self, ctx: Context, theta: Array, memory: Any) -> Any:
+        v, half = ctx.v[..., self.dof, None], _COUNT // 2
+        yielding = dahl(memory[..., :half], v * ctx.dt, self.YIELDING * self.reach)
+        keep = np.exp(-ctx.dt / self.FORGETTING)
+        return np.concatenate([yielding, v / self.top + keep * (memory[..., half:] - v / self.top)], -1)
+
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        out.qfrc[..., self.dof] -= (theta * ctx.memory).sum(-1)
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        for place, dof, _ in coordinates(model):
+            if "[" in place:
+                continue
+            effect = cls._on(place, dof, scales, -1.0, 1.0)
+            effect.reach, effect.top = excursion(model, scales, place), joint_scales(model, scales, (place,))[1]
+            out.append(effect)
+        return out

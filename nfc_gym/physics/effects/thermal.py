@@ -17,11 +17,13 @@ class Thermal(Effect):
     """Commands times 1 - fade h; the heat h follows (u / reference)^2: dh/dt = ((u / reference)^2 - h) / time_constant.
 
     One thermal mass heated by the losses of the winding, which go with the square of the current; the resistance that
-    rises with it takes from the force. The heat starts settled at the first command.
+    rises with it takes from the force. The heat starts settled at a log's or an episode's
+    first command.
     """
 
     family = "thermal"
     summary = "Drive fades as it warms up"
+    slow = True  # it warms up over minutes
     PARAMS = (
         Param("fade", "1", 0.0, 0.9, probes=(0.05, 0.2), resolution=0.002),
         Param("time_constant", "s", 0.05, 300.0, probes=(0.5, 3.0, 20.0), shape=True),

@@ -1,0 +1,148 @@
+"""Play between a drive and its joint."""
+
+# ruff: noqa: D102  (hooks are documented once, in base.Effect)
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales, actuator_names, index, joint_dofs
+from nfc_gym.physics.effects.drive import on_scalar, plain
+from nfc_gym.physics.effects.hysteresis import excursion
+from nfc_gym.physics.effects.places import angle_unit, joint_places, sized, with_units
+
+_STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
+_LIGHT = 0.1  # share of the joint's inertia that a rotor has where the model states no armature
+
+
+def drives(model: mujoco.MjModel) -> dict[str, int]:
+    """Scalar joints that just one actuator moves, whose force is an affine function of command and motion: its id."""
+    known, found = actuator_names(model), {}
+    fit = {known.index(n) for n in plain(model)}
+    for a in range(model.nu):
+        joint = int(model.actuator_trnid[a, 0])
+        if on_scalar(model, a):
+            name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+            found.setdefault(name, []).append(a)
+    stateless = lambda a: int(model.actuator_dyntype[a]) == _STATELESS  # noqa: E731
+    return {n: a[0] for n, a in found.items() if n and len(a) == 1 and a[0] in fit and stateless(a[0])}
+
+
+class Drive:
+    """The torque of joints' actuators from command and motion, as MuJoCo computes it.
+
+    Args:
+      model: the nominal model.
+      actuators: (n,) ids, each of a scalar joint.
+    """
+
+    def __init__(self, model: mujoco.MjModel, actuators: NDArray[np.intp]) -> None:
+        joints = model.actuator_trnid[actuators, 0]
+        self.rows = index(actuators)
+        self.q, self.v = (
+            index(model.jnt_qposadr[joints].astype(np.intp)),
+            index(model.jnt_dofadr[joints].astype(np.intp)),
+        )
+        self.gear = model.actuator_gear[actuators, 0].copy()
+        self.low, self.high = (
+            np.where(model.actuator_ctrllimited[actuators].astype(bool), end, far)
+            for end, far in zip(model.actuator_ctrlrange[actuators].T, (-np.inf, np.inf), strict=True)
+        )
+        self.weak, self.strong = (
+            np.where(model.actuator_forcelimited[actuators].astype(bool), end, far)
+            for end, far in zip(model.actuator_forcerange[actuators].T, (-np.inf, np.inf), strict=True)
+        )
+
+    def torque(self, ctx: Context) -> Array:
+        """(..., n) N m or N at the joints."""
+        gain, bias = (ctx.nominal(f"actuator_{n}prm")[..., self.rows, :3] for n in ("gain", "bias"))
+        length, speed = self.gear * ctx.q[..., self.q], self.gear * ctx.v[..., self.v]
+        law = lambda p: p[..., 0] + p[..., 1] * length + p[..., 2] * speed  # noqa: E731
+        wish = np.minimum(np.maximum(ctx.ctrl[..., self.rows], self.low), self.high)
+        return self.gear * np.minimum(np.maximum(law(gain) * wish + law(bias), self.weak), self.strong)
+
+
+class Backlash(Effect):
+    """The drive turns freely through `gap` before its force reaches the joint.
+
+    Where the drive's force changes sign its rotor leaves one flank and crosses the play under that force, its inertia
+    and the joint's own motion; until it lies against the other flank the joint coasts. The drive's force then acts for
+    the rest of that step. The rotor is taken as light: what it hits the flank with is lost, and while both touch the
+    joint moves as the model says. The law thus only withholds the drive's force and adds no energy. The actuator's law
+    (a servo's position) is read at the joint. Nordin and Gutman, Automatica 38 (2002) 1633-1649, survey such models.
+
+    `rotor` is not fitted: it is the joint's `armature`, or a tenth of the joint's inertia where the model has none.
+    The gap is known to the same factor as the rotor is, since the time to cross it goes with their product.
+    """
+
+    family = "backlash"
+    summary = "Backlash: dead travel between drive and joint"
+    MODULATES = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+    PARAMS = (
+        Param("gap", "rad", 0.0, 1.0, probes=(0.01, 0.05)),
+        Param("rotor", "kg m^2", 1e-12, 1e6, probes=(0.01,), shape=True),
+    )
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        known = drives(model)
+        for name, _ in zip(self.where, joint_dofs(model, self.where), strict=True):
+            if name not in known:
+                raise InputError(
+                    f"backlash: no single motor or servo moves {name!r}; joints with one: {', '.join(known)}"
+                )
+        actuators = np.array([known[n] for n in self.where], np.intp)
+        self.drive, self.rows = Drive(model, actuators), index(actuators)
+
+    def rest(self, ctx: Context, theta: Array) -> Any:
+        """The rotor lies against the flank that the drive pushes."""
+        v, half = ctx.v[..., self.drive.v], theta[..., 0:1] / 2
+        return np.sign(self.drive.torque(ctx)) * half, np.array(v), np.ones_like(v)
+
+    def follow(self, ctx: Context, theta: Array, memory: Any) -> Any:
+        """(place of the rotor in the play, its speed, share of the step through which it pushes), (..., n) each."""
+        place, speed, share = memory
+        v, half, dt = ctx.v[..., self.drive.v], theta[..., 0:1] / 2, ctx.dt
+        torque = self.drive.torque(ctx)
+        side, pull = np.sign(torque), np.abs(torque) / theta[..., 1:2]
+        # towards the flank that the drive pushes: speed against the joint, and the way there
+        ahead, way = side * np.where(share > 0, 0.0, speed - v), np.maximum(half - side * place, 0.0)
+        back = (ahead < 0) & (way + ahead**2 / np.maximum(2 * pull, 1e-300) > 2 * half)  # it hits the other flank
+        ahead, way = np.where(back, 0.0, ahead), np.where(back, 2 * half, way)
+        root = np.sqrt(ahead**2 + 2 * pull * way)
+        sooner = 2 * way / np.where(ahead + root > 0, ahead + root, 1.0)
+        later = (root - ahead) / np.maximum(pull, 1e-300)
+        arrival = np.where(way == 0, np.where(ahead < 0, later, 0.0), np.where(ahead >= 0, sooner, later))
+        arrival = np.where((way > 0) & (root == 0), np.inf, arrival)  # nothing moves it
+        pushing = np.where(arrival < dt, 1 - arrival / dt, 0.0)
+        # unless it arrives, through the step: in units of the flank's side, or as it drifts where no force acts
+        drift = np.where(side == 0, speed - v, side * ahead)
+        moved = np.where(back, -side * half, place) + dt * (drift + dt / 2 * side * pull)
+        inside = np.minimum(np.maximum(moved, -half), half)
+        free = np.where(moved == inside, v + drift + dt * side * pull, v)
+        return np.where(pushing > 0, side * half, inside), np.where(pushing > 0, v, free), pushing
+
+    def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
+        share = ctx.memory[2][..., None]
+        for name in self.MODULATES:
+            fields[name][..., self.rows, :] *= share
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        out: list[Effect] = []
+        known = drives(model)
+        for where in joint_places(model):
+            if not set(where) <= set(known):
+                continue
+            dofs = joint_dofs(model, where)
+            inertia = float(np.median(1 / np.maximum(model.dof_invweight0[dofs], 1e-9)))
+            rotor = float(np.median(model.dof_armature[dofs])) or _LIGHT * inertia
+            fixed = {"probes": (rotor,), "low": rotor * (1 - 1e-3), "high": rotor * (1 + 1e-3)}
+            reach, unit = excursion(model, scales, where[0]), angle_unit(model, where[0])
+            gap = {"probes": (0.02 * reach, 0.1 * reach), "high": reach, "resolution": 5e-4 * reach}
+            units = {"gap": unit, "rotor": "kg m^2" if unit == "rad" else "kg"}
+            out.append(cls(where, with_units(sized(cls.PARAMS, gap=gap, rotor=fixed), units)))
+        return out

@@ -1,0 +1,109 @@
+"""Hidden states at a segment's start come from what the log shows before it."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from nfc_gym.core import Channel, Log
+from nfc_gym.measured.instant import track
+from nfc_gym.measured.inverse import actuator_forces
+from nfc_gym.measured.problem import RolloutProblem
+from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.states import estimate_states
+from nfc_gym.physics.effects import build
+from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.physics.rollout import Plant
+
+DT, EVERY, LEVEL, TRANSITION = 0.005, 2, 0.25, 0.15
+SD_Q, SD_V = 5e-4, 5e-3
+PENDULUM = f"""
+<mujoco>
+  <option timestep="{DT}" integrator="implicitfast"/>
+  <worldbody>
+    <body name="bob"><joint name="hinge" axis="0 1 0" damping="0.05"/>
+      <geom name="ball" size="0.03" pos="0 0 -0.3" mass="0.5"/></body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>
+"""
+MODEL = mujoco.MjModel.from_xml_string(PENDULUM)
+
+
+def swing(seed: int, seconds: float = 3.0, fine: int = 5) -> Log:
+    """A swing with Dahl's friction in small Euler steps of the test's own, at a fifth of the model's step."""
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    model.opt.timestep = DT / fine
+    data, w = mujoco.MjData(model), 0.0
+    t = np.arange(round(seconds / DT / EVERY)) * DT * EVERY
+    phase = rng.uniform(0, 6, 2)
+    u, q, v = 0.7 * np.sin(3 * t + phase[0]) + 0.5 * np.sin(7 * t + phase[1]), np.empty(len(t)), np.empty(len(t))
+    for k in range(len(t)):
+        q[k], v[k] = data.qpos[0], data.qvel[0]
+        for _ in range(EVERY * fine):
+            rate = data.qvel[0]
+            w += model.opt.timestep * (rate - abs(rate) * w) / TRANSITION
+            data.ctrl[0], data.qfrc_applied[0] = u[k], -LEVEL * w
+            mujoco.mj_step(model, data)
+    q, v = q + SD_Q * rng.normal(size=len(t)), v + SD_V * rng.normal(size=len(t))
+    channels = {"joint:hinge:pos": Channel(q, "rad", SD_Q), "joint:hinge:vel": Channel(v, "rad/s", SD_V)}
+    return Log(f"swing_{seed}", t, {"ctrl:motor": u}, channels, {"exo:time": t})
+
+
+LOGS = [swing(s) for s in range(3)]
+
+
+@pytest.fixture(scope="module")
+def plant() -> Plant:
+    effect, _ = build("hysteresis", "hinge", {"level": LEVEL, "transition": TRANSITION})
+    return Plant(MODEL, ParameterSpace(MODEL, []), [effect], nthread=1)
+
+
+def _problem() -> RolloutProblem:
+    states = [estimate_states(MODEL, log) for log in LOGS]
+    return RolloutProblem(MODEL, LOGS, states, Layout(0.2, 0.5, (0.1, 0.2), 0.2, DT))
+
+
+def test_at_the_truth_a_spring_that_yields_leaves_only_noise(plant: Plant) -> None:
+    """With the past the residual is what start and sensor noise make; with joints taken to begin at rest it is not."""
+    problem, x = _problem(), np.array([[LEVEL, TRANSITION]])
+    sigma = problem.covariance(plant, x[0])
+    chi2 = []
+    for past in (problem.segments.past, None):
+        blind = problem.take(np.arange(len(problem)))
+        blind.segments = replace(blind.segments, past=past)
+        later = problem.time_of > 0.5  # the log shows a whole history before it
+        r = blind.residual(plant, x)[0][later]
+        chi2.append(np.einsum("si,sij,sj->s", r, np.linalg.inv(sigma[later]), r).mean() / r.shape[1])
+    assert chi2[0] == pytest.approx(1.0, abs=0.35)
+    assert chi2[1] > 3 * chi2[0]
+
+
+def test_parts_of_a_problem_keep_their_past(plant: Plant) -> None:
+    problem, x = _problem(), np.array([[LEVEL, TRANSITION], [0.1, 0.3]])
+    some = np.array([7, 2, 20])
+    np.testing.assert_array_equal(problem.take(some).residual(plant, x), problem.residual(plant, x)[:, some])
+
+
+def test_the_past_before_a_log_begins_is_rest() -> None:
+    past = _problem().segments.past
+    assert past is not None
+    q, v = past.motion(0)  # 0.5 s before each start
+    np.testing.assert_array_equal(v[0], 0)
+    np.testing.assert_array_equal(q[0], estimate_states(MODEL, LOGS[0]).qpos[0])
+    lead, step = past.lead
+    assert lead.shape[1] * step == pytest.approx(_problem().time_of.max() - 0.5)
+
+
+def test_inverse_problems_lead_hidden_states_along_the_log(plant: Plant) -> None:
+    """The torque that the motion needs holds the loop: within the noise of the accelerations of what was commanded."""
+    log = LOGS[0]
+    log = replace(log, channels=log.channels | {"force:motor": Channel(log.controls["ctrl:motor"], "N m", 1e-3)})
+    t = track(MODEL, log, estimate_states(MODEL, log), ["force:motor"], 1)
+    error = [
+        np.std((actuator_forces(plant, x, t) - t.measured)[20:-20])
+        for x in (np.array([LEVEL, TRANSITION]), np.array([0.0, TRANSITION]))
+    ]
+    assert error[0] < 0.35 * error[1]

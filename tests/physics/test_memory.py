@@ -1,0 +1,190 @@
+"""Joints that remember, against closed forms: a spring that yields, play between drive and joint."""
+
+import mujoco
+import numpy as np
+import pytest
+from machines import make, plant_of, run
+
+from nfc_gym.physics.effects import FAMILIES, Context, Forces, Scales
+from nfc_gym.physics.past import Past
+from nfc_gym.physics.rollout import Segments
+
+DT, MASS = 0.001, 2.0
+RAIL = f"""
+<mujoco><option timestep="{DT}" gravity="0 0 0"/><worldbody><body><joint name="rail" type="slide" axis="1 0 0"/>
+<geom type="sphere" size=".1" mass="{MASS}"/></body></worldbody>
+<actuator><motor name="push" joint="rail"/></actuator></mujoco>"""
+MODEL = mujoco.MjModel.from_xml_string(RAIL)
+
+
+def _loop(level: float, transition: float, reach: float, count: int) -> float:
+    """Work that hysteresis takes from a joint led once to and fro, when its first turns are over."""
+    effect, theta = make("hysteresis", "rail", {"level": level, "transition": transition})
+    effect.bind(MODEL)
+    x = reach * np.sin(np.linspace(0, 6 * np.pi, 3 * count + 1))
+    ctx = Context(MODEL, DT, np.zeros(1), np.zeros(1), np.zeros(1), {}, None, None)  # type: ignore[arg-type]
+    memory, forces = effect.rest(ctx, theta), []
+    for step in np.diff(x):
+        ctx.v = np.array([step / DT])
+        ctx.memory = memory = effect.follow(ctx, theta, memory)
+        out = Forces(np.zeros(1), np.zeros((2, 6)))
+        effect.force(ctx, theta, out)
+        forces.append(out.qfrc[0])
+    f, last = np.array([0.0, *forces]), slice(2 * count, 3 * count)
+    return float((-(f[1:] + f[:-1]) / 2 * np.diff(x))[last].sum())
+
+
+@pytest.mark.parametrize(("reach", "count"), [(0.3, 2000), (0.3, 8000), (0.05, 4000)])
+def test_hysteresis_takes_the_area_of_its_loop_at_any_speed(reach: float, count: int) -> None:
+    """4 level (X - D tanh(X / D)) a turn between -X and X, however fast: Dahl's equation integrated by hand."""
+    level, transition = 3.0, 0.1
+    area = 4 * level * (reach - transition * np.tanh(reach / transition))
+    assert _loop(level, transition, reach, count) == pytest.approx(area, rel=2e-3)
+
+
+def test_hysteresis_is_a_spring_at_first_and_dry_friction_at_last() -> None:
+    level, transition = 3.0, 0.5
+    effect, theta = make("hysteresis", "rail", {"level": level, "transition": transition})
+    omega = np.sqrt(level / transition / MASS)
+    q = run(RAIL, effect, theta, 1000, qvel=[0.001]).qpos[0, 0, :, 0]
+    np.testing.assert_allclose(q, 0.001 / omega * np.sin(omega * np.arange(1001) * DT), atol=2e-6)
+    v = run(RAIL, effect, theta, 4000, qvel=[20.0]).qvel[0, 0, :, 0]
+    assert (v[1000] - v[4000]) / (3000 * DT) == pytest.approx(level / MASS, rel=1e-3)
+
+
+def test_hysteresis_of_a_step_too_long_for_it_stays_stable() -> None:
+    """A transition far below what a step can resolve: the mass still comes to rest, and no energy appears."""
+    effect, theta = make("hysteresis", "rail", {"level": 50.0, "transition": 1e-6})
+    v = np.abs(run(RAIL, effect, theta, 600, qvel=[1.0]).qvel[0, 0, :, 0])
+    assert v.max() <= 1.0
+    assert v[-1] < 1e-3
+
+
+def test_hidden_states_are_led_along_the_measured_past() -> None:
+    """Segments cut from a longer motion, with its past, go on as the motion did; without a past they do not."""
+    cut, steps = 707, 300  # 7 ms after the drive has turned: a rotor is in its gap
+    for family, values in (
+        ("hysteresis", {"level": 3.0, "transition": 0.05}),
+        ("backlash", {"gap": 0.02, "rotor": 0.02}),
+    ):
+        effect, theta = make(family, "rail", values)
+        ctrl = 4 * np.sign(np.sin(np.arange(cut + steps) * DT * 2 * np.pi / 0.35))[:, None]
+        whole = run(RAIL, effect, theta, cut + steps, ctrl=ctrl)
+        q, v = whole.qpos[0, 0], whole.qvel[0, 0]
+        start, speed = q[cut][None], v[cut][None]
+        past = Past.given(q[None, : cut + 1], v[None, : cut + 1])
+        plant = plant_of(MODEL, effect)
+        again = [
+            plant.shoot(theta[None], Segments(DT, cut, start, speed, ctrl[None], past=p)).qpos[0, 0]
+            for p in (past, None)
+        ]
+        np.testing.assert_allclose(again[0], q[cut:], atol=1e-9, err_msg=family)
+        assert np.abs(again[1] - q[cut:]).max() > 1e-5, family
+        fine = Segments(DT / 2, 2 * cut, start, speed, np.repeat(ctrl, 2, 0)[None], past=past.refine().repeat(1))
+        model = mujoco.MjModel.from_xml_string(RAIL)
+        model.opt.timestep = DT / 2
+        finer = plant_of(model, effect).shoot(theta[None], fine).qpos[0, 0, ::2]
+        assert np.abs(finer - q[cut:]).max() < 0.2 * np.abs(again[1] - q[cut:]).max(), family
+
+
+def test_pasts_are_picked_and_repeated() -> None:
+    q = np.arange(12.0).reshape(3, 4, 1)
+    past = Past.given(q, 10 * q)
+    np.testing.assert_array_equal(past.pick(np.array([2, 0])).motion(1)[0][:, 0], [9, 1])
+    np.testing.assert_array_equal(past.pick(np.array([1])).repeat(2).motion(3)[1][:, 0], [70, 70])
+    np.testing.assert_array_equal(past.refine().motion(3)[0][:, 0], [1.5, 5.5, 9.5])
+
+
+@pytest.mark.parametrize("gap", [0.02, 1e-4])
+def test_backlash_loses_the_time_to_cross_the_gap(gap: float) -> None:
+    """After the drive turns, the joint coasts for sqrt(2 gap J / F), and goes on as the nominal one did that later."""
+    rotor, force, first = 0.05, 5.0, 101
+    effect, theta = make("backlash", "rail", {"gap": gap, "rotor": rotor})
+    ctrl = np.where(np.arange(1000) < first, -force, force)[:, None]
+    v = run(RAIL, effect, theta, 1000, ctrl=ctrl).qvel[0, 0, :, 0]
+    lost = np.sqrt(2 * gap * rotor / force)
+    coasting = int(lost / DT)
+    np.testing.assert_allclose(v[first : first + coasting], -force / MASS * first * DT, rtol=1e-9)
+    assert v[-1] == pytest.approx(force / MASS * (1000 * DT - 2 * first * DT - lost), rel=1e-6)
+
+
+def test_backlash_adds_no_energy() -> None:
+    """Whatever the drive does, what reaches the joint is its force times a share between 0 and 1."""
+    rng = np.random.default_rng(0)
+    effect, theta = make("backlash", "rail", {"gap": 0.01, "rotor": 0.02})
+    ctrl = np.repeat(rng.normal(size=20), 50)[:, None] * 5
+    v = run(RAIL, effect, theta, 1000, ctrl=ctrl).qvel[0, 0, :, 0]
+    share = MASS * np.diff(v) / DT / ctrl[:, 0]
+    assert share.min() > -1e-9
+    assert share.max() < 1 + 1e-9
+    assert (share < 1e-9).sum() > 20  # while it crosses the gap
+    assert (share > 1 - 1e-9).sum() > 600
+
+
+def test_backlash_acts_on_a_servo_without_slowing_its_joint() -> None:
+    """In the gap a stiff servo's damping is gone as well: the joint keeps its speed."""
+    text = RAIL.replace('<motor name="push" joint="rail"/>', '<velocity name="push" joint="rail" kv="500"/>').replace(
+        "<option ", '<option integrator="implicitfast" '
+    )
+    effect, theta = make("backlash", "rail", {"gap": 0.5, "rotor": 50.0})
+    ctrl = np.where(np.arange(60) < 20, 1.0, 0.0)[:, None]
+    v = run(text, effect, theta, 60, qvel=[0.9], ctrl=ctrl).qvel[0, 0, :, 0]
+    assert v[20] == pytest.approx(1.0, rel=1e-2)
+    np.testing.assert_allclose(v[22:], v[22], rtol=1e-9)
+
+
+def test_thermal_heat_begins_where_the_log_does() -> None:
+    """Two seconds at full command before a history of 50 ms: the drive has faded as if all of it had been history."""
+    effect, theta = make("thermal", "push", {"fade": 0.5, "time_constant": 2.0, "reference": 1.0})
+    plant, cut = plant_of(MODEL, effect), 2000
+    ctrl = np.concatenate([np.zeros(1), np.ones(cut + 100)])[:, None]
+    whole = run(RAIL, effect, theta, 100, ctrl=ctrl[: cut + 100], history=cut)
+
+    def lay(index: np.ndarray) -> object:
+        from nfc_gym.physics.past import Before
+
+        still = np.zeros((1, 51, 1))
+        lead = np.concatenate([np.zeros(1), np.ones(195)])[None, :, None]
+        return Before(still, still, lead, (cut - 50) * DT / 195)
+
+    seg = Segments(DT, 50, np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 150, 1)), past=Past(lay, np.arange(1)))  # type: ignore[arg-type]
+    short = plant.shoot(theta[None], seg)
+    assert short.qvel[0, 0, -1, 0] == pytest.approx(whole.qvel[0, 0, -1, 0], rel=5e-3)
+    settled = run(RAIL, effect, theta, 100, ctrl=[1.0], history=50).qvel[0, 0, -1, 0]
+    assert abs(settled / whole.qvel[0, 0, -1, 0] - 1) > 0.1
+
+
+def test_generic_memory_stands_for_laws_it_does_not_know() -> None:
+    """A Bouc-Wen joint (n = 2, sigma = 0.6) led through turns: memory explains it, a function of place does not."""
+    x = np.concatenate([np.linspace(0, 0.3, 300), np.linspace(0.3, -0.2, 500), np.linspace(-0.2, 0.25, 450)])
+    w, truth = 0.0, []
+    for step in np.diff(x):
+        s = np.sign(step)
+        w += step / 0.06 * (1 - 0.6 * s * abs(w) * w + (0.6 - 1) * w * w)
+        truth.append(w)
+    y = np.array(truth)
+    scales = Scales(
+        np.ones(1), np.full(1, 0.5), np.ones(1), np.ones(1), 0.01, {"exo:time": 1.0}, {"joint:rail:pos": (0.2, 1e-3)}
+    )
+
+    def unexplained(family: str) -> float:
+        effect = FAMILIES[family].propose(MODEL, scales)[0]
+        effect.bind(MODEL)
+        ctx = Context(MODEL, DT, np.zeros(1), np.zeros(1), np.zeros(1), {}, None, None)  # type: ignore[arg-type]
+        memory, columns = effect.rest(ctx, effect.null), []
+        for step, place in zip(np.diff(x), x[1:], strict=True):
+            ctx.q, ctx.v = np.array([place]), np.array([step / DT])
+            if family == "generic_memory":
+                ctx.memory = memory = effect.follow(ctx, effect.null, memory)
+            column = []
+            for unit in np.eye(6):
+                out = Forces(np.zeros(1), np.zeros((2, 6)))
+                effect.force(ctx, unit, out)
+                column.append(out.qfrc[0])
+            columns.append(column)
+        a = np.array(columns)
+        rest = y - a @ np.linalg.lstsq(a, y, rcond=None)[0]
+        return float((rest**2).mean() / (y**2).mean())
+
+    assert unexplained("generic_memory") < 0.01
+    assert unexplained("generic_position") > 0.2
