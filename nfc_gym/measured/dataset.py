@@ -3,18 +3,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.measured import units
+from nfc_gym.measured.align import Alignment, Use, align
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.columns import LogColumns
 from nfc_gym.measured.entries import Measured, Servo
 from nfc_gym.measured.mapping import Mapping, Split, load_mapping
-from nfc_gym.measured.readers import read_table
+from nfc_gym.measured.readers import Streams, read_table
 from nfc_gym.measured.splits import Fold, Source, divide, find_logs
 
 Array = NDArray[np.float64]
@@ -75,6 +76,20 @@ class Defect:
     text: str
 
 
+class Reading(NamedTuple):
+    """What became of one log file.
+
+    Attributes:
+      log: None where `defects` stop it from being used.
+      defects: everything that does.
+      alignment: how its streams were brought to one time; None where the file has one time for all columns.
+    """
+
+    log: Log | None
+    defects: list[Defect]
+    alignment: Alignment | None = None
+
+
 def load(path: Path | str) -> Dataset:
     """Read a mapping file and all its logs.
 
@@ -86,7 +101,7 @@ def load(path: Path | str) -> Dataset:
     sources = find_logs(mapping, path.parent)
     logs = []
     for source in sources:
-        log, defects = read_log(mapping, source)
+        log, defects, _ = read_log(mapping, source)
         if log is None:
             raise InputError("\n".join(f"{source.path}: {p.where}: {p.text}" for p in defects))
         logs.append(log)
@@ -100,8 +115,8 @@ def assemble(mapping: Mapping, path: Path, sources: list[Source], logs: list[Log
     return Dataset(mapping, path, division.logs, division.folds, division.independent, files)
 
 
-def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]]:
-    """One log file as the mapping describes it, or None and everything that is wrong with it."""
+def read_log(mapping: Mapping, source: Source) -> Reading:
+    """One log file as the mapping describes it, or everything that is wrong with it."""
     defects: list[Defect] = []
 
     def attempt(where: str, work: Callable[[], T]) -> T | None:
@@ -112,12 +127,19 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
             return None
 
     try:
-        columns = LogColumns(read_table(source.path))
+        table = read_table(source.path, source.part)
     except InputError as e:
-        return None, [Defect("file", str(e).removeprefix(f"{source.path}: "))]
+        return Reading(None, [Defect("file", str(e).removeprefix(f"{source.path}: "))])
+    alignment = None
+    if isinstance(table, Streams):
+        streams = table
+        alignment = attempt("streams", lambda: align(streams, mapping.time.columns[0], _uses(mapping)))
+        if alignment is None:
+            return Reading(None, defects)
+    columns = LogColumns(table if alignment is None else alignment.table)
     time = attempt("time", lambda: _time(mapping, columns))
     if time is None:
-        return None, defects
+        return Reading(None, defects, alignment)
     m = mapping
     controls = {
         k: attempt(f"controls.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.controls.items()
@@ -125,7 +147,9 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
     exogenous = {
         k: attempt(f"exogenous.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.exogenous.items()
     }
-    channels = {k: attempt(f"channels.{k}", lambda k=k, c=c: _channel(k, c, columns)) for k, c in m.channels.items()}
+    channels = {
+        k: attempt(f"channels.{k}", lambda k=k, c=c: _channel(k, c, columns, alignment)) for k, c in m.channels.items()
+    }
     known = {
         f"{k.field}:{'+'.join(k.of)}": attempt(
             f"known.{k.field}",
@@ -139,10 +163,22 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
         if c.servo
     }
     if defects:
-        return None, defects
+        return Reading(None, defects, alignment)
     parts = {"controls": controls, "channels": channels, "exogenous": exogenous, "known": known, "servo": servo}
     log = attempt("log", lambda: Log(name=source.name, time=time, group=source.group, **parts))
-    return log, defects
+    return Reading(log, defects, alignment)
+
+
+def _uses(mapping: Mapping) -> list[Use]:
+    """How each column of a mapping is brought to other times: commands and masks held, measurements interpolated."""
+    uses = [Use(c.columns, "hold" if c.hold == "zero" else "linear") for c in mapping.controls.values()]
+    for name, channel in mapping.channels.items():
+        uses.append(Use(channel.columns, "slerp" if parse_channel(name).quantity == "quat" else "linear", True))
+        uses += [Use((channel.mask,), "hold")] if channel.mask else []
+    uses += [Use(e.columns, "linear") for e in mapping.exogenous.values()]
+    uses += [Use((name,), "linear") for k in mapping.known for name in k.columns]
+    servos = [c.servo for c in mapping.controls.values() if c.servo]
+    return uses + [Use((n,), "linear") for s in servos for t in (s.gain, s.supply, s.damping) for n in t.columns]
 
 
 def _time(mapping: Mapping, columns: LogColumns) -> Array:
@@ -195,7 +231,7 @@ def _servo(columns: LogColumns, servo: Servo) -> dict[str, Array]:
     return {name: _finite(columns.product(term.columns, term.scale), name) for name, term in terms.items()}
 
 
-def _channel(name: str, entry: Measured, columns: LogColumns) -> Channel:
+def _channel(name: str, entry: Measured, columns: LogColumns, alignment: Alignment | None) -> Channel:
     parsed = parse_channel(name)
     raw = columns.many(entry.columns)
     width = len(entry.axes) if entry.axes else parsed.width or (1 if parsed.kind in ("joint", "force") else None)
@@ -205,7 +241,9 @@ def _channel(name: str, entry: Measured, columns: LogColumns) -> Channel:
         )
     mask = columns.mask(entry.mask) if entry.mask else None
     present: NDArray[np.bool_] = np.asarray(np.isfinite(raw).all(1))
-    if entry.rate is not None and not present.all():  # a slower sensor's rows between its samples are empty
+    patchy = alignment is not None and not alignment.patchy.isdisjoint(entry.columns)
+    slow = None if alignment is None else alignment.rates.get(entry.columns[0])
+    if (entry.rate is not None or patchy) and not present.all():  # between samples and in gaps nothing was measured
         mask = present if mask is None else np.logical_and(mask, present)
     _finite(raw, f"columns {', '.join(entry.columns)}", mask)
     if not present.any():
@@ -221,7 +259,7 @@ def _channel(name: str, entry: Measured, columns: LogColumns) -> Channel:
         smooth=entry.smooth,
         mask=mask,
         axes=entry.axis_indices,
-        rate=entry.rate,
+        rate=entry.rate or slow,
     )
 
 
