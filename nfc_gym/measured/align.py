@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core import InputError
+from nfc_gym.measured.channels import parse_channel
+from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.readers import Stream, Streams, Table
 from nfc_gym.measured.resampling import Clock, held, interpolated, lateness, nearest_rows
 
@@ -87,6 +89,18 @@ class Alignment:
     patchy: frozenset[str]
     cut: tuple[float, float]
     cutters: tuple[str, str]
+
+
+def uses(mapping: Mapping) -> list[Use]:
+    """How each column of a mapping is brought to other times: commands and masks held, measurements interpolated."""
+    found = [Use(c.columns, "hold" if c.hold == "zero" else "linear") for c in mapping.controls.values()]
+    for name, channel in mapping.channels.items():
+        found.append(Use(channel.columns, "slerp" if parse_channel(name).quantity == "quat" else "linear", True))
+        found += [Use((channel.mask,), "hold")] if channel.mask else []
+    found += [Use(e.columns, "linear") for e in mapping.exogenous.values()]
+    found += [Use((name,), "linear") for k in mapping.known for name in k.columns]
+    servos = [c.servo for c in mapping.controls.values() if c.servo]
+    return found + [Use((n,), "linear") for s in servos for t in (s.gain, s.supply, s.damping) for n in t.columns]
 
 
 def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:

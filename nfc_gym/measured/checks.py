@@ -74,9 +74,8 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
             found.append((source.name, Suspicion("error", defect.where, "defect", message, advice)))
         if log is not None:
             found += [(source.name, s) for s in suspicions(mapping, model, log)]
-            found += [(source.name, s) for s in clock_offsets(model, log)]
             logs.append(log)
-    findings = gather(_weighed(found, len(sources)), len(sources))
+    findings = gather(_weighed(found, len(sources)), len(sources)) + list(clock_offsets(model, logs))
     if len(logs) < len(sources):
         return None, findings
     try:

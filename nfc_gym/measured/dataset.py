@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.measured import units
-from nfc_gym.measured.align import Alignment, Use, align
+from nfc_gym.measured.align import Alignment, align, uses
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.columns import LogColumns
 from nfc_gym.measured.entries import Measured, Servo
@@ -133,7 +133,7 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
     alignment = None
     if isinstance(table, Streams):
         streams = table
-        alignment = attempt("streams", lambda: align(streams, mapping.time.columns[0], _uses(mapping)))
+        alignment = attempt("streams", lambda: align(streams, mapping.time.columns[0], uses(mapping)))
         if alignment is None:
             return Reading(None, defects)
     columns = LogColumns(table if alignment is None else alignment.table)
@@ -167,18 +167,6 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
     parts = {"controls": controls, "channels": channels, "exogenous": exogenous, "known": known, "servo": servo}
     log = attempt("log", lambda: Log(name=source.name, time=time, group=source.group, **parts))
     return Reading(log, defects, alignment)
-
-
-def _uses(mapping: Mapping) -> list[Use]:
-    """How each column of a mapping is brought to other times: commands and masks held, measurements interpolated."""
-    uses = [Use(c.columns, "hold" if c.hold == "zero" else "linear") for c in mapping.controls.values()]
-    for name, channel in mapping.channels.items():
-        uses.append(Use(channel.columns, "slerp" if parse_channel(name).quantity == "quat" else "linear", True))
-        uses += [Use((channel.mask,), "hold")] if channel.mask else []
-    uses += [Use(e.columns, "linear") for e in mapping.exogenous.values()]
-    uses += [Use((name,), "linear") for k in mapping.known for name in k.columns]
-    servos = [c.servo for c in mapping.controls.values() if c.servo]
-    return uses + [Use((n,), "linear") for s in servos for t in (s.gain, s.supply, s.damping) for n in t.columns]
 
 
 def _time(mapping: Mapping, columns: LogColumns) -> Array:

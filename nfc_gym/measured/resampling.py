@@ -1,4 +1,4 @@
-"""Samples at one set of times brought to another: held, interpolated, and which rows a slow sensor's samples fall on."""
+"""Samples brought to other times: held or interpolated, and which rows the samples of a slow sensor fall on."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -2,12 +2,12 @@
 
 A data set is the folder that holds `metadata.json` (or the one above it, whose `data` folder does), or the `.hdf5` file
 in it. Columns of an episode of T steps: `observations` (T, k) and `actions` (T, k) with entries `observations[5]`;
-of Dict and Tuple spaces `observations.<key>`, `actions.0`; `rewards`, `terminations`, `truncations`, `infos.<key>`. Row i holds
-the observation that action i answers to, so the episode's last observation, which no action follows, is left out.
-Episodes of one step are left out.
+of Dict and Tuple spaces `observations.<key>`, `actions.0`; `rewards`, `terminations`, `truncations`, `infos.<key>`.
+Row i holds the observation that action i answers to, so the episode's last observation, which no action follows, is
+left out. Episodes of one step are left out.
 
-`time` is `infos.time` where that was recorded, else the row times the environment's control interval `dt`, for which the
-environment must be registered here; its own program is run, never one that the data set names.
+`time` is `infos.time` where that was recorded, else the row times the environment's control interval `dt`, for which
+the environment must be registered here; its own program is run, never one that the data set names.
 """
 
 import functools
@@ -115,7 +115,8 @@ def _interval(spec: tuple[str, int | None]) -> float | None:
     if name not in gym.registry:  # gym.make would import the module that an id names
         return None
     try:
-        env = gym.make(name, **({} if skip is None else {"frame_skip": skip}))
+        kwargs: dict[str, Any] = {} if skip is None else {"frame_skip": skip}
+        env = gym.make(name, **kwargs)
     except Exception:  # it needs what is not installed, say: then the time stays unknown
         return None
     interval = getattr(env.unwrapped, "dt", None)

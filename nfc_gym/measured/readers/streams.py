@@ -33,10 +33,10 @@ class Stream:
 class Streams(dict[str, NDArray[Any]]):
     """Columns by name, and which stream each belongs to.
 
-    The grammar of names: `<topic>.<field>.<sub>` with `[i]` for an entry of an array; besides the fields every topic has
-    `<topic>.time` (s, by the sender's stamps where it has them) and `<topic>.received` (s, when it was logged). Both
-    count from the file's first stamp of that kind. The one that a mapping names as its `time` makes that topic the
-    base, to which the others are resampled: by their `time` or by their `received`, as the base's is.
+    The grammar of names: `<topic>.<field>.<sub>` with `[i]` for an entry of an array; besides its fields every topic
+    has `<topic>.time` (s, by the sender's stamps where it has them) and `<topic>.received` (s, when it was logged).
+    Both count from the file's first stamp of that kind. The one that a mapping names as its `time` makes that topic
+    the base, to which the others are resampled: by their `time` or by their `received`, as the base's is.
 
     Args:
       streams: what the file holds.

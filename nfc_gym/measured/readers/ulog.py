@@ -3,9 +3,9 @@
 Columns are `<topic>.<field>`: `vehicle_attitude.q` (T, 4) with entries `vehicle_attitude.q[0]`; a topic's further
 instances are `sensor_gyro[1].x`. Parameters are constants, `parameters.MPC_XY_P`, as they were at the start.
 
-A sample's time is its `timestamp_sample`, when the sensor was read, where the topic has one; but commands (`actuator_*`,
-`*_setpoint`) and topics without one are timed by `timestamp`, when they were sent: of a command, `timestamp_sample` is
-the time of the sample that it answers to. `<topic>.received` is `timestamp`.
+A sample's time is its `timestamp_sample`, when the sensor was read, where the topic has one. Commands (`actuator_*`,
+`*_setpoint`) and topics without one are timed by `timestamp`, when they were sent: the `timestamp_sample` of a command is
+that of the sample it answers to. `<topic>.received` is `timestamp`.
 """
 
 import contextlib
