@@ -213,7 +213,7 @@ def _bring(
     widths = np.cumsum([0] + [1 if p.ndim == 1 else p.shape[1] for p in parts])
     columns = np.concatenate([p[clock.order].reshape(len(clock.time), -1) for p in parts], 1).astype(np.float64)
     time, interval = clock.time, clock.interval
-    there = np.isfinite(columns).all(1)
+    there: NDArray[np.bool_] = np.asarray(np.isfinite(columns).all(1))
     if use.measured and 1 < there.sum() < len(there):  # a message that lacks a value is no sample of it
         time, columns = time[there], columns[there]
         interval = float(np.median(np.diff(time)))

@@ -72,8 +72,8 @@ def nearest_rows(time: Array, at: Array) -> NDArray[np.bool_]:
     """Of the times `at` (T,), those that are nearest to one of `time` (N,): (T,) bool."""
     right = np.clip(np.searchsorted(at, time), 1, len(at) - 1)
     nearest = np.where(time - at[right - 1] <= at[right] - time, right - 1, right)
-    rows = np.zeros(len(at), bool)
-    rows[nearest[(time >= at[0]) & (time <= at[-1])]] = True
+    rows, half = np.zeros(len(at), bool), 0.5 * np.median(np.diff(at))
+    rows[nearest[(time >= at[0] - half) & (time <= at[-1] + half)]] = True
     return rows
 
 

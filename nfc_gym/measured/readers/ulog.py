@@ -4,8 +4,8 @@ Columns are `<topic>.<field>`: `vehicle_attitude.q` (T, 4) with entries `vehicle
 instances are `sensor_gyro[1].x`. Parameters are constants, `parameters.MPC_XY_P`, as they were at the start.
 
 A sample's time is its `timestamp_sample`, when the sensor was read, where the topic has one. Commands (`actuator_*`,
-`*_setpoint`) and topics without one are timed by `timestamp`, when they were sent: the `timestamp_sample` of a command is
-that of the sample it answers to. `<topic>.received` is `timestamp`.
+`*_setpoint`) and topics without one are timed by `timestamp`, when they were sent: the `timestamp_sample` of a command
+is that of the sample it answers to. `<topic>.received` is `timestamp`.
 """
 
 import contextlib
