@@ -126,14 +126,15 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
             defects.append(Defect(where, str(e)))
             return None
 
+    time_column, used = mapping.time.columns[0], uses(mapping)
     try:
-        table = read_table(source.path, source.part)
+        table = read_table(source.path, source.part, {time_column, *(name for use in used for name in use.columns)})
     except InputError as e:
         return Reading(None, [Defect("file", str(e).removeprefix(f"{source.path}: "))])
     alignment = None
     if isinstance(table, Streams):
         streams = table
-        alignment = attempt("streams", lambda: align(streams, mapping.time.columns[0], uses(mapping)))
+        alignment = attempt("streams", lambda: align(streams, time_column, used))
         if alignment is None:
             return Reading(None, defects)
     columns = LogColumns(table if alignment is None else alignment.table)

@@ -1,4 +1,4 @@
-"""What was written at known times comes back at other times: exactly where it can, within the formula's error elsewhere."""
+"""What is known at some times comes back at others: exactly, or within the error of the interpolation formula."""
 
 import numpy as np
 import pytest
@@ -167,7 +167,7 @@ def test_what_cannot_be_brought_together_is_an_error() -> None:
         align(table, "/a.time", [Use(("/a.w", "/b.x"), "slerp", True)])
     with pytest.raises(InputError, match=r"'/b.x' has times of its own, and '/a.raw' is not a time.*/a.time, /b.time"):
         align(table, "/a.raw", [Use(("/b.x",), "linear")])
-    with pytest.raises(InputError, match="'/a.q' has entries 0 to 2"):
+    with pytest.raises(InputError, match=r"'/a\.q' has entries 0 to 2"):
         align(table, "/b.time", [Use(("/a.q[7]",), "linear")])
     same = align(table, "/a.raw", [Use(("/a.w",), "linear", True), Use(("parameters.mass",), "linear")])
     np.testing.assert_array_equal(same.table["/a.w"], np.ones(5))

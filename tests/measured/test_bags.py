@@ -21,7 +21,10 @@ KINDS = ("mcap", "sqlite3", "ros1")
 
 
 def low(i: int, ns: int, spare: int = 0) -> Any:
-    motors = [make("machine_msgs/msg/Motor", q=0.5 * i, torque=float(-i)), make("machine_msgs/msg/Motor", q=1.0, torque=0.1)]
+    motors = [
+        make("machine_msgs/msg/Motor", q=0.5 * i, torque=float(-i)),
+        make("machine_msgs/msg/Motor", q=1.0, torque=0.1),
+    ]
     return make(
         "machine_msgs/msg/Low", header=make.header(ns), motor=motors, gyro=np.array([i, 2.0 * i, 0.3]),
         spare=np.arange(float(spare)), on=i % 2 == 0, text="moving",
@@ -99,7 +102,12 @@ def test_frames_of_tf_are_topics(tmp_path: Path) -> None:
         def transform(child: str, x: float) -> Any:
             pose = make("geometry_msgs/msg/Transform", translation=make.vector(x),
                         rotation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0))  # fmt: skip
-            return make("geometry_msgs/msg/TransformStamped", header=make.header(START + i), child_frame_id=child, transform=pose)
+            return make(
+                "geometry_msgs/msg/TransformStamped",
+                header=make.header(START + i),
+                child_frame_id=child,
+                transform=pose,
+            )
 
         both = [transform("base", i), transform("tool", -i)]
         return START + 7 + i, make("tf2_msgs/msg/TFMessage", transforms=both if i % 2 else both[:1])
@@ -109,6 +117,23 @@ def test_frames_of_tf_are_topics(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table["/tf[base].transform.translation.x"], np.arange(6.0))
     np.testing.assert_array_equal(table["/tf[tool].transform.translation.x"], [-1.0, -3.0, -5.0])
     assert {s.clock for s in table.streams} == {"header.stamp"}
+
+
+def test_topics_that_nobody_asks_for_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from rosbags.highlevel import AnyReader
+
+    decoded: list[str] = []
+    plain = AnyReader.deserialize
+    monkeypatch.setattr(
+        AnyReader, "deserialize", lambda self, raw, kind: decoded.append(kind) or plain(self, raw, kind)
+    )
+    messages = [(START + i, low(i, START + i)) for i in range(9)]
+    commands = [(START + i, make.command(START + i, i)) for i in range(9)]
+    topics = {"/low": ("machine_msgs/msg/Low", messages), "/low_cmd": ("machine_msgs/msg/Stamped", commands)}
+    table = read_table(write_bag(tmp_path / "run", STORE, topics), names={"/low_cmd.data", "/low_cmd.time"})
+    np.testing.assert_array_equal(table["/low_cmd.data"], np.arange(9.0))
+    assert "/low.motor[0].q" in table  # it can still be suggested
+    assert sorted(decoded) == ["machine_msgs/msg/Low"] + ["machine_msgs/msg/Stamped"] * 9
 
 
 def test_stamps_that_were_never_set_are_not_believed(tmp_path: Path) -> None:
@@ -129,7 +154,9 @@ def test_a_bag_of_several_files_is_one_log(tmp_path: Path) -> None:
     (folder / "more.db3").write_bytes(file.read_bytes())
     text = (folder / "metadata.yaml").read_text()
     assert "message_count: 50" in text
-    twice = text.replace(f"- {file.name}", f"- {file.name}\n  - more.db3").replace("message_count: 50", "message_count: 100")
+    twice = text.replace(f"- {file.name}", f"- {file.name}\n  - more.db3").replace(
+        "message_count: 50", "message_count: 100"
+    )
     (folder / "metadata.yaml").write_text(twice)
     assert len(read_table(folder)["/low.time"]) == 100
 

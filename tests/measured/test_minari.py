@@ -34,7 +34,9 @@ def collect(
         told = {"time": np.array([info["time"] for _, info in seen])} if infos else None
         ends = {"terminations": [False] * n, "truncations": [False] * n}
         actions = 0.1 * np.arange(n, dtype=np.float32)[:, None]
-        episodes.append(EpisodeBuffer(observations=observations, actions=actions, rewards=[1.0] * n, infos=told, **ends))
+        episodes.append(
+            EpisodeBuffer(observations=observations, actions=actions, rewards=[1.0] * n, infos=told, **ends)
+        )
     named = {"dataset_id": "spring/test-v0", "algorithm_name": "none", "author": "none", "author_email": "none"}
     minari.create_dataset_from_buffers(buffer=episodes, env=env, code_permalink="none", **named)
     env.close()
@@ -62,7 +64,9 @@ def test_episodes_are_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         read_table(root, "episode_9")
 
 
-def test_time_without_infos_is_that_of_the_environment_registered_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_without_infos_is_that_of_the_environment_registered_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root = collect(tmp_path, monkeypatch, (5,), infos=False, frame_skip=3)
     np.testing.assert_allclose(read_table(root, "episode_0")["time"], 0.06 * np.arange(5))
     gym.registry.pop("Spring-v0")

@@ -1,5 +1,6 @@
 """A mapping of a bag: what `nfc-gym check` says of its streams and clocks, and the log that is loaded."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from nfc_gym.measured.dataset import load
 pytest.importorskip("rosbags", reason="needs rosbags: pip install 'nfc_gym[ros]'")
 STORE = typestore()
 make = Messages(STORE)
-SECONDS = 12.0
+SECONDS = 5.0
 
 MAPPING = """
 version: 1
@@ -45,7 +46,12 @@ def yaw_rate(t: np.ndarray) -> np.ndarray:
 
 
 def record(
-    folder: Path, seed: int, late: float = 0.0, gap: tuple[float, float] = (0, 0), header: bool = True, shift: float = 0.01
+    folder: Path,
+    seed: int,
+    late: float = 0.0,
+    gap: tuple[float, float] = (0, 0),
+    header: bool = True,
+    shift: float = 0.01,
 ) -> None:
     """Joints at 100 Hz, a command `shift` before each, poses at 40 Hz, an IMU at 200 Hz stamped `late` seconds late."""
     rng = np.random.default_rng(seed)
@@ -57,14 +63,15 @@ def record(
     def noisy(value: float, sd: float) -> float:
         return value + sd * float(rng.standard_normal())
 
-    joints = [
-        (ns + 2_000_000, make.joints(ns, ["hinge"], [noisy(np.sin(3 * t + seed), 1e-3)], [noisy(3 * np.cos(3 * t + seed), 1e-2)]))
-        for t, ns in times(100, 0.2)
-    ]  # fmt: skip
+    def joint(t: float, ns: int) -> Any:
+        return make.joints(ns, ["hinge"], [noisy(np.sin(3 * t + seed), 1e-3)], [noisy(3 * np.cos(3 * t + seed), 1e-2)])
+
+    joints = [(ns + 2_000_000, joint(t, ns)) for t, ns in times(100, 0.2)]
     goals = [(ns, make.command(ns if header else 0, np.sin(3 * t + seed + 0.1))) for t, ns in times(100, 0.2 - shift)]
     poses = [(ns, make.pose(ns, (np.cos(yaw(t) / 2), 0, 0, np.sin(yaw(t) / 2)))) for t, ns in times(40, 0.0)]
     imu = [
-        (ns, make.imu(ns + round(late * NS), [noisy(w, 1e-2) for w in (0, 0, yaw_rate(t))])) for t, ns in times(200, 0.0)
+        (ns, make.imu(ns + round(late * NS), [noisy(w, 1e-2) for w in (0, 0, yaw_rate(t))]))
+        for t, ns in times(200, 0.0)
     ]
     topics = {
         "/js": ("sensor_msgs/msg/JointState", joints),
@@ -75,23 +82,34 @@ def record(
     write_bag(folder / f"run_{seed}", STORE, topics)
 
 
-def dataset(folder: Path, *edits: tuple[str, str], **how: Any) -> Path:
-    text = MAPPING
-    for old, new in edits:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "machine.xml").write_text(MODEL)
-    (folder / "mapping.yaml").write_text(text)
-    for seed in range(3):
-        record(folder, seed, **how)
-    return folder / "mapping.yaml"
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A mapping, edited, of three bags recorded in a certain way; each way is recorded once."""
+    made: dict[Any, Path] = {}
+
+    def write(folder: Path, *edits: tuple[str, str], **how: Any) -> Path:
+        key = tuple(sorted(how.items()))
+        if key not in made:
+            made[key] = tmp_path_factory.mktemp("bags")
+            for seed in range(3):
+                record(made[key], seed, **how)
+        text = MAPPING
+        for old, new in edits:
+            assert old in text
+            text = text.replace(old, new)
+        shutil.copytree(made[key], folder, dirs_exist_ok=True)
+        (folder / "machine.xml").write_text(MODEL)
+        (folder / "mapping.yaml").write_text(text)
+        return folder / "mapping.yaml"
+
+    return write
 
 
 def told(path: Path, *severities: str) -> str:
     return "\n".join(f"{f.severity} {f}" for f in check(path) if not severities or f.severity in severities)
 
 
-def test_what_was_resampled_is_said_and_nothing_is_wrong(tmp_path: Path) -> None:
+def test_what_was_resampled_is_said_and_nothing_is_wrong(tmp_path: Path, dataset: Any) -> None:
     path = dataset(tmp_path)
     said = told(path)
     assert "error" not in said
@@ -106,7 +124,7 @@ def test_what_was_resampled_is_said_and_nothing_is_wrong(tmp_path: Path) -> None
     assert "at the end, which /pose does not reach" in said
 
 
-def test_the_log_is_what_was_written(tmp_path: Path) -> None:
+def test_the_log_is_what_was_written(tmp_path: Path, dataset: Any) -> None:
     log = load(dataset(tmp_path)).logs[0]
     t = log.time + 0.2
     np.testing.assert_allclose(log.controls["ctrl:servo"], np.sin(3 * t + 0.1), atol=1e-9)
@@ -121,7 +139,7 @@ def test_the_log_is_what_was_written(tmp_path: Path) -> None:
     np.testing.assert_allclose(2 * np.arctan2(seen[:, 3], seen[:, 0]), yaw(t[quat.mask]), atol=2e-3)
 
 
-def test_a_clock_offset_is_found_with_its_number_and_nothing_is_shifted(tmp_path: Path) -> None:
+def test_a_clock_offset_is_found_with_its_number_and_nothing_is_shifted(tmp_path: Path, dataset: Any) -> None:
     path = dataset(tmp_path, late=0.0123)
     warnings = told(path, "warning", "error")
     finding = next(f for f in check(path) if f.where == "channels.sensor:gyro")
@@ -136,23 +154,20 @@ def test_a_clock_offset_is_found_with_its_number_and_nothing_is_shifted(tmp_path
     np.testing.assert_allclose(log.channels["sensor:gyro"].values[:, 2], yaw_rate(log.time + 0.2 - 0.0123), atol=6e-2)
 
 
-def test_a_gap_is_a_mask_for_a_sensor_and_an_error_in_the_base(tmp_path: Path) -> None:
-    path = dataset(tmp_path, ("time: {column: /js.time}", "time: {column: /imu.time}"), gap=(5.0, 5.04))
+def test_a_gap_is_a_mask_for_a_sensor_and_an_error_in_the_base(tmp_path: Path, dataset: Any) -> None:
+    path = dataset(tmp_path, ("time: {column: /js.time}", "time: {column: /imu.time}"), gap=(3.0, 3.04))
     log = load(path).logs[0]
     mask = log.channels["body:base:quat"].mask
     assert mask is not None
     assert "pause" in told(path, "warning")
-    wide = tmp_path / "wide"
-    wide.mkdir()
-    assert "a gap of 0.6" in told(dataset(wide, gap=(5.0, 5.6)), "error")
+    assert "a gap of 0.6" in told(dataset(tmp_path / "wide", gap=(3.0, 3.6)), "error")
 
 
-def test_late_commands_unset_headers_and_no_common_time_are_said(tmp_path: Path) -> None:
+def test_late_commands_unset_headers_and_no_common_time_are_said(tmp_path: Path, dataset: Any) -> None:
     said = told(dataset(tmp_path, shift=0.004, header=False), "warning", "note")
     assert "its commands wait 4 ms on average for the next row of /js" in said
     assert "held from 100 Hz (receive time, as header.stamp is not always set)" in said
     apart = tmp_path / "apart"
-    apart.mkdir()
     assert "no time in common" in told(dataset(apart, late=100.0), "error")
     assert "/js.received' as the time column" in told(apart / "mapping.yaml", "error")
     by_receipt = (apart / "mapping.yaml").read_text().replace("/js.time", "/js.received")
@@ -161,7 +176,7 @@ def test_late_commands_unset_headers_and_no_common_time_are_said(tmp_path: Path)
     assert "to the 100 Hz of /js (receive time)" in told(apart / "mapping.yaml")
 
 
-def test_a_column_that_is_not_there_is_suggested(tmp_path: Path) -> None:
+def test_a_column_that_is_not_there_is_suggested(tmp_path: Path, dataset: Any) -> None:
     said = told(dataset(tmp_path, ("/js.position[hinge]", "/js.positon[hinge]")), "error")
     assert "no column '/js.positon[hinge]'" in said
     assert "did you mean '/js.position[hinge]'" in said

@@ -56,7 +56,11 @@ def test_topics_instances_arrays_parameters_and_stamps(tmp_path: Path) -> None:
 def test_streams_are_brought_to_one_time(tmp_path: Path) -> None:
     table = read_table(flight(tmp_path / "log.ulg"))
     quat = tuple(f"vehicle_attitude.q[{i}]" for i in range(4))
-    uses = [Use(quat, "slerp", True), Use(("actuator_motors.control[1]",), "hold"), Use(("sensor_gyro[1].x",), "linear", True)]
+    uses = [
+        Use(quat, "slerp", True),
+        Use(("actuator_motors.control[1]",), "hold"),
+        Use(("sensor_gyro[1].x",), "linear", True),
+    ]
     found = align(table, "sensor_gyro.time", uses)
     t = found.table["sensor_gyro.time"]
     np.testing.assert_allclose(found.table[quat[3]], np.sin(t / 2), atol=1e-6)

@@ -124,9 +124,7 @@ def write_ulog(path: Path, topics: Mapping[str, Any], parameters: Mapping[str, f
     for number, (topic, fields) in enumerate(topics.items()):
         name, _, instance = topic.removesuffix("]").partition("[")
         kinds = {k: "uint64_t" if k.startswith("timestamp") else "float" for k in fields}
-        spelled = [
-            f"{kinds[k]}[{v.shape[1]}] {k}" if np.ndim(v) == 2 else f"{kinds[k]} {k}" for k, v in fields.items()
-        ]
+        spelled = [f"{kinds[k]}[{v.shape[1]}] {k}" if np.ndim(v) == 2 else f"{kinds[k]} {k}" for k, v in fields.items()]
         if name not in formats:
             out.append(ulog_message("F", f"{name}:{';'.join(spelled)};".encode()))
             formats.add(name)

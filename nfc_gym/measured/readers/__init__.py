@@ -43,13 +43,12 @@ for _suffix, _reader in (
     (".parquet", read_parquet),
     (".npz", read_npz),
     (".mat", read_mat),
-    (".db3", read_bag),
-    (".mcap", read_bag),
-    (".bag", read_bag),
     (".ulg", read_ulog),
 ):
     register_reader(_suffix, _reader)
-register_folder("metadata.yaml", read_bag)
+for _suffix in (".db3", ".mcap", ".bag"):
+    register_reader(_suffix, read_bag, selective=True)
+register_folder("metadata.yaml", read_bag, selective=True)
 register_parts(".hdf5", episodes, read_episode)
 for _marker in ("metadata.json", "data/metadata.json"):
     register_folder(_marker, read_episode, episodes)

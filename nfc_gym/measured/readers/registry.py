@@ -1,6 +1,6 @@
 """Which reader opens which file: by suffix, or by what a folder holds; one file may hold several logs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -17,23 +17,29 @@ Table = dict[str, NDArray[Any]]
 Reader = Callable[[Path], Table]
 Parts = Callable[[Path], tuple[str, ...]]
 PartReader = Callable[[Path, str], Table]
+SelectiveReader = Callable[[Path, Collection[str] | None], Table]
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """`parts` None: the file is one log, and `read` takes its path alone; else also the name of a part."""
+    """`read` takes a path; where `parts` is, also the name of a part; where `selective`, also the columns wanted."""
 
     read: Callable[..., Table]
     parts: Parts | None = None
+    selective: bool = False
 
 
 _SUFFIXES: dict[str, _Entry] = {}
 _FOLDERS: dict[str, _Entry] = {}
 
 
-def register_reader(suffix: str, reader: Reader) -> None:
-    """Have files that end in `suffix` (`".bag"`) read by `reader`: path -> columns (T,), arrays (T, k) or scalars."""
-    _SUFFIXES[suffix.lower()] = _Entry(reader)
+def register_reader(suffix: str, reader: Reader | SelectiveReader, selective: bool = False) -> None:
+    """Have files that end in `suffix` (`".bag"`) read by `reader`: path -> columns (T,), arrays (T, k) or scalars.
+
+    A `selective` reader also takes the names of the columns that are wanted, or None for all; of the others it may give
+    a sample only, so that they can be suggested for a name that is misspelt.
+    """
+    _SUFFIXES[suffix.lower()] = _Entry(reader, selective=selective)
 
 
 def register_parts(suffix: str, parts: Parts, reader: PartReader) -> None:
@@ -41,9 +47,11 @@ def register_parts(suffix: str, parts: Parts, reader: PartReader) -> None:
     _SUFFIXES[suffix.lower()] = _Entry(reader, parts)
 
 
-def register_folder(marker: str, reader: Reader | PartReader, parts: Parts | None = None) -> None:
+def register_folder(
+    marker: str, reader: Reader | PartReader | SelectiveReader, parts: Parts | None = None, selective: bool = False
+) -> None:
     """Have a folder that holds a file `marker` (`"metadata.yaml"`) read as one log, or as several where `parts` is."""
-    _FOLDERS[marker] = _Entry(reader, parts)
+    _FOLDERS[marker] = _Entry(reader, parts, selective)
 
 
 def suffixes() -> tuple[str, ...]:
@@ -69,10 +77,14 @@ def log_parts(path: Path) -> tuple[str, ...]:
     return entry.parts(path)
 
 
-def read_table(path: Path, part: str = "") -> Table:
+def read_table(path: Path, part: str = "", names: Collection[str] | None = None) -> Table:
     """Columns of a log by name: (T,), (T, k), or 0-d arrays that stand for the whole log.
 
     A file whose columns are sampled at times of their own gives `Streams`, a table that says which are whose.
+
+    Args:
+      part: one of `log_parts(path)`.
+      names: the columns that are wanted; others may be incomplete. None is all.
 
     Raises:
       InputError: the file is missing, empty, truncated, of another format, holds no column or one name twice.
@@ -85,7 +97,8 @@ def read_table(path: Path, part: str = "") -> Table:
             f"{path}: no reader for {path.suffix or 'a file without suffix'}; known: {', '.join(_SUFFIXES)}"
         )
     _require(path)
-    table = entry.read(path) if entry.parts is None else entry.read(path, part)
+    arguments = ((part,) if entry.parts else ()) + ((names,) if entry.selective else ())
+    table = entry.read(path, *arguments)
     if not isinstance(table, Streams):
         table = {name: _as_seconds(np.asarray(values)) for name, values in table.items()}
     if not table:

@@ -11,7 +11,7 @@ A sample's time is its header's stamp where every message of the topic has one, 
 definitions are the bag's own; a bag without any is read by those of ROS 2's common packages.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -33,8 +33,13 @@ _ADVICE = (
 )
 
 
-def read_bag(path: Path) -> Streams:
+def read_bag(path: Path, names: Collection[str] | None = None) -> Streams:
     """All topics of a recording; a folder's files are one log.
+
+    Args:
+      path: the recording.
+      names: the columns that are wanted; of topics that none of them belongs to only the first message is decoded.
+        None is all columns.
 
     Raises:
       InputError: `rosbags` is not installed, or the recording is cut off, damaged, or holds no readable message.
@@ -44,7 +49,7 @@ def read_bag(path: Path) -> Streams:
     common = typesys.get_typestore(typesys.Stores.LATEST)
     with parsing(path, _ADVICE), highlevel.AnyReader([path], default_typestore=common) as bag:
         types = Types(bag.typestore)
-        topics, left_out, count = _messages(bag, types)
+        topics, left_out, count = _messages(bag, types, names)
         if count != bag.message_count:
             raise broken(path, f"{bag.message_count} messages are announced, {count} are there", _ADVICE)
     streams = []
@@ -58,8 +63,9 @@ def read_bag(path: Path) -> Streams:
     return Streams(streams, left_out)
 
 
-def _messages(bag: Any, types: Types) -> tuple[dict[str, "_Topic"], dict[str, str], int]:
+def _messages(bag: Any, types: Types, names: Collection[str] | None) -> tuple[dict[str, "_Topic"], dict[str, str], int]:
     """Topics by name, what is left out and why, and how many messages there were in all."""
+    wanted = {c.topic for c in bag.connections if names is None or any(_of(name, c.topic) for name in names)}
     topics: dict[str, _Topic] = {}
     refused: dict[str, str] = {}
     silent = {c.topic: "no message was recorded" for c in bag.connections}
@@ -67,9 +73,9 @@ def _messages(bag: Any, types: Types) -> tuple[dict[str, "_Topic"], dict[str, st
     for connection, received, raw in bag.messages():
         count += 1
         name, msgtype = connection.topic, connection.msgtype
-        silent.pop(name, None)
-        if name in refused:
+        if name in refused or (name not in silent and name not in wanted):
             continue
+        silent.pop(name, None)
         if len(raw) > LARGEST_MESSAGE:
             refused[name] = f"its messages are larger than {LARGEST_MESSAGE >> 10} KiB"
             continue
@@ -84,6 +90,10 @@ def _messages(bag: Any, types: Types) -> tuple[dict[str, "_Topic"], dict[str, st
     for name in refused:  # a topic whose first messages were small
         topics.pop(name, None)
     return topics, silent | refused, count
+
+
+def _of(column: str, topic: str) -> bool:
+    return column.startswith((f"{topic}.", f"{topic}["))
 
 
 def _unpacked(topic: str, msgtype: str, message: Any) -> Iterator[tuple[str, str, Any]]:
