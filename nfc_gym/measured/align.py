@@ -75,8 +75,7 @@ class Alignment:
       base: the topic whose times they are.
       clock: what those times are.
       resampled: what was done to the other streams.
-      rates: column -> Hz at which a sensor slower than the base was sampled; it is NaN between its samples.
-      patchy: columns that are NaN in some rows because of gaps or because their sensor is slow.
+      rates: measured columns that are NaN in some rows, in gaps or between a slow sensor's samples -> Hz of those.
       cut: s that were cut off at the start and at the end, as some stream does not reach there.
       cutters: the streams that decided where.
     """
@@ -86,7 +85,6 @@ class Alignment:
     clock: str
     resampled: tuple[Resampled, ...]
     rates: dict[str, float]
-    patchy: frozenset[str]
     cut: tuple[float, float]
     cutters: tuple[str, str]
 
@@ -122,7 +120,7 @@ def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
     table: Table = dict(streams)
     table[time] = grid[rows]
     done: dict[tuple[str, How], Resampled] = {}
-    rates, patchy = {}, set()
+    rates: dict[str, float] = {}
     for use in uses:
         owner = _owner(streams, use)
         if owner is None:
@@ -133,16 +131,14 @@ def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
         elif owner.name not in clocks:  # a single message, such as a latched one, stands for the whole log
             table |= {name: p[0] for name, p in zip(use.columns, parts, strict=True)}
         elif all(p.dtype.kind in "biuf" for p in parts):
-            values, report, slow = _bring(clocks[owner.name], parts, grid[rows], use)
+            values, report = _bring(clocks[owner.name], parts, grid[rows], use)
             table |= dict(zip(use.columns, values, strict=True))
             if use.measured and any(not np.isfinite(v).all() for v in values):
-                patchy |= set(use.columns)
-            if slow is not None:
-                rates |= dict.fromkeys(use.columns, slow)
+                rates |= dict.fromkeys(use.columns, report["rate"])
             told = Resampled(owner.name, owner.clock if kind == "stamps" else "receive time", use.how, **report)
             done[owner.name, use.how] = max(done.get((owner.name, use.how), told), told, key=lambda r: r.missing)
     clock = base.clock if kind == "stamps" else "receive time"
-    return Alignment(table, base.name, clock, tuple(done.values()), rates, frozenset(patchy), cut, cutters)
+    return Alignment(table, base.name, clock, tuple(done.values()), rates, cut, cutters)
 
 
 def _require_present(streams: Streams, names: Sequence[str]) -> None:
@@ -173,7 +169,7 @@ def _single(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
             f"name one of {', '.join(clocks[:8])}"
         )
     name = "" if base is None else base.name
-    return Alignment(dict(streams), name, time, (), {}, frozenset(), (0.0, 0.0), ("", ""))
+    return Alignment(dict(streams), name, time, (), {}, (0.0, 0.0), ("", ""))
 
 
 def _overlap(
@@ -208,8 +204,8 @@ def _values(streams: Streams, name: str) -> NDArray[Any]:
 
 def _bring(
     clock: Clock, parts: Sequence[NDArray[Any]], grid: Array, use: Use
-) -> tuple[list[NDArray[Any]], dict[str, Any], float | None]:
-    """Columns at the times `grid`, what is reported of them, and the rate in Hz of a sensor slower than that."""
+) -> tuple[list[NDArray[Any]], dict[str, Any]]:
+    """Columns at the times `grid`, and what is reported of them."""
     widths = np.cumsum([0] + [1 if p.ndim == 1 else p.shape[1] for p in parts])
     columns = np.concatenate([p[clock.order].reshape(len(clock.time), -1) for p in parts], 1).astype(np.float64)
     time, interval = clock.time, clock.interval
@@ -218,14 +214,14 @@ def _bring(
         time, columns = time[there], columns[there]
         interval = float(np.median(np.diff(time)))
     step = float(np.median(np.diff(grid)))
-    gap, late, slow = GAP * interval, 0.0, None
+    gap, late = GAP * interval, 0.0
     fresh = np.ones(len(grid), bool)
     if use.how == "hold":
         values, gap, late = held(time, columns, grid), np.inf, lateness(time, grid)
     else:
         values = interpolated(time, columns, grid, gap, use.how == "slerp")
         if use.measured and interval > SLOWER * step:
-            fresh, slow = nearest_rows(time, grid), 1 / interval
+            fresh = nearest_rows(time, grid)
     missing = float(np.isnan(values[fresh]).any(1).mean()) if fresh.any() else 1.0
     values[~fresh] = np.nan
     out = [values[:, a] if p.ndim == 1 else values[:, a:b] for p, a, b in zip(parts, widths, widths[1:], strict=False)]
@@ -240,4 +236,4 @@ def _bring(
         "repeated": clock.repeated,
         "disordered": clock.disordered,
     }
-    return out, report, slow
+    return out, report

@@ -23,6 +23,7 @@ T = TypeVar("T")
 
 LARGEST_GAP = 10.0  # sampling intervals; a longer pause makes two logs of one
 UNIT_NORM = 0.05  # a quaternion's norm may differ so much from 1 (rounding, interpolation) and is then normalised
+ROUNDING = 1e-14  # a norm that differs so little from 1 is 1
 
 
 @dataclass(frozen=True)
@@ -230,9 +231,9 @@ def _channel(name: str, entry: Measured, columns: LogColumns, alignment: Alignme
         )
     mask = columns.mask(entry.mask) if entry.mask else None
     present: NDArray[np.bool_] = np.asarray(np.isfinite(raw).all(1))
-    patchy = alignment is not None and not alignment.patchy.isdisjoint(entry.columns)
-    slow = None if alignment is None else alignment.rates.get(entry.columns[0])
-    if (entry.rate is not None or patchy) and not present.all():  # between samples and in gaps nothing was measured
+    rates = {} if alignment is None else alignment.rates
+    rate = entry.rate or next((rates[name] for name in entry.columns if name in rates), None)
+    if rate is not None and not present.all():  # between a slow sensor's samples and in gaps nothing was measured
         mask = present if mask is None else np.logical_and(mask, present)
     _finite(raw, f"columns {', '.join(entry.columns)}", mask)
     if not present.any():
@@ -248,7 +249,7 @@ def _channel(name: str, entry: Measured, columns: LogColumns, alignment: Alignme
         smooth=entry.smooth,
         mask=mask,
         axes=entry.axis_indices,
-        rate=entry.rate or slow,
+        rate=rate,
     )
 
 
@@ -269,6 +270,7 @@ def _quaternion(values: Array, scalar_last: bool) -> Array:
             f"norm {norm[off[0]]:.3g} at row {off[0]} ({off.size} such rows) where unit quaternions are wanted; "
             "name their four columns"
         )
+    norm = np.where(np.abs(norm - 1) < ROUNDING, 1.0, norm)  # what is of unit length keeps its bits
     quat = (np.roll(values, 1, axis=1) if scalar_last else values) / norm[:, None]
     flips = np.where((quat[1:] * quat[:-1]).sum(1) < 0, -1.0, 1.0)
     return quat * np.cumprod(np.concatenate([[1.0], flips]))[:, None]

@@ -92,7 +92,7 @@ def test_nothing_is_interpolated_over_a_gap_but_its_edges_stand() -> None:
     assert told["linear"].gap == pytest.approx(GAP * 0.01)
     assert told["linear"].longest == pytest.approx(0.51)
     assert told["linear"].missing == pytest.approx(inside[nearest_rows(time, grid)].mean(), abs=0.01)
-    assert found.patchy == {"/s.x"}
+    assert found.rates == {"/s.x": pytest.approx(100)}
     assert np.isfinite(found.table["/s.u"]).all()  # a command holds until the next
 
 
