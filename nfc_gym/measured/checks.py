@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 
 from nfc_gym.core import InputError, Log
+from nfc_gym.measured.clock_checks import clock_offsets
 from nfc_gym.measured.dataset import Dataset, assemble, read_log
 from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order
 from nfc_gym.measured.mapping import SPLITS, Mapping, load_mapping
@@ -14,6 +15,7 @@ from nfc_gym.measured.model import compile_model, read_spec
 from nfc_gym.measured.model_checks import model_findings
 from nfc_gym.measured.signal_checks import suspicions
 from nfc_gym.measured.splits import find_logs
+from nfc_gym.measured.stream_checks import stream_notes
 
 __all__ = ["Finding", "check", "examine", "require"]
 
@@ -64,14 +66,16 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
     found: list[tuple[str, Suspicion]] = []
     logs: list[Log] = []
     for source in sources:
-        log, defects = read_log(mapping, source)
+        log, defects, alignment = read_log(mapping, source)
+        if alignment is not None:
+            found += [(source.name, s) for s in stream_notes(alignment)]
         for defect in defects:
             message, _, advice = defect.text.partition("; ")
             found.append((source.name, Suspicion("error", defect.where, "defect", message, advice)))
         if log is not None:
             found += [(source.name, s) for s in suspicions(mapping, model, log)]
             logs.append(log)
-    findings = gather(_weighed(found, len(sources)), len(sources))
+    findings = gather(_weighed(found, len(sources)), len(sources)) + list(clock_offsets(model, logs))
     if len(logs) < len(sources):
         return None, findings
     try:

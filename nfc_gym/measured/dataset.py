@@ -3,18 +3,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.measured import units
+from nfc_gym.measured.align import Alignment, align, uses
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.columns import LogColumns
 from nfc_gym.measured.entries import Measured, Servo
 from nfc_gym.measured.mapping import Mapping, Split, load_mapping
-from nfc_gym.measured.readers import read_table
+from nfc_gym.measured.readers import Streams, read_table
 from nfc_gym.measured.splits import Fold, Source, divide, find_logs
 from nfc_gym.physics.effects.base import TIME
 
@@ -23,6 +24,7 @@ T = TypeVar("T")
 
 LARGEST_GAP = 10.0  # sampling intervals; a longer pause makes two logs of one
 UNIT_NORM = 0.05  # a quaternion's norm may differ so much from 1 (rounding, interpolation) and is then normalised
+ROUNDING = 1e-14  # a norm that differs so little from 1 is 1
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,20 @@ class Defect:
     text: str
 
 
+class Reading(NamedTuple):
+    """What became of one log file.
+
+    Attributes:
+      log: None where `defects` stop it from being used.
+      defects: everything that does.
+      alignment: how its streams were brought to one time; None where the file has one time for all columns.
+    """
+
+    log: Log | None
+    defects: list[Defect]
+    alignment: Alignment | None = None
+
+
 def load(path: Path | str) -> Dataset:
     """Read a mapping file and all its logs.
 
@@ -87,7 +103,7 @@ def load(path: Path | str) -> Dataset:
     sources = find_logs(mapping, path.parent)
     logs = []
     for source in sources:
-        log, defects = read_log(mapping, source)
+        log, defects, _ = read_log(mapping, source)
         if log is None:
             raise InputError("\n".join(f"{source.path}: {p.where}: {p.text}" for p in defects))
         logs.append(log)
@@ -101,8 +117,8 @@ def assemble(mapping: Mapping, path: Path, sources: list[Source], logs: list[Log
     return Dataset(mapping, path, division.logs, division.folds, division.independent, files)
 
 
-def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]]:
-    """One log file as the mapping describes it, or None and everything that is wrong with it."""
+def read_log(mapping: Mapping, source: Source) -> Reading:
+    """One log file as the mapping describes it, or everything that is wrong with it."""
     defects: list[Defect] = []
 
     def attempt(where: str, work: Callable[[], T]) -> T | None:
@@ -112,13 +128,21 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
             defects.append(Defect(where, str(e)))
             return None
 
+    time_column, used = mapping.time.columns[0], uses(mapping)
     try:
-        columns = LogColumns(read_table(source.path))
+        table = read_table(source.path, source.part, {time_column, *(name for use in used for name in use.columns)})
     except InputError as e:
-        return None, [Defect("file", str(e).removeprefix(f"{source.path}: "))]
+        return Reading(None, [Defect("file", str(e).removeprefix(f"{source.path}: "))])
+    alignment = None
+    if isinstance(table, Streams):
+        streams = table
+        alignment = attempt("streams", lambda: align(streams, time_column, used))
+        if alignment is None:
+            return Reading(None, defects)
+    columns = LogColumns(table if alignment is None else alignment.table)
     time = attempt("time", lambda: _time(mapping, columns))
     if time is None:
-        return None, defects
+        return Reading(None, defects, alignment)
     m = mapping
     controls = {
         k: attempt(f"controls.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.controls.items()
@@ -126,7 +150,9 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
     exogenous = {
         k: attempt(f"exogenous.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.exogenous.items()
     }
-    channels = {k: attempt(f"channels.{k}", lambda k=k, c=c: _channel(k, c, columns)) for k, c in m.channels.items()}
+    channels = {
+        k: attempt(f"channels.{k}", lambda k=k, c=c: _channel(k, c, columns, alignment)) for k, c in m.channels.items()
+    }
     exogenous.setdefault(TIME, time)  # that of the whole file, where a split by time cuts it
     known = {
         f"{k.field}:{'+'.join(k.of)}": attempt(
@@ -141,12 +167,12 @@ def read_log(mapping: Mapping, source: Source) -> tuple[Log | None, list[Defect]
         if c.servo
     }
     if defects:
-        return None, defects
+        return Reading(None, defects, alignment)
     parts = {"controls": controls, "channels": channels, "exogenous": exogenous, "known": known, "servo": servo}
     log = attempt(
         "log", lambda: Log(name=source.name, time=time, group=source.group, condition=source.condition, **parts)
     )
-    return log, defects
+    return Reading(log, defects, alignment)
 
 
 def _time(mapping: Mapping, columns: LogColumns) -> Array:
@@ -199,7 +225,7 @@ def _servo(columns: LogColumns, servo: Servo) -> dict[str, Array]:
     return {name: _finite(columns.product(term.columns, term.scale), name) for name, term in terms.items()}
 
 
-def _channel(name: str, entry: Measured, columns: LogColumns) -> Channel:
+def _channel(name: str, entry: Measured, columns: LogColumns, alignment: Alignment | None) -> Channel:
     parsed = parse_channel(name)
     raw = columns.many(entry.columns)
     width = len(entry.axes) if entry.axes else parsed.width or (1 if parsed.kind in ("joint", "force") else None)
@@ -209,7 +235,9 @@ def _channel(name: str, entry: Measured, columns: LogColumns) -> Channel:
         )
     mask = columns.mask(entry.mask) if entry.mask else None
     present: NDArray[np.bool_] = np.asarray(np.isfinite(raw).all(1))
-    if entry.rate is not None and not present.all():  # a slower sensor's rows between its samples are empty
+    rates = {} if alignment is None else alignment.rates
+    rate = entry.rate or next((rates[name] for name in entry.columns if name in rates), None)
+    if rate is not None and not present.all():  # between a slow sensor's samples and in gaps nothing was measured
         mask = present if mask is None else np.logical_and(mask, present)
     _finite(raw, f"columns {', '.join(entry.columns)}", mask)
     if not present.any():
@@ -225,7 +253,7 @@ def _channel(name: str, entry: Measured, columns: LogColumns) -> Channel:
         smooth=entry.smooth,
         mask=mask,
         axes=entry.axis_indices,
-        rate=entry.rate,
+        rate=rate,
     )
 
 
@@ -246,6 +274,7 @@ def _quaternion(values: Array, scalar_last: bool) -> Array:
             f"norm {norm[off[0]]:.3g} at row {off[0]} ({off.size} such rows) where unit quaternions are wanted; "
             "name their four columns"
         )
+    norm = np.where(np.abs(norm - 1) < ROUNDING, 1.0, norm)  # what is of unit length keeps its bits
     quat = (np.roll(values, 1, axis=1) if scalar_last else values) / norm[:, None]
     flips = np.where((quat[1:] * quat[:-1]).sum(1) < 0, -1.0, 1.0)
     return quat * np.cumprod(np.concatenate([[1.0], flips]))[:, None]

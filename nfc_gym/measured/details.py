@@ -78,7 +78,7 @@ def _rollout_traces(v: Verified, models: Models) -> list[dict[str, Any]]:
     rows = []
     for i, o in enumerate(one.observers):
         step, measured = one.samples(i)
-        for d in range(measured.shape[-1]):
+        for d in range(measured.shape[-1] if len(step) else 0):
             spread = np.ptp(curves["calibrated"][i][0, 0, :, d] - curves["extended"][i][0, 0, :, d])
             rows.append((spread / max(float(np.ptp(measured[:, d])), 1e-6), o, i, d, step, measured))
     rows.sort(key=lambda r: -r[0])

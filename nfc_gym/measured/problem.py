@@ -130,13 +130,13 @@ class RolloutProblem(Problem):
             for name in ("qpos_sd", "qvel_sd")
         ]
 
+        def rows(log: Log, name: str, at: Array) -> Array:
+            channel = log.channels[name]
+            values = channel.values.reshape(len(log), -1)[at]
+            return values if channel.mask is None else np.where(channel.mask[at][:, None], values, np.nan)
+
         def take(o: Observer) -> Array:
-            return np.stack(
-                [
-                    kit.logs[i].channels[o.name].values.reshape(len(kit.logs[i]), -1)[n]
-                    for i, n in zip(where.log, where.samples, strict=True)
-                ]
-            )
+            return np.stack([rows(kit.logs[i], o.name, n) for i, n in zip(where.log, where.samples, strict=True)])
 
         self._measured = measured if measured is not None else [take(o) for o in self._observers]
         noise = [np.array([channel_noise(log, o.name) for log in kit.logs])[where.log] for o in self._observers]
@@ -173,7 +173,8 @@ class RolloutProblem(Problem):
 
     def samples(self, channel: int) -> tuple[Array, Array]:
         """The first block's compared samples of a channel: (h,) physics steps after the start and (h, dim) values."""
-        return self._where.step[0], self._measured[channel][0]
+        there = np.isfinite(self._measured[channel][0]).all(1)
+        return self._where.step[0][there], self._measured[channel][0][there]
 
     def predict(
         self, plant: Plant, x: Array, segments: Segments, observers: Sequence[Observer]

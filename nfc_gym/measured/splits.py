@@ -13,7 +13,7 @@ import numpy as np
 from nfc_gym.core import InputError, Log
 from nfc_gym.measured.entries import LogEntry, SplitRule
 from nfc_gym.measured.mapping import SPLITS, Mapping, Split
-from nfc_gym.measured.readers import suffixes
+from nfc_gym.measured.readers import is_log, log_parts, suffixes
 from nfc_gym.measured.yaml_marks import suggest
 
 SELECT_OF_REST = 0.2  # by: rotate: this part of the logs that do not verify selects
@@ -28,12 +28,14 @@ class Source:
       name: unique; the stem, or the path below the mapping's folder where two stems are alike.
       split: fit, select, verify, or auto where the split rule decides.
       group, condition: empty where none was given.
+      part: which of the logs in a file that holds several (an episode); empty for a file that is one log.
     """
 
     name: str
     path: Path
     split: str
     group: str
+    part: str = ""
     condition: str = ""
 
 
@@ -64,32 +66,42 @@ def find_logs(mapping: Mapping, folder: Path) -> list[Source]:
     Raises:
       InputError: nothing matches, a file is listed twice, a group's pattern does not match, `splits` names other files.
     """
-    found: dict[Path, tuple[LogEntry, str, str, str]] = {}
+    found: dict[Path, tuple[LogEntry, list[tuple[str, ...]]]] = {}
     for entry in mapping.logs:
         paths = _matches(entry, folder)
-        assigned = _read_splits(folder / entry.splits, paths) if entry.splits else {}
+        inside = {path: {part: _label(path, part) for part in log_parts(path)} for path in paths}
+        labels = [label for parts in inside.values() for label in parts.values()]
+        assigned = _read_splits(folder / entry.splits, labels) if entry.splits else {}
         for path in paths:
             if path in found:
                 raise InputError(
                     f"logs: {path.name} is matched by {found[path][0].path!r} and by {entry.path!r}; list it once"
                 )
-            name = assigned.get(path.stem, entry.split)
-            split, group = (name, "") if name in (*SPLITS, "auto") else ("auto", name)
-            given = _named(entry.group, path, "group") or group
-            found[path] = entry, split, given, _named(entry.condition, path, "condition")
-    stems = Counter(path.stem for path in found)
+            rules = []
+            for part, label in inside[path].items():
+                name = assigned.get(label, entry.split)
+                split, group = (name, "") if name in (*SPLITS, "auto") else ("auto", name)
+                given = _named(entry.group, label, "group") or group
+                rules.append((split, given, part, _named(entry.condition, label, "condition")))
+            found[path] = entry, rules
+    stems = Counter(_label(path) for path in found)
 
-    def name_of(path: Path) -> str:
-        if stems[path.stem] == 1:
-            return path.stem
+    def name_of(path: Path, part: str) -> str:
+        if stems[_label(path)] == 1:
+            return _label(path, part)
         inside = path.relative_to(folder) if path.is_relative_to(folder) else path
-        return inside.with_suffix("").as_posix()
+        return _label(inside, part, inside.parent.as_posix() + "/")
 
-    sources = [Source(name_of(path), path, *rest) for path, (_, *rest) in found.items()]
+    sources = [Source(name_of(path, rule[2]), path, *rule) for path, (_, rules) in found.items() for rule in rules]
     name, count = Counter(source.name for source in sources).most_common(1)[0]
     if count > 1:
         raise InputError(f"logs: {count} files would all be called {name!r}; rename them")
     return sources
+
+
+def _label(path: Path, part: str = "", before: str = "") -> str:
+    """What a log is called: the file's stem or the folder's name, with the name of its part."""
+    return before + (path.name if path.is_dir() else path.stem) + (f"/{part}" if part else "")
 
 
 def _matches(entry: LogEntry, folder: Path) -> list[Path]:
@@ -97,33 +109,33 @@ def _matches(entry: LogEntry, folder: Path) -> list[Path]:
     base = Path(pattern.anchor) if pattern.is_absolute() else folder
     relative = str(pattern.relative_to(pattern.anchor)) if pattern.is_absolute() else entry.path
     try:
-        matches = sorted(p for p in base.glob(relative) if p.is_file())
+        matches = sorted(p for p in base.glob(relative) if is_log(p))
     except (ValueError, NotImplementedError) as e:
         raise InputError(f"logs: {entry.path!r} is no path or glob: {e}") from None
     if not matches:
         nearest = base / relative
         while not nearest.is_dir():
             nearest = nearest.parent
-        there = sorted(p.name for p in nearest.iterdir() if p.suffix.lower() in suffixes())
+        there = sorted(
+            p.name for p in nearest.iterdir() if p.suffix.lower() in suffixes() or (p.is_dir() and is_log(p))
+        )
         raise InputError(
             f"logs: no file matches {entry.path!r} in {base}; {nearest} holds: {', '.join(there[:6]) or 'no log'}"
         )
     return matches
 
 
-def _named(pattern: str | None, path: Path, what: str) -> str:
-    """What a pattern's round brackets hold of a file name."""
+def _named(pattern: str | None, label: str, what: str) -> str:
+    """What a pattern's round brackets hold of a log's label."""
     if pattern is None:
         return ""
-    match = re.search(pattern, path.stem)
+    match = re.search(pattern, label)
     if match is None or not match[1]:
-        raise InputError(
-            f"logs: {what} pattern {pattern!r} does not match the file name {path.stem!r}; widen the pattern"
-        )
+        raise InputError(f"logs: {what} pattern {pattern!r} does not match the file name {label!r}; widen the pattern")
     return match[1]
 
 
-def _read_splits(path: Path, logs: list[Path]) -> dict[str, str]:
+def _read_splits(path: Path, stems: list[str]) -> dict[str, str]:
     try:
         splits = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -132,7 +144,6 @@ def _read_splits(path: Path, logs: list[Path]) -> dict[str, str]:
         raise InputError(f"logs: splits file {path} is not JSON: {e}") from None
     if not isinstance(splits, dict) or not all(isinstance(v, str) and v for v in splits.values()):
         raise InputError(f'logs: splits file {path} must hold {{"log stem": "fit" | "select" | "verify" | group name}}')
-    stems = [p.stem for p in logs]
     for stem in stems:
         if stem not in splits:
             raise InputError(f"logs: splits file {path} says nothing of {stem!r}; {suggest(stem, list(splits))}")

@@ -1,6 +1,7 @@
 """What is compared with what: residuals at the truth are noise; forces and sensors are those of the closed form."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -130,6 +131,31 @@ def test_rollouts_of_clean_logs_start_where_the_machine_was(plant: Plant) -> Non
     residual = rollouts(plant, clean=True).residual(plant, np.array([[DAMPING]]))[0]
     assert np.sqrt((residual[:, :3] ** 2).mean()) < 0.2 * SD_Q
     assert np.sqrt((residual[:, 3:] ** 2).mean()) < 0.2 * SD_V
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_rows_under_a_mask_are_not_compared(plant: Plant, slow: bool) -> None:
+    """Neither what stands in them (a gap, rows between a slow sensor's samples) nor a start that was read there."""
+    log = run(plant.model, 0)
+    keep = np.arange(len(log)) % 5 == 0 if slow else np.abs(log.time - 1.0) > 0.1
+    held = np.maximum.accumulate(np.where(keep, np.arange(len(log)), 0))
+    angle = Channel(log.channels["joint:hinge:pos"].values[held], "rad", SD_Q, mask=keep, rate=20.0)
+    channels = {"joint:hinge:pos": angle, "joint:hinge:vel": log.channels["joint:hinge:vel"]}
+    spoilt = replace(log, channels=channels)
+    layout = Layout(0.3, 0, (0.1, 0.2, 0.3), 0.09, DT)
+    problem = RolloutProblem(plant.model, [spoilt], [estimate_states(plant.model, spoilt)], layout)
+    x = np.array([DAMPING])
+    rows = np.rint((problem.time_of[:, None] + np.array(layout.horizons)) / log.interval).astype(int)
+    np.testing.assert_array_equal(problem.mask[:, :3], keep[rows])
+    assert problem.mask[:, 3:].all()
+    assert 0 < problem.mask[:, :3].mean() < 1
+    residual = problem.residual(plant, x[None])[0]
+    assert (residual[~problem.mask] == 0).all()
+    assert np.isfinite(residual).all()
+    whole = RolloutProblem(plant.model, [log], [estimate_states(plant.model, log)], layout)
+    assert chi2(problem, plant, x)[problem.mask].mean() == pytest.approx(chi2(whole, plant, x).mean(), abs=0.25)
+    twin = problem.synthetic(plant, x, np.random.default_rng(0))
+    np.testing.assert_array_equal(twin.mask, problem.mask)
 
 
 def test_take_picks_blocks(plant: Plant) -> None:

@@ -14,8 +14,10 @@ from machines import make
 import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym.core import InputError, MissingExtra
 from nfc_gym.measured.checks import check
+from nfc_gym.measured.dataset import load
 from nfc_gym.measured.mapping import load_mapping
 from nfc_gym.measured.readers import read_table
+from nfc_gym.physics.names import names
 from nfc_gym.physics.state import rotate
 from nfc_gym.wrappers import ApplyEffects, RecordLog, VectorRecordLog
 
@@ -97,6 +99,78 @@ def test_a_recorded_log_passes_the_check(name: str, tmp_path: Path) -> None:
     assert len(mapping.controls) == model.nu == env.unwrapped.model.nu
     if "nfc_gym" in name:
         assert [p.name for p in mapping.declared] == list(env.unwrapped.psi_space.names)
+
+
+class Witness(gym.Wrapper):
+    """Writes down by itself what a simulation is before each step, and what drove it."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.seen: list[list[tuple]] = []
+
+    def reset(self, **kwargs):
+        self.seen.append([])
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        data = self.unwrapped.data
+        before = (data.time, data.qpos.copy(), data.qvel.copy())
+        result = super().step(action)
+        self.seen[-1].append((*before, data.ctrl.copy()))
+        return result
+
+
+@pytest.mark.parametrize(
+    ("name", "root"), [("Ant-v5", "torso"), ("nfc_gym/AntRough-v0", "torso"), ("nfc_gym/JackalFlat-v0", "base")]
+)
+def test_what_is_loaded_is_to_the_bit_what_the_simulation_was(name: str, root: str, tmp_path: Path) -> None:
+    kwargs = {"terrain_pool": 1} if "Rough" in name else {}
+    env = Witness(RecordLog(gym.make(name, max_episode_steps=80, **kwargs), tmp_path))
+    _drive(env, 3, 80)
+    assert [str(f) for f in check(tmp_path / "mapping.yaml") if f.severity == "error"] == []
+    data = load(tmp_path / "mapping.yaml")
+    model = env.unwrapped.model
+    assert len(data.logs) == len(env.seen) == 3
+    for log, episode in zip(data.logs, env.seen, strict=True):
+        time, qpos, qvel, ctrl = (np.array(v) for v in zip(*episode, strict=True))
+        assert (log.time == time - time[0]).all()
+        assert list(log.controls) == [f"ctrl:{n}" for n in names(model).actuators]
+        for i, values in enumerate(log.controls.values()):
+            assert (values == ctrl[:, i]).all()
+        channels = {key: channel.values for key, channel in log.channels.items()}
+        unit = qpos[:, 3:7] / np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+        assert (channels[f"body:{root}:pos"] == qpos[:, :3]).all()
+        assert (channels[f"body:{root}:quat"] == unit).all()
+        assert (channels[f"body:{root}:linvel"] == qvel[:, :3]).all()
+        assert (channels[f"body:{root}:angvel"] == rotate(unit, qvel[:, 3:6])).all()
+        for j in range(1, model.njnt):
+            q, v, joint = model.jnt_qposadr[j], model.jnt_dofadr[j], names(model).joints[j]
+            assert (channels[f"joint:{joint}:pos"] == qpos[:, q]).all()
+            assert (channels[f"joint:{joint}:vel"] == qvel[:, v]).all()
+
+
+def test_rows_of_a_vector_environment_are_loaded_as_single_ones_are(tmp_path: Path) -> None:
+    kwargs = {"max_episode_steps": 40, "context": []}
+    actions = np.repeat(np.random.default_rng(0).uniform(-1, 1, (4, 3, 2)), 10, axis=0)
+    many = VectorRecordLog(gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=3, **kwargs), tmp_path / "many")
+    many.reset(seed=7)
+    one = RecordLog(gym.make("nfc_gym/JackalFlat-v0", **kwargs), tmp_path / "one")
+    for k in range(40):
+        many.step(actions[k])
+    many.close()
+    for row in range(3):
+        one.reset(seed=7 + row)
+        for k in range(40):
+            one.step(actions[k, row])
+    one.close()
+    both = [load(tmp_path / folder / "mapping.yaml") for folder in ("many", "one")]
+    for folder in ("many", "one"):
+        assert not [f for f in check(tmp_path / folder / "mapping.yaml") if f.severity == "error"]
+    assert [log.name for log in both[0].logs] == [log.name for log in both[1].logs]
+    for a, b in zip(both[0].logs, both[1].logs, strict=True):
+        same(a.time, b.time)
+        same(dict(a.controls), dict(b.controls))
+        same({k: c.values for k, c in a.channels.items()}, {k: c.values for k, c in b.channels.items()})
 
 
 def test_the_model_beside_the_logs_moves_as_the_environment_did(tmp_path: Path) -> None:

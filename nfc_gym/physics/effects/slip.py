@@ -71,10 +71,7 @@ class Slip(Effect):
     summary = "Wheels grip less than their friction says"
     PARAMS = (
         # Natural: what both lack, the friction coefficient itself can give back.
-        *(
-            Param(n, "1", 0.0, 0.98, probes=(0.3,), resolution=0.005, natural=True)
-            for n in ("lateral", "longitudinal")
-        ),
+        *(Param(n, "1", 0.0, 0.98, probes=(0.3,), resolution=0.005, natural=True) for n in ("lateral", "longitudinal")),
         Param("creep", "1", 0.0, 1e3, probes=(3.0, 30.0), resolution=0.1),
     )
 

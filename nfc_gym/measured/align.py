@@ -1,0 +1,239 @@
+"""Streams of a log brought to the times of one of them, the base, which the mapping's `time` column names.
+
+Measured signals are interpolated linearly, orientations by slerp, commands held from the last one unless their `hold`
+says linear. A gap longer than `GAP` of a stream's own sampling intervals is not bridged: rows inside it are NaN. Of a
+sensor that is slower than the base only the row nearest to each of its samples is kept, so that one sample counts once.
+Rows that some stream does not reach are cut off at both ends. All of it is told by `Alignment`, nothing is guessed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core import InputError
+from nfc_gym.measured.channels import parse_channel
+from nfc_gym.measured.mapping import Mapping
+from nfc_gym.measured.readers import Stream, Streams, Table
+from nfc_gym.measured.resampling import Clock, held, interpolated, lateness, nearest_rows
+
+Array = NDArray[np.float64]
+How = Literal["linear", "hold", "slerp"]
+
+GAP = 4.0  # sampling intervals of a stream; over a longer pause nothing is interpolated
+SLOWER = 1.5  # a sensor whose interval is so many times the base's is kept at its own samples only
+
+
+@dataclass(frozen=True)
+class Use:
+    """Columns of the mapping that are resampled together: how, and whether they are measured (or commanded)."""
+
+    columns: tuple[str, ...]
+    how: How
+    measured: bool = False
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """What was done to a stream.
+
+    Attributes:
+      stream: the topic.
+      clock: what its times are.
+      how: interpolated or held.
+      rate, base_rate: Hz, before and after.
+      gap: s, the longest pause that is bridged; infinite where values are held.
+      missing: share of its rows that fell into longer pauses.
+      kept: share of the base's rows that carry a sample of a sensor slower than the base; else 1.
+      late: s, by which a held command comes after its stamp, on average: it waits for the base's next row.
+      longest: s, the longest pause in it.
+      repeated, disordered: samples with a stamp that another has, and those that came before an earlier one.
+    """
+
+    stream: str
+    clock: str
+    how: How
+    rate: float
+    base_rate: float
+    gap: float
+    missing: float
+    kept: float
+    late: float
+    longest: float
+    repeated: int
+    disordered: int
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A log's columns at the base's times.
+
+    Attributes:
+      table: every column that the mapping uses has the base's rows; the others are as they were.
+      base: the topic whose times they are.
+      clock: what those times are.
+      resampled: what was done to the other streams.
+      rates: measured columns that are NaN in some rows, in gaps or between a slow sensor's samples -> Hz of those.
+      cut: s that were cut off at the start and at the end, as some stream does not reach there.
+      cutters: the streams that decided where.
+    """
+
+    table: Table
+    base: str
+    clock: str
+    resampled: tuple[Resampled, ...]
+    rates: dict[str, float]
+    cut: tuple[float, float]
+    cutters: tuple[str, str]
+
+
+def uses(mapping: Mapping) -> list[Use]:
+    """How each column of a mapping is brought to other times: commands and masks held, measurements interpolated."""
+    found = [Use(c.columns, "hold" if c.hold == "zero" else "linear") for c in mapping.controls.values()]
+    for name, channel in mapping.channels.items():
+        found.append(Use(channel.columns, "slerp" if parse_channel(name).quantity == "quat" else "linear", True))
+        found += [Use((channel.mask,), "hold")] if channel.mask else []
+    found += [Use(e.columns, "linear") for e in mapping.exogenous.values()]
+    found += [Use((name,), "linear") for k in mapping.known for name in k.columns]
+    servos = [c.servo for c in mapping.controls.values() if c.servo]
+    return found + [Use((n,), "linear") for s in servos for t in (s.gain, s.supply, s.damping) for n in t.columns]
+
+
+def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
+    """Bring the columns in `uses` to the times of column `time`.
+
+    Raises:
+      InputError: `time` is no stream's time, streams have no time in common, or a quaternion's columns several clocks.
+    """
+    _require_present(streams, [time, *(c for use in uses for c in use.columns)])
+    found = streams.clock(time)
+    if found is None:
+        return _single(streams, time, uses)
+    base, kind = found
+    grid = streams.seconds(base, kind)
+    others = {s.name: s for use in uses if (s := _owner(streams, use)) is not None and s is not base}
+    clocks = {name: Clock(streams.seconds(s, kind)) for name, s in others.items() if len(s.stamps) > 1}
+    holds = {s.name for use in uses if use.how == "hold" and (s := _owner(streams, use)) is not None}
+    rows, cut, cutters = _overlap(base.name, grid, clocks, holds)
+    table: Table = dict(streams)
+    table[time] = grid[rows]
+    done: dict[tuple[str, How], Resampled] = {}
+    rates: dict[str, float] = {}
+    for use in uses:
+        owner = _owner(streams, use)
+        if owner is None:
+            continue
+        parts = [_values(streams, name) for name in use.columns]
+        if owner is base:
+            table |= {name: p[rows] for name, p in zip(use.columns, parts, strict=True)}
+        elif owner.name not in clocks:  # a single message, such as a latched one, stands for the whole log
+            table |= {name: p[0] for name, p in zip(use.columns, parts, strict=True)}
+        elif all(p.dtype.kind in "biuf" for p in parts):
+            values, report = _bring(clocks[owner.name], parts, grid[rows], use)
+            table |= dict(zip(use.columns, values, strict=True))
+            if use.measured and any(not np.isfinite(v).all() for v in values):
+                rates |= dict.fromkeys(use.columns, report["rate"])
+            told = Resampled(owner.name, owner.clock if kind == "stamps" else "receive time", use.how, **report)
+            done[owner.name, use.how] = max(done.get((owner.name, use.how), told), told, key=lambda r: r.missing)
+    clock = base.clock if kind == "stamps" else "receive time"
+    return Alignment(table, base.name, clock, tuple(done.values()), rates, cut, cutters)
+
+
+def _require_present(streams: Streams, names: Sequence[str]) -> None:
+    for name in names:
+        topic = next((t for t in streams.left_out if name == t or name.startswith((f"{t}.", f"{t}["))), None)
+        if topic is not None and name not in streams and streams.owner(name) is None:
+            raise InputError(f"column {name!r} cannot be used: {topic}: {streams.left_out[topic]}")
+
+
+def _owner(streams: Streams, use: Use) -> Stream | None:
+    """The stream of columns that are used together; None where they are constants or not there at all."""
+    owners = {s.name: s for name in use.columns if (s := streams.owner(name)) is not None}
+    if len(owners) > 1 and use.how == "slerp":
+        raise InputError(
+            f"columns {', '.join(use.columns)} come from {' and '.join(owners)}; a quaternion needs one clock"
+        )
+    return next(iter(owners.values()), None)
+
+
+def _single(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
+    """A time column of another kind, such as a raw stamp: it serves the columns of its own stream."""
+    base = streams.owner(time)
+    stray = next((c for u in uses for c in u.columns if (s := streams.owner(c)) is not None and s is not base), None)
+    if stray is not None:
+        clocks = sorted({f"{s.name}.time" for s in streams.streams})
+        raise InputError(
+            f"column {stray!r} has times of its own, and {time!r} is not a time that it can be brought to; "
+            f"name one of {', '.join(clocks[:8])}"
+        )
+    name = "" if base is None else base.name
+    return Alignment(dict(streams), name, time, (), {}, (0.0, 0.0), ("", ""))
+
+
+def _overlap(
+    base: str, grid: Array, clocks: dict[str, Clock], holds: set[str]
+) -> tuple[slice, tuple[float, float], tuple[str, str]]:
+    """Rows that every stream reaches; a held command reaches on to the end."""
+    first, opener = max([(c.time[0], n) for n, c in clocks.items()], default=(grid[0], ""))
+    last, closer = min([(c.time[-1], n) for n, c in clocks.items() if n not in holds], default=(grid[-1], ""))
+    inside = np.flatnonzero((grid >= first) & (grid <= last))
+    if len(inside) < 2:
+        spans = {base: (grid[0], grid[-1])} | {n: (c.time[0], c.time[-1]) for n, c in clocks.items()}
+        told = ", ".join(f"{n} {a:.6g} to {b:.6g} s" for n, (a, b) in spans.items())
+        raise InputError(
+            f"its streams have no time in common ({told}); if their stamps come from several clocks, name "
+            f"'{base}.received' as the time column, and all are taken as they were received"
+        )
+    rows = slice(int(inside[0]), int(inside[-1]) + 1)
+    cut = (float(grid[rows][0] - grid[0]), float(grid[-1] - grid[rows][-1]))
+    return rows, cut, (opener, closer)
+
+
+def _values(streams: Streams, name: str) -> NDArray[Any]:
+    if name in streams:
+        return streams[name]
+    whole, _, index = name.removesuffix("]").rpartition("[")
+    values, i = streams[whole], int(index) if index.isdigit() else -1
+    if values.ndim != 2 or not 0 <= i < values.shape[1]:
+        there = f"entries 0 to {values.shape[1] - 1}" if values.ndim == 2 else "no entries"
+        raise InputError(f"column {name!r}: {whole!r} has {there}")
+    return values[:, i]
+
+
+def _bring(
+    clock: Clock, parts: Sequence[NDArray[Any]], grid: Array, use: Use
+) -> tuple[list[NDArray[Any]], dict[str, Any]]:
+    """Columns at the times `grid`, and what is reported of them."""
+    widths = np.cumsum([0] + [1 if p.ndim == 1 else p.shape[1] for p in parts])
+    columns = np.concatenate([p[clock.order].reshape(len(clock.time), -1) for p in parts], 1).astype(np.float64)
+    time, interval = clock.time, clock.interval
+    there: NDArray[np.bool_] = np.asarray(np.isfinite(columns).all(1))
+    if use.measured and 1 < there.sum() < len(there):  # a message that lacks a value is no sample of it
+        time, columns = time[there], columns[there]
+        interval = float(np.median(np.diff(time)))
+    step = float(np.median(np.diff(grid)))
+    gap, late = GAP * interval, 0.0
+    fresh = np.ones(len(grid), bool)
+    if use.how == "hold":
+        values, gap, late = held(time, columns, grid), np.inf, lateness(time, grid)
+    else:
+        values = interpolated(time, columns, grid, gap, use.how == "slerp")
+        if use.measured and interval > SLOWER * step:
+            fresh = nearest_rows(time, grid)
+    missing = float(np.isnan(values[fresh]).any(1).mean()) if fresh.any() else 1.0
+    values[~fresh] = np.nan
+    out = [values[:, a] if p.ndim == 1 else values[:, a:b] for p, a, b in zip(parts, widths, widths[1:], strict=False)]
+    report = {
+        "rate": 1 / interval if interval else np.inf,
+        "base_rate": 1 / step,
+        "gap": gap,
+        "missing": missing,
+        "kept": float(fresh.mean()),
+        "late": late,
+        "longest": clock.longest,
+        "repeated": clock.repeated,
+        "disordered": clock.disordered,
+    }
+    return out, report

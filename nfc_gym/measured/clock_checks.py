@@ -1,0 +1,98 @@
+"""Clocks that disagree: two sensors of one motion, one of which shows it later. Reported, never repaired."""
+
+from collections.abc import Iterator, Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core import Channel, Log
+from nfc_gym.measured.channels import parse_channel
+from nfc_gym.measured.findings import Finding
+from nfc_gym.measured.offsets import Offset, clock_offset
+from nfc_gym.measured.smoothing import fresh_samples
+from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back
+
+Array = NDArray[np.float64]
+
+AGREE = 0.8  # correlation from which on two signals are taken for the same motion
+SURE = 4.0  # standard deviations, with which an offset is not zero
+SHARE = 0.25  # of a sampling interval: a smaller offset is none to speak of
+MOST = 2.0  # s, or a fifth of the log where that is less
+LONGEST = 10_000  # samples of a channel that are compared
+
+
+def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log]) -> Iterator[Finding]:
+    """Pairs of channels that measure one motion at different times, over all logs, each told where the later one is."""
+    found: dict[tuple[str, str], list[tuple[str, Offset, float]]] = {}
+    for log in logs:
+        for position, speed, time, travel in _pairs(model, log):
+            other, rate = _samples(log, log.channels[speed])
+            rate = rate.reshape(len(rate), -1)
+            offset = clock_offset(time, travel, other, rate, min(MOST, 0.2 * log.duration))
+            if offset is not None and offset.correlation > AGREE and offset.sd > 0:
+                coarsest = max(float(np.median(np.diff(t))) for t in (time, other))
+                found.setdefault((position, speed), []).append((log.name, offset, coarsest))
+    for (position, speed), offsets in found.items():
+        yield from _told(position, speed, offsets)
+
+
+def _told(position: str, speed: str, offsets: list[tuple[str, Offset, float]]) -> Iterator[Finding]:
+    """The weighted mean over logs, its deviation widened where they scatter by more than their own."""
+    each, sd = (np.array([getattr(o, key) for _, o, _ in offsets]) for key in ("seconds", "sd"))
+    mean = float((each / sd**2).sum() / (1 / sd**2).sum())
+    spread = ((each - mean) ** 2 / sd**2).sum() / max(len(each) - 1, 1)
+    deviation = float(np.sqrt(max(spread, 1.0) / (1 / sd**2).sum()))
+    if abs(mean) < max(SURE * deviation, SHARE * float(np.median([c for _, _, c in offsets]))):
+        return
+    late, early = (speed, position) if mean > 0 else (position, speed)
+    size = 1e3 * abs(mean)
+    message = f"comes {size:.3g} ± {1e3 * deviation:.1g} ms after {early}, by the motion that both show"
+    if len(each) > 1:
+        low, high = sorted(1e3 * np.sign(mean) * np.quantile(each, (0, 1)))
+        message += f" in {len(each)} logs (single ones {low:.3g} to {high:.3g} ms)"
+    message += ": two clocks, or a filter; nothing was shifted"
+    advice = f"subtract {size / 1e3:.3g} s from its stamps, or let the loop weigh sensor_delay:{late}"
+    yield Finding("warning", f"channels.{late}", message, advice)
+
+
+def _pairs(model: mujoco.MjModel | None, log: Log) -> Iterator[tuple[str, str, Array, Array]]:
+    """(position, channel of its rate, times (T,), position (T, k) in that channel's frame, up to a constant)."""
+    for name, channel in log.channels.items():
+        parsed = parse_channel(name)
+        if parsed.quantity not in ("pos", "quat") or parsed.own_frame:
+            continue
+        time, values = _samples(log, channel)
+        if parsed.quantity == "pos":
+            speed = f"joint:{parsed.object}:vel" if parsed.kind == "joint" else f"body:{parsed.object}:linvel"
+            if speed in log.channels:
+                yield name, speed, time, values.reshape(len(time), -1)
+            continue
+        steps = quat_to_vector(quat_multiply(quat_conjugate(values[:-1]), values[1:]))
+        for other, frame in _gyros(model, log, parsed.object):
+            seen = rotate(values[:-1], steps) if frame is None else rotate_back(frame, steps)
+            axes = log.channels[other].axes
+            turned = np.concatenate([np.zeros((1, 3)), np.cumsum(seen, 0)])
+            yield name, other, time, turned if axes is None else turned[:, list(axes)]
+
+
+def _samples(log: Log, channel: Channel) -> tuple[Array, Array]:
+    """A channel's own samples: where it is compared, and where a held one was renewed; the first `LONGEST`."""
+    rows = fresh_samples(log.time, channel.values, channel.rate)
+    rows = (rows if channel.mask is None else rows[channel.mask[rows]])[:LONGEST]
+    return log.time[rows], channel.values[rows]
+
+
+def _gyros(model: mujoco.MjModel | None, log: Log, body: str) -> Iterator[tuple[str, Array | None]]:
+    """Channels that measure a body's angular velocity, and the frame they do so in: None is the world's."""
+    for name in log.channels:
+        parsed = parse_channel(name)
+        if parsed.object == body and parsed.quantity == "angvel":
+            yield name, np.array([1.0, 0, 0, 0]) if parsed.own_frame else None
+        if model is None or parsed.kind != "sensor":
+            continue
+        s = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, parsed.object)
+        if s >= 0 and int(model.sensor_type[s]) == int(mujoco.mjtSensor.mjSENS_GYRO):
+            site = int(model.sensor_objid[s])
+            if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.site_bodyid[site])) == body:
+                yield name, model.site_quat[site]
