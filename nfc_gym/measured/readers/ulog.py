@@ -43,6 +43,8 @@ def read_ulog(path: Path) -> Streams:
         raise broken(path, "it holds bytes that are no message", _ADVICE)
     if not log.has_data_appended:
         _require_whole(path)
+    if any("timestamp" not in data.data for data in log.data_list):
+        raise broken(path, "a topic has no timestamps", _ADVICE)
     streams = [_stream(data) for data in log.data_list]
     if not streams:
         raise InputError(f"{path}: no topic was logged; log some (SDLOG_MODE, SDLOG_PROFILE), or leave the file out")
