@@ -19,7 +19,7 @@ from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.wrappers import ApplyEffects
 
-DT, SECONDS, NOISE = 0.005, 3.0, {"x": 0.002, "v": 0.01}
+DT, SECONDS, NOISE = 0.005, 2.0, {"x": 0.002, "v": 0.01}
 DRAG = 0.35  # N s/m
 WINDS = {"calm": 0.0, "breeze": 1.5, "gale": 4.0}  # m/s along x
 
@@ -54,7 +54,7 @@ channels:
   "joint:y:pos": {column: py, unit: m, noise: 0.002}
   "joint:y:vel": {column: vy, unit: m/s, noise: 0.01}
 segments: {length: 0.4, history: 0.0, horizons: [0.1, 0.2, 0.4]}
-effects: {only: [wind, drag_linear, external_force]}
+effects: {only: [wind, external_force]}
 """
 
 
