@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
+from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.instant import track
 from nfc_gym.measured.inverse import actuator_forces
 from nfc_gym.measured.problem import RolloutProblem
@@ -107,3 +108,27 @@ def test_inverse_problems_lead_hidden_states_along_the_log(plant: Plant) -> None
         for x in (np.array([LEVEL, TRANSITION]), np.array([0.0, TRANSITION]))
     ]
     assert error[0] < 0.35 * error[1]
+
+
+def test_forward_problems_lead_hidden_states_along_each_log() -> None:
+    """A scale in the joint reads the spring that yields, in two logs of unequal length and at two parameters."""
+    text = PENDULUM.replace(
+        "</actuator>", '</actuator><sensor><accelerometer name="acc" site="tip"/></sensor>'
+    ).replace("</body>", '<site name="tip" pos="0 0 -0.3"/></body>')
+    model = mujoco.MjModel.from_xml_string(text)
+    logs = [
+        replace(log, channels=log.channels | {"sensor:acc": Channel(np.zeros((len(log), 3)), "m/s^2", 0.1)})
+        for log in (LOGS[0], LOGS[1].part(0, 120, "short"))
+    ]
+    effect, _ = build("hysteresis", "hinge", {"level": LEVEL, "transition": TRANSITION})
+    plant = Plant(model, ParameterSpace(model, []), [effect], nthread=1)
+    problem = ForwardProblem(model, logs, [estimate_states(model, log) for log in logs], 0.2)
+    x = np.array([[LEVEL, TRANSITION], [0.0, TRANSITION]])
+    for t, values in zip(problem.tracks, problem.evaluate(plant, x, problem.tracks), strict=True):
+        w, dt = 0.0, t.dt
+        inertia = 0.5 * 0.3**2 + 0.4 * 0.5 * 0.03**2
+        for k, rate in enumerate(t.qvel[:, 0]):
+            side = np.sign(rate)
+            w = side + (w - side) * np.exp(-abs(rate) * dt / TRANSITION)
+            # the tip turns about y, 0.3 m below it: its own x is minus the lever times the angular acceleration
+            np.testing.assert_allclose((values[0] - values[1])[k, 0], 0.3 * LEVEL * w / inertia, rtol=1e-6, atol=1e-9)

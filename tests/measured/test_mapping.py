@@ -253,6 +253,17 @@ def test_without_a_selecting_log_the_last_quarter_selects(build: Build, tmp_path
     assert not data.independent_splits
 
 
+def test_every_log_has_its_time_as_a_signal(build: Build) -> None:
+    """Seconds of the whole file, also in the parts that a split by time makes of it; a column of that name wins."""
+    path = build(None, ('"*.npz"}', '"*.npz"}\nsplit: {by: time}'))
+    parts = [log for log in load(path).logs if log.name.startswith("run_0")]
+    assert len(parts) == 3
+    np.testing.assert_allclose(np.concatenate([p.exogenous["exo:time"] for p in parts]), np.arange(400) / 100)
+    path = build(None, ("segments:", 'exogenous: {"exo:time": {column: q, unit: s}}\nsegments:'))
+    log = load(path).logs[0]
+    np.testing.assert_array_equal(log.exogenous["exo:time"], log.channels["joint:hinge:pos"].values)
+
+
 def test_splits_file_names_groups_and_is_checked(build: Build, tmp_path: Path) -> None:
     path = build(None, ('"*.npz"}', '"*.npz", splits: splits.json}\nsplit: {by: rotate}'), logs=4)
     (tmp_path / "splits.json").write_text(json.dumps({f"run_{k}": "walk" if k < 2 else "turn" for k in range(4)}))

@@ -92,6 +92,9 @@ def test_hidden_states_begin_anew_with_each_episode() -> None:
     effects = [
         make("delay", "push", {"delay": 0.05}),
         make("thermal", "push", {"fade": 0.3, "time_constant": 0.1, "reference": 1}),
+        make("hysteresis", "elbow", {"level": 0.3, "transition": 0.1}),
+        make("backlash", "wheel_l", {"gap": 0.1, "rotor": 0.01}),
+        make("friction_patch", "ground", {"lost": 0.5, "x": 5.0, "y": 0.0, "radius_x": 0.1, "radius_y": 1.0}),
     ]
     env = ApplyEffects(ZooEnv(), effects)
     first, second = roll(env, 8), roll(env, 8)
@@ -126,6 +129,16 @@ def test_own_values_at_each_place() -> None:
     again = ApplyEffects(ZooEnv(), [to_row(both, theta)])
     assert again.effects[0].id == both.id
     np.testing.assert_array_equal(again.thetas[0], theta)
+    for family, places, values in (
+        ("hysteresis", ("shoulder", "elbow"), {"level": 0.3, "transition": 0.1}),
+        ("backlash", ("wheel_l", "wheel_r"), {"gap": 0.1, "rotor": 0.01}),
+    ):
+        own = each([make(family, n, values)[0] for n in places])
+        own.bind(MODEL)
+        theta = np.array([*values.values()] * 2)
+        tied = make(family, list(places), values)
+        np.testing.assert_array_equal(_wrapped([(own, theta)], 2), _rolled([(own, theta)], 2))
+        np.testing.assert_array_equal(_rolled([(own, theta)], 2), _rolled([tied], 2))
 
 
 def test_a_wrapped_environment_is_pickled_and_remade_from_its_spec() -> None:

@@ -43,11 +43,28 @@ HEAT = {
 }
 DRY = {"family": "coulomb", "where": "rear_left_wheel", "parameters": {"level": 0.3}}
 LOAD = {"family": "payload", "where": "base", "parameters": {"mass": 3.0, "x": 0.1, "y": 0.0, "z": 0.1}}
+MEMORIES = [
+    {"family": "hysteresis", "where": "rear_left_wheel", "parameters": {"level": 0.5, "transition": 0.3}},
+    {"family": "backlash", "where": "front_right_wheel", "parameters": {"gap": 0.2, "rotor": 0.005}},
+    {
+        "family": "friction_patch",
+        "where": "ground",
+        "parameters": {"lost": 0.7, "x": 0.1, "y": 0.1, "radius_x": 0.3, "radius_y": 0.4},
+    },
+    {"family": "compliance", "where": "ground", "parameters": {"softness": 0.5, "damping": 0.2}},
+    {"family": "sinkage", "where": "ground", "parameters": {"depth": 0.004, "resistance": 0.1}},
+    {
+        "family": "gust",
+        "where": "base",
+        "parameters": {"push_x": 0.0, "push_y": 9.0, "push_z": 0.0, "start": 0.03, "length": 0.06},
+    },
+]
 EFFECTS = [SLIP, DELAY, HEAT, DRY, LOAD]
 BIAS = 0.02 * np.arange(1.0, NV + 1)
 
 STACKS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
     "effects": (lambda e: ApplyEffects(e, EFFECTS), lambda e: VectorApplyEffects(e, EFFECTS)),
+    "memory": (lambda e: ApplyEffects(e, MEMORIES), lambda e: VectorApplyEffects(e, MEMORIES)),
     "force": (lambda e: ResidualDynamics(e, BIAS), lambda e: VectorResidualDynamics(e, BIAS)),
     "state": (
         lambda e: ResidualDynamics(e, BIAS, mode="state"),
