@@ -15,6 +15,18 @@ from nfc_gym.physics.effects.friction import Coulomb, DirectionalFriction, LoadF
 from nfc_gym.physics.effects.generic import GenericPosition, GenericTime, GenericVelocity
 from nfc_gym.physics.effects.inertial import ComShift, Inertia, Payload, complete_inertia
 from nfc_gym.physics.effects.joint import Armature, Cogging, DampingPoly, SpringOffset
+from nfc_gym.physics.effects.law_forms import (
+    LawCommand,
+    LawCross,
+    LawFrictionByPlace,
+    LawHarmonic,
+    LawHeight,
+    LawPlace,
+    LawPolynomial,
+    LawPower,
+    LawRamp,
+    LawWave,
+)
 from nfc_gym.physics.effects.load import ExternalForce, Slope, Wind
 from nfc_gym.physics.effects.rotor import GroundEffect, RotorDrag
 from nfc_gym.physics.effects.sensors import Misalignment, SensorBias, SensorDelay, SensorGain
@@ -29,6 +41,7 @@ _TYPES: tuple[type[Effect], ...] = (
     Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
     Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, RotorDrag, GroundEffect, ExternalForce, Slope,
     Slip, SensorBias, SensorGain, SensorDelay, Misalignment, GenericPosition, GenericVelocity, GenericTime,
+    LawHarmonic, LawPower, LawPolynomial, LawPlace, LawFrictionByPlace, LawHeight, LawRamp, LawWave, LawCommand, LawCross,
 )  # fmt: skip
 
 FAMILIES: dict[str, type[Effect]] = {t.family: t for t in _TYPES}
