@@ -23,6 +23,7 @@ from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.details import details
 from nfc_gym.measured.export import corrected, effects_of, pack, unpack
 from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.maps import maps
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
@@ -284,7 +285,8 @@ def _report(
         "identifiability": say.identifiability(found),
         "rounds": [r.__dict__ for r in found.rounds],
         "noise": _noise(run.bench, dataset, fold),
-        "details": details(run.bench, v, models, dataset.of("verify", fold)),
+        "details": details(run.bench, v, models, dataset.of("verify", fold))
+        | ({"maps": maps(v, extended.plant.model, found.rest.scanned, ("calibrated", "extended"))} if left else {}),
         "seed": run.seed,
         "versions": {"nfc_gym": version("nfc_gym"), "mujoco": mujoco.__version__},
     }

@@ -26,13 +26,11 @@ class Remainder:
 
     Attributes:
       fitted: the model with the laws that were believed.
-      left: total loss of the model with named effects alone, on the fit logs.
       scanned: of the laws' first scan, None where nothing was left to scan.
       dropped: named effects that a law alone outdoes.
     """
 
     fitted: Fit
-    left: float
     scanned: Scanned | None = None
     dropped: list[str] = field(default_factory=list)
 
@@ -60,7 +58,7 @@ class LawSearch:
 
     def run(self, arena: Arena, calibrated: Fit) -> Remainder:
         """Add laws to an arena's model while they are believed; first ask whether one alone outdoes what it has."""
-        out = Remainder(arena.current, float(arena.current.losses.sum()))
+        out = Remainder(arena.current)
         if arena.leftover < SILENT or not self.laws:
             return out
         if arena.current.plant.effects and (rival := self._alone(arena, calibrated)) is not None:

@@ -106,13 +106,16 @@ class Search:
             if current is not arena.current:
                 arena = self.settle(current, polished=True)
             keep(arena.current, rounds)
+        dropped: list[str] = []
         generic = self._generic(arena, screen, outcome) if arena.leftover > SILENT else None
         if generic is not None and arena.current.plant.effects and self._outdone(arena, generic, calibrated):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
+            dropped = [e.id for e in arena.current.plant.effects]
             bare = fit(self.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6)
             arena = self.settle(bare, polished=True)
         laws = LawSearch(self.laws, self.options.worth, self.settle, self._prune)
         rest = laws.run(arena, calibrated)
+        rest.dropped = rest.dropped or dropped
         return Found(calibrated, rest.fitted, rounds, generic, screened, rest)
 
     def _prune(self, arena: Arena) -> Fit:

@@ -29,10 +29,11 @@ def unexplained(v: Verified, found: Found, plant: Plant, rows: list[dict[str, An
     out: dict[str, Any] = {"nearest": nearest, "nearest_share": share, "proposed": [r["id"] for r in rows]}
     near = f"; the nearest named effect, {nearest}, explains {share:.0%}" if nearest else "; no named effect comes near"
     scanned = found.rest.scanned
-    if laws:
-        parts = [f"looks like {law.what}: {r['sentence'].rstrip('.')}" for law, r in zip(laws, rows, strict=True)]
-        return _place(plant.model, laws[0]) | out | {"description": " and ".join(parts) + near}
     reason = found.rounds[-1].reason or "no effect of the library explains it"
+    if laws:
+        parts = [f"{law.what}: {_inner(r['sentence'])}" for law, r in zip(laws, rows, strict=True)]
+        text = f"looks like {', and '.join(parts)}{near}"
+        return _place(plant.model, laws[0]) | out | {"description": f"{text}; {reason}" if "alike" in reason else text}
     if scanned is not None and scanned.nearest is not None:
         law = scanned.nearest.law
         law.bind(plant.model)
@@ -41,6 +42,11 @@ def unexplained(v: Verified, found: Found, plant: Plant, rows: list[dict[str, An
     coordinate = place if place.startswith("sensor") else f"{place} ({group})"
     text = f"largest share of the remaining misfit: {part:.0%}; {reason}{near}"
     return {"coordinate": coordinate, "where": place} | out | {"description": text}
+
+
+def _inner(sentence: str) -> str:
+    """A sentence as part of a longer one."""
+    return sentence[:1].lower() + sentence[1:].rstrip(".")
 
 
 def _guess(near: Proposal) -> str:
@@ -62,15 +68,13 @@ def _place(model: mujoco.MjModel, law: Effect) -> dict[str, str]:
 
 
 def _nearest(found: Found) -> tuple[str | None, float]:
-    """The named effect that gained most of what was left when no more were believed, and its share of that."""
-    # Where a law outdid all named effects, the best of these is the nearest.
-    dropped = bool(found.rest.dropped)
-    rows = [r for r in found.rounds[0 if dropped else -1].ranking if not r["generic"]]
-    left = float(found.calibrated.losses.sum()) if dropped else found.rest.left
-    best = max(rows, key=lambda r: r["gain_fit"], default=None)
-    if best is None:
-        return None, 0.0
-    return best["id"], float(np.clip(best["gain_fit"] / max(left, 1e-9), 0, 1))
+    """The named effect that took away most of what was left where none was believed, and its share of that.
+
+    Where a law outdid all named effects together, that is the best of the first round.
+    """
+    rows = [r for r in found.rounds[0 if found.rest.dropped else -1].ranking if not r["generic"]]
+    best = max(rows, key=lambda r: r["share"], default=None)
+    return (None, 0.0) if best is None else (best["id"], float(np.clip(best["share"], 0, 1)))
 
 
 def _worst(v: Verified) -> tuple[str, str, float]:
