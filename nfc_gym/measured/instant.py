@@ -67,9 +67,7 @@ def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[st
     )  # fmt: skip
 
 
-def still(
-    model: mujoco.MjModel, dt: float, q: Array, v: Array, ctrl: Array, exogenous: dict[str, Array]
-) -> Context:
+def still(model: mujoco.MjModel, dt: float, q: Array, v: Array, ctrl: Array, exogenous: dict[str, Array]) -> Context:
     """A context without a simulation: laws of state, command and signals can be evaluated in it, and no others."""
 
     def none(name: str) -> Array:

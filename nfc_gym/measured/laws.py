@@ -1,6 +1,6 @@
 """Sparse regression over the impulse tensor: which law, on which degree of freedom, the misfit looks like.
 
-Every term of a dictionary (`physics.effects.law_forms`) is a product with the tensor; the best are refined in their
+Every term of a dictionary (`physics.effects.law`) is a product with the tensor; the best are refined in their
 shape (order, power, edges) on the tensor too. One law is added at a time and refitted with everything else in
 roll-outs before the next is looked for: stepwise selection, in the spirit of SINDy (Brunton et al. 2016), but on
 predictions several horizons long rather than on differentiated data. Nothing here is believed: that is the contest's.
@@ -118,9 +118,7 @@ class _Scan:
         if len(shape):
             simplex = shape + np.concatenate([np.zeros((1, len(room))), 0.25 * np.diag(room)])
             options = {"initial_simplex": simplex, "maxfev": 30 + 30 * len(shape), "xatol": 1e-3 * room.min()}
-            shape = np.clip(
-                minimize(lambda s: -value(s)[0], shape, method="Nelder-Mead", options=options).x, low, high
-            )
+            shape = np.clip(minimize(lambda s: -value(s)[0], shape, method="Nelder-Mead", options=options).x, low, high)
         gain, size = value(shape)
         theta = np.concatenate([size, shape])
         return Proposal(law.at(self.tensor.context, theta), theta, gain / self.total)
@@ -147,7 +145,9 @@ def scan(problem: Problem, metric: Metric, current: Fit, laws: Sequence[Law], rn
     refined = [run.refined(law, shape) for gain, shape, law in found[:_REFINED] if gain > 0]
     refined.sort(key=lambda p: -p.share)
     places: dict[str, float] = {}
-    for share, place in [(p.share, p.law.where[0]) for p in refined] + [(g / run.total, w.where[0]) for g, _, w in found]:
+    for share, place in [(p.share, p.law.where[0]) for p in refined] + [
+        (g / run.total, w.where[0]) for g, _, w in found
+    ]:
         places[place] = max(places.get(place, 0.0), min(share, 1.0))
     chance = float(run.luck.max()) / run.total
     kept = {p.law.family: p for p in reversed(refined) if p.share > chance}

@@ -188,7 +188,9 @@ def _fold(
         + ("; ".join(e["sentence"] for e in report["effects"]) or "no effect claimed")
     )
     if report["unexplained"]:
-        tell(f"[bold]UNEXPLAINED[/bold] at {report['unexplained']['coordinate']}: {report['unexplained']['description']}")
+        tell(
+            f"[bold]UNEXPLAINED[/bold] at {report['unexplained']['coordinate']}: {report['unexplained']['description']}"
+        )
     return report
 
 

@@ -98,4 +98,3 @@ class LawSearch:
             return None
         named = bare.judge(arena.current)
         return rival if rival.total > CLEARLY * named.total and not bare.ties(rival, named) else None
-

@@ -15,18 +15,9 @@ from nfc_gym.physics.effects.friction import Coulomb, DirectionalFriction, LoadF
 from nfc_gym.physics.effects.generic import GenericPosition, GenericTime, GenericVelocity
 from nfc_gym.physics.effects.inertial import ComShift, Inertia, Payload, complete_inertia
 from nfc_gym.physics.effects.joint import Armature, Cogging, DampingPoly, SpringOffset
-from nfc_gym.physics.effects.law_forms import (
-    LawCommand,
-    LawCross,
-    LawFrictionByPlace,
-    LawHarmonic,
-    LawHeight,
-    LawPlace,
-    LawPolynomial,
-    LawPower,
-    LawRamp,
-    LawWave,
-)
+from nfc_gym.physics.effects.law_motion import LawCommand, LawCross, LawPolynomial, LawPower, LawRamp
+from nfc_gym.physics.effects.law_place import LawFrictionByPlace, LawHeight, LawPlace
+from nfc_gym.physics.effects.law_waves import LawHarmonic, LawWave
 from nfc_gym.physics.effects.load import ExternalForce, Slope, Wind
 from nfc_gym.physics.effects.rotor import GroundEffect, RotorDrag
 from nfc_gym.physics.effects.sensors import Misalignment, SensorBias, SensorDelay, SensorGain

@@ -20,7 +20,7 @@ import numpy as np
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
-from nfc_gym.physics.effects.generic import coordinates
+from nfc_gym.physics.effects.generic import TIME, coordinates
 from nfc_gym.physics.state import rotate
 
 _FREE, _HINGE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -39,6 +39,16 @@ def turns(model: mujoco.MjModel, dof: int) -> bool:
     joint = int(model.dof_jntid[dof])
     kind = int(model.jnt_type[joint])
     return kind == _HINGE or (kind == _FREE and dof - int(model.jnt_dofadr[joint]) >= 3)
+
+
+def kind_of(model: mujoco.MjModel, dof: int) -> int:
+    return int(model.jnt_type[model.dof_jntid[dof]])
+
+
+def ends_of(x: Array) -> tuple[float, float]:
+    """Nearly the whole range that a variable covers."""
+    low, high = np.quantile(x, [0.005, 0.995])
+    return float(low), float(max(high, low + 1e-9))
 
 
 class Law(Effect):
@@ -147,3 +157,30 @@ def pushed(model: mujoco.MjModel, scales: Scales) -> list[tuple[str, int, int | 
 def spread(value: float, sd: float | None) -> str:
     """` ± 0.02`, or nothing where the spread is not known."""
     return "" if sd is None or not np.isfinite(sd) else f" ± {1.96 * sd:.2g}"
+
+
+class OfVariable(Law):
+    """A law of the coordinate that the last name in `where` says."""
+
+    def _bind_variable(self, model: mujoco.MjModel) -> None:
+        _, q = self._degree(model, self.where[-1].removesuffix("@body"))
+        if q is None:
+            raise InputError(
+                f"{self.family}: {self.where[-1]!r} has no coordinate; name a joint, or a free joint's 0-2"
+            )
+        self.coordinate = q
+
+    def variable(self, ctx: Context) -> Array:
+        """(...,) what the law is a function of."""
+        return ctx.q[..., self.coordinate]
+
+    @property
+    def what(self) -> str:
+        return f"f(q_{self.where[-1].removesuffix('@body')})"
+
+
+def time_of(law: Law, ctx: Context) -> Array:
+    """(...,) seconds since the log began."""
+    if TIME not in ctx.exogenous:
+        raise InputError(f"{law.family} reads the signal {TIME!r}, which the log does not carry")
+    return ctx.exogenous[TIME]
