@@ -145,9 +145,8 @@ def scan(problem: Problem, metric: Metric, current: Fit, laws: Sequence[Law], rn
     refined = [run.refined(law, shape) for gain, shape, law in found[:_REFINED] if gain > 0]
     refined.sort(key=lambda p: -p.share)
     places: dict[str, float] = {}
-    for share, place in [(p.share, p.law.where[0]) for p in refined] + [
-        (g / run.total, w.where[0]) for g, _, w in found
-    ]:
+    shares = [(p.share, p.law) for p in refined] + [(gain / run.total, law) for gain, _, law in found]
+    for share, place in ((s, law.where[0]) for s, law in shares):
         places[place] = max(places.get(place, 0.0), min(share, 1.0))
     chance = float(run.luck.max()) / run.total
     kept = {p.law.family: p for p in reversed(refined) if p.share > chance}

@@ -1,4 +1,4 @@
-"""Misfit maps: the misfit on the verification logs over the place in the world, and over each joint's position and speed.
+"""Misfit maps: the misfit on the verification logs over the place in the world and over joints' positions and speeds.
 
 Over time and over the compared quantities it is in `details`; here it is laid over the state at each block's start.
 """

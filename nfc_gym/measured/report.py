@@ -248,12 +248,13 @@ def _maps(maps: Row, stages: Sequence[str]) -> Row:
         for line in maps.get("lines") or []
     ]
     grid = maps.get("grid") or {}
+    x, y = (grid.get(k) or [] for k in "xy")
     every = [finite(v) or 0.0 for s in kept for row in grid.get(s) or [] for v in row]
+    most = max(every, default=1.0)
     grids = [
-        {"title": STAGES[s], "figure": charts.heat_grid(f"misfit over the ground, {STAGES[s]}", *axes, grid[s], most)}
+        {"title": STAGES[s], "figure": charts.heat_grid(f"misfit over the ground, {STAGES[s]}", x, y, grid[s], most)}
         for s in kept
-        for axes, most in [((grid.get("x"), grid.get("y")), max(every, default=1.0))]
-        if grid.get(s)
+        if x and y and grid.get(s)
     ]
     return {"places": places, "lines": lines, "grids": grids}
 

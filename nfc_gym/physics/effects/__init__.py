@@ -32,7 +32,8 @@ _TYPES: tuple[type[Effect], ...] = (
     Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
     Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, RotorDrag, GroundEffect, ExternalForce, Slope,
     Slip, SensorBias, SensorGain, SensorDelay, Misalignment, GenericPosition, GenericVelocity, GenericTime,
-    LawHarmonic, LawPower, LawPolynomial, LawPlace, LawFrictionByPlace, LawHeight, LawRamp, LawWave, LawCommand, LawCross,
+    LawHarmonic, LawPower, LawPolynomial, LawPlace, LawFrictionByPlace, LawHeight, LawRamp, LawWave, LawCommand,
+    LawCross,
 )  # fmt: skip
 
 FAMILIES: dict[str, type[Effect]] = {t.family: t for t in _TYPES}

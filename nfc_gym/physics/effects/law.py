@@ -42,6 +42,7 @@ def turns(model: mujoco.MjModel, dof: int) -> bool:
 
 
 def kind_of(model: mujoco.MjModel, dof: int) -> int:
+    """`mjtJoint` of the joint that a degree of freedom belongs to."""
     return int(model.jnt_type[model.dof_jntid[dof]])
 
 

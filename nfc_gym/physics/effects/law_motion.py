@@ -1,4 +1,4 @@
-"""Proposed laws of the motion: of a speed, of a position, of another part's speed, of a command, and a trend in time."""
+"""Proposed laws of the motion: of a speed, a position, another part's speed, a command; and a trend in time."""
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect and law.Law)
 

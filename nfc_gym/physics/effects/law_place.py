@@ -1,4 +1,4 @@
-"""Proposed laws of where the machine is: a patch that pushes, a patch of other friction, a push that fades with height."""
+"""Proposed laws of the place: a patch that pushes, a patch of other friction, a push that fades with height."""
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect and law.Law)
 
