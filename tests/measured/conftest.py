@@ -1,10 +1,13 @@
 """A pendulum with a motor, measured without fault: the data set that the tests then spoil, one thing at a time."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # `hidden_laws`: pytest's importlib mode does not add the folder
 
 MODEL = """
 <mujoco>
