@@ -74,7 +74,10 @@ def _nearest(found: Found) -> tuple[str | None, float]:
     """
     rows = [r for r in found.rounds[0 if found.rest.dropped else -1].ranking if not r["generic"]]
     best = max(rows, key=lambda r: r["share"], default=None)
-    return (None, 0.0) if best is None else (best["id"], float(np.clip(best["share"], 0, 1)))
+    if best is not None:
+        return best["id"], float(np.clip(best["share"], 0, 1))
+    # Screening saw none that gains anything; it leads with the one that comes nearest all the same.
+    return (found.screened[0].effect.id if found.screened else None), 0.0
 
 
 def _worst(v: Verified) -> tuple[str, str, float]:
