@@ -133,7 +133,8 @@ def scan(problem: Problem, metric: Metric, current: Fit, laws: Sequence[Law], rn
     """
     model = current.plant.model
     taken = {e.id for e in current.plant.effects}
-    laws = [law for law in laws if law.id not in taken]
+    free = [law.again() if law.id in taken else law for law in laws]
+    laws = [law for law in free if law is not None and law.id not in taken]
     for law in laws:
         law.bind(model)
     tensor = impulse(problem, metric, current, _sizes(laws)) if laws else None

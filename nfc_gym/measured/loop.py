@@ -285,7 +285,7 @@ def _report(
             "extended_over_calibrated_95": say.gain_interval(v, rng),
         },
         "identifiability": say.identifiability(found),
-        "rounds": [r.__dict__ for r in found.rounds],
+        "rounds": [r.__dict__ for r in (*found.rounds, *found.rest.rounds)],
         "noise": _noise(run.bench, dataset, fold),
         "details": details(run.bench, v, models, dataset.of("verify", fold))
         | ({"maps": maps(v, extended.plant.model, found.rest.scanned, ("calibrated", "extended"))} if left else {}),

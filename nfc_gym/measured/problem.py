@@ -92,7 +92,7 @@ class Stretch:
     Attributes:
       steps: (n,) physics steps after the block's start, not whole numbers.
       qpos, qvel: (n, nq), (n, nv).
-      straight: (nq,) coordinates that were measured and add plainly (no quaternions).
+      straight: (nq,) coordinates that are known and add plainly (no quaternions).
       observed: (nv,) degrees of freedom that were measured.
     """
 
@@ -187,11 +187,13 @@ class RolloutProblem(Problem):
         """The measured states along each block."""
         kit, out = self._kit, []
         straight = np.zeros(kit.model.nq, bool)
-        observed = kit.states[0].observed
+        observed, known = kit.states[0].observed, (kit.states[0].qpos_sd > 0).any(0)
         for j in range(kit.model.njnt):
             q, d, kind = int(kit.model.jnt_qposadr[j]), int(kit.model.jnt_dofadr[j]), int(kit.model.jnt_type[j])
-            width = 3 if kind == int(mujoco.mjtJoint.mjJNT_FREE) else int(kind >= int(mujoco.mjtJoint.mjJNT_SLIDE))
-            straight[q : q + width] = observed[d : d + width]
+            if kind == int(mujoco.mjtJoint.mjJNT_FREE):  # of a base whose velocity alone is measured no place is known
+                straight[q : q + 3] = known[d : d + 3]
+            elif kind >= int(mujoco.mjtJoint.mjJNT_SLIDE):  # a joint's measured speed is integrated
+                straight[q] = observed[d]
         for i, start in zip(self._where.log, self._where.start, strict=True):
             time = kit.logs[i].time
             last = int(np.searchsorted(time, time[start] + self.segments.steps * self.segments.dt)) + 1

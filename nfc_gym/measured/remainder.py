@@ -11,6 +11,7 @@ from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.laws import Scanned, scan
+from nfc_gym.measured.rounds import Round
 from nfc_gym.measured.screen import Screen
 from nfc_gym.physics.effects.law import Law
 
@@ -28,11 +29,13 @@ class Remainder:
       fitted: the model with the laws that were believed.
       scanned: of the laws' first scan, None where nothing was left to scan.
       dropped: named effects that a law alone outdoes.
+      rounds: of the laws, for the report.
     """
 
     fitted: Fit
     scanned: Scanned | None = None
     dropped: list[str] = field(default_factory=list)
+    rounds: list[Round] = field(default_factory=list)
 
     @property
     def laws(self) -> list[Law]:
@@ -55,6 +58,7 @@ class LawSearch:
     ) -> None:
         self.laws, self.worth, self.settle, self.prune = laws, worth, settle, prune
         self.scanned: Scanned | None = None
+        self.rounds: list[Round] = []
 
     def run(self, arena: Arena, calibrated: Fit) -> Remainder:
         """Add laws to an arena's model while they are believed; first ask whether one alone outdoes what it has."""
@@ -74,7 +78,7 @@ class LawSearch:
             arena = self.settle(best.fitted)
             if (kept := self.prune(arena)) is not arena.current:
                 arena = self.settle(kept)
-        out.fitted = arena.current
+        out.fitted, out.rounds = arena.current, self.rounds
         return out
 
     def _best(self, arena: Arena) -> Judged | None:
@@ -86,8 +90,13 @@ class LawSearch:
         entered = [arena.enter([screen.try_one(p.law)]) for p in self.scanned.proposals[:_ENTERED]]
         believed = [j for j in entered if arena.worth(j, self.worth) and arena.plausible(j) and arena.told_apart(j)]
         best = max(believed, key=lambda j: j.total, default=None)
+        outcome = Round([], 0.0, [arena.row(j) for j in sorted(entered, key=lambda j: -j.total)])
         if best is not None:
             arena.say(f"proposed {arena.label(best)}")
+            outcome.accepted, outcome.share = [arena.label(best)], best.gain / max(float(arena.base.sum()), 1e-9)
+        else:
+            outcome.reason = "no law gains more on unseen logs than chance"
+        self.rounds.append(outcome)
         return best
 
     def _alone(self, arena: Arena, calibrated: Fit) -> Judged | None:

@@ -162,3 +162,11 @@ def test_no_law_is_proposed_for_a_machine_that_lacks_nothing(machine: str, seed:
     arena = null.arena
     scanned = scan(arena.fit_data.problem, arena.under, arena.current, null.laws, arena.rng)
     assert all(p.share < 0.1 for p in scanned.proposals)
+
+
+def test_two_harmonics_of_one_joint_are_two_laws() -> None:
+    push = push_joint(lambda q, v: 0.04 * np.cos(3 * q - 1) + 0.03 * np.cos(7 * q - 2))
+    found = case(Machine(WHEEL, 0.01, 0.012, swing(0.1), push), 81).explain()
+    assert [law.id for law in found.laws] == ["law_harmonic:wheel", "law_harmonic:wheel+wheel"]
+    orders = sorted(theta[2] for theta in found.fitted.plant.split(found.fitted.x)[1])
+    np.testing.assert_allclose(orders, [3, 7], atol=0.02)

@@ -119,6 +119,10 @@ class Law(Effect):
             params.append(replace(p, probes=(float(value),), low=float(low), high=float(high)))
         return type(self)(self.where, params)
 
+    def again(self) -> "Law | None":
+        """The law to look for where this one is at work already; None where one of its kind is enough."""
+        return None
+
     @property
     def what(self) -> str:
         """What the force is a function of, as in `f(q_wheel)`."""

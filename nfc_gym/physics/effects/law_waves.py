@@ -59,13 +59,21 @@ class LawHarmonic(OfVariable, _Wave):
     )
 
     def grid(self, ctx: Context) -> Array:
-        if len(self.where) > 1:  # what one part's turning does to another: its unbalance, and twice that
+        if self._foreign:  # what one part's turning does to another: its unbalance, and twice that
             return np.array([[1.0], [2.0]])
         rates = self._rates(ctx, 0.5, 40.0)
         return np.union1d(rates, np.arange(1.0, 13.0))[:, None]
 
+    @property
+    def _foreign(self) -> bool:
+        """Whether another joint than the pushed one turns."""
+        return self.where[-1] != self.where[0]
+
+    def again(self) -> Law | None:
+        return None if len(self.where) > 1 else LawHarmonic(2 * self.where, self.params)  # a second harmonic
+
     def say(self, theta: Array, sd: Array | None = None) -> str:
-        order, of = float(theta[2]), "" if len(self.where) == 1 else f" of {self.where[1]}"
+        order, of = float(theta[2]), f" of {self.where[1]}" if self._foreign else ""
         times = f"{round(order)} times" if abs(order - round(order)) < 0.01 else f"{order:.3g} times"
         times = "once" if times == "1 times" else times
         return f"A {self.noun} that repeats {times} a turn{of}: {self.amplitude(theta, sd)}."
