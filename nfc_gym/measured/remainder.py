@@ -17,6 +17,7 @@ from nfc_gym.physics.effects.law import Law
 
 SILENT = 0.04  # nats a number beyond the noise, below which nothing is left to explain (chi-squared about 1.08)
 CLEARLY = 1.25  # of what all named effects gain together: what a law alone must gain for none of them to be claimed
+_FURTHER = 0.1  # the same for a law beside one that is believed: it would mend the first one's rounding
 _MOST = 3  # laws, one after the other
 _ENTERED = 3  # proposals that are refitted for each
 
@@ -70,7 +71,10 @@ class LawSearch:
             out.dropped = [e.id for e in arena.current.plant.effects]
             out.scanned = self.scanned
             arena = self.settle(rival.fitted)
-        while len([e for e in arena.current.plant.effects if isinstance(e, Law)]) < _MOST and arena.leftover > SILENT:
+        for _ in range(_MOST):
+            laws = [e for e in arena.current.plant.effects if isinstance(e, Law)]
+            if len(laws) >= _MOST or arena.leftover < (_FURTHER if laws else SILENT):
+                break
             best = self._best(arena)
             out.scanned = out.scanned or self.scanned
             if best is None:
