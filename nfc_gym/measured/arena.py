@@ -235,6 +235,7 @@ class Arena:
         return {
             "id": self.label(j),
             "gain_fit": float(j.fit_gains.sum()),
+            "share": float(j.fit_gains.sum() / max(self.left_out.sum(), 1e-9)),
             "gain_select": j.gain,
             "gain_select_low": j.lower,
             "generic": new[0].generic,

@@ -180,6 +180,52 @@ def error_chart(label: str, unit: str, series: Sequence[Series]) -> Markup:
     return _svg(_WIDTH, _HEIGHT, f"{label}: error against horizon", body)
 
 
+def misfit_chart(label: str, unit: str, series: Sequence[Series]) -> Markup:
+    """Misfit in noise widths over a coordinate of the state."""
+    xs = [a for s in series for a, _ in s.points() if a is not None]
+    ys = [b for s in series for _, b in s.points() if b is not None]
+    if not xs or not ys or max(ys) <= 0:
+        return Markup('<p class="none">No value to draw.</p>')
+    x = _Axis(min(xs), max(xs) if max(xs) > min(xs) else min(xs) + 1.0, _LEFT, _WIDTH - _RIGHT)
+    y = _Axis(0.0, 1.08 * max(ys), _HEIGHT - _BOTTOM, _TOP)
+    body = [_frame(x, y, unit, "misfit, × noise")]
+    body += [Markup("").join((_path(s, x, y), _markers(s, x, y))) for s in series]
+    return _svg(_WIDTH, _HEIGHT, label, body)
+
+
+def heat_grid(label: str, x: Sequence[float], y: Sequence[float], rows: Sequence[Sequence[Any]], top: float) -> Markup:
+    """Misfit over two coordinates: cells between the edges x and y (m), darker from 1 to top on a log scale.
+
+    `rows` hold mean square misfits, a row for each stretch of y from below; None leaves a cell bare.
+    """
+    ends = [finite(v) for v in (x[0], x[-1], y[0], y[-1])]
+    if None in ends or not (x[-1] > x[0] and y[-1] > y[0]):
+        return Markup('<p class="none">No value to draw.</p>')
+    across = _Axis(x[0], x[-1], _LEFT, _WIDTH - _RIGHT)
+    up = _Axis(y[0], y[-1], _HEIGHT - _BOTTOM, _TOP)
+    body = [_frame(across, up, "x (m)", "y (m)")]
+    for j, row in enumerate(rows):
+        for i, value in enumerate(row):
+            v = finite(value)
+            if v is None:
+                continue
+            shade = 0.0 if v <= 1 or top <= 1 else min(math.log(v) / math.log(top), 1.0)
+            cell = Markup(
+                '<rect class="heat" x="{}" y="{}" width="{}" height="{}" fill-opacity="{}"><title>{}</title></rect>'
+            )
+            body.append(
+                cell.format(
+                    f"{across(x[i]):.1f}",
+                    f"{up(y[j + 1]):.1f}",
+                    f"{across(x[i + 1]) - across(x[i]):.1f}",
+                    f"{up(y[j]) - up(y[j + 1]):.1f}",
+                    f"{0.06 + 0.94 * shade:.2f}",
+                    f"{number(math.sqrt(max(v, 0.0)))} × noise",
+                )
+            )
+    return _svg(_WIDTH, _HEIGHT, label, body)
+
+
 def trace_chart(label: str, unit: str, series: Sequence[Series]) -> Markup:
     """Values against time; the range is the measurement's, so that a prediction that runs away does not flatten it."""
     xs = [a for s in series for a, b in s.points() if a is not None and b is not None]

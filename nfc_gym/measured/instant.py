@@ -18,7 +18,7 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.smoothing import moving_average
 from nfc_gym.measured.states import States, channel_noise
-from nfc_gym.physics.effects.base import actuator_names
+from nfc_gym.physics.effects.base import Context, actuator_names
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.rollout import Plant
 
@@ -67,6 +67,15 @@ def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[st
         {k: v[rows] for k, v in log.exogenous.items()}, known,
         np.concatenate(columns, 1)[rows], np.concatenate(masks, 1)[rows], np.array(noise), log.condition,
     )  # fmt: skip
+
+
+def still(model: mujoco.MjModel, dt: float, q: Array, v: Array, ctrl: Array, exogenous: dict[str, Array]) -> Context:
+    """A context without a simulation: laws of state, command and signals can be evaluated in it, and no others."""
+
+    def none(name: str) -> Array:
+        raise KeyError(f"{name}: only states, commands and signals are known here")
+
+    return Context(model, dt, q, v, ctrl, exogenous, none, none)
 
 
 class InstantProblem(Problem):
@@ -155,6 +164,13 @@ class InstantProblem(Problem):
         sigma = np.zeros((len(self), width, width))
         sigma[:, np.arange(width), np.arange(width)] = np.maximum(noise, 1e-9) ** 2 / kernel
         return sigma
+
+    def motion(self, model: mujoco.MjModel) -> Context:
+        """What laws of the motion read at every compared sample, (S, T, ...) each."""
+        pairs = list(zip(self.log_of, self.rows, strict=True))
+        pick = lambda name: np.stack([getattr(self.tracks[i], name)[r] for i, r in pairs])  # noqa: E731
+        exogenous = {k: np.stack([self.tracks[i].exogenous[k][r] for i, r in pairs]) for k in self.tracks[0].exogenous}
+        return still(model, self.tracks[0].dt, pick("qpos"), pick("qvel"), pick("ctrl"), exogenous)
 
     def take(self, index: NDArray[np.intp]) -> "InstantProblem":
         """See `Problem`."""

@@ -23,6 +23,7 @@ from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.details import details
 from nfc_gym.measured.export import corrected, effects_of, pack, unpack
 from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.maps import maps
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
@@ -32,6 +33,7 @@ from nfc_gym.measured.search import Found, Options, Search
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole
+from nfc_gym.measured.unexplained import unexplained
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
@@ -185,6 +187,10 @@ def _fold(
         f"[bold]{report['verdict']}[/bold]: "
         + ("; ".join(e["sentence"] for e in report["effects"]) or "no effect claimed")
     )
+    if report["unexplained"]:
+        tell(
+            f"[bold]UNEXPLAINED[/bold] at {report['unexplained']['coordinate']}: {report['unexplained']['description']}"
+        )
     return report
 
 
@@ -253,8 +259,12 @@ def _report(
     models = say.Models(nominal, (calibrated.plant, calibrated.x), (extended.plant, extended.x))
     run.say(f"verifying on {len(problem)} segments")
     v = say.verify(problem, models, _REPLICAS, rng)
-    verdict = say.verdict(v, len(extended.plant.effects), found.generic is not None)
     shares = say.excess_shares(v, problem, extended, models.calibrated)
+    rows = say.effect_rows(extended, found.rounds, whole, shares)
+    laws = {e.id for e in extended.plant.effects if e.generic}
+    claimed, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
+    verdict = say.verdict(v, len(claimed), found.generic is not None or bool(proposed))
+    left = verdict in ("unexplained", "partly explained")
     splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
     return {
         "schema": 1,
@@ -263,9 +273,10 @@ def _report(
         "logs": splits,
         "independent_splits": dataset.independent_splits,
         "parameters": say.parameter_rows(extended, nominal[1], whole),
-        "effects": say.effect_rows(extended, found.rounds, whole, shares),
+        "effects": claimed,
+        "proposals": proposed,
         "verdict": verdict,
-        "unexplained": say.unexplained(v, found) if verdict in ("unexplained", "partly explained") else None,
+        "unexplained": unexplained(v, found, extended.plant, proposed) if left else None,
         "error": say.errors(v),
         "chi2": {stage: v.chi2(stage) for stage in v.residual}
         | {
@@ -274,9 +285,10 @@ def _report(
             "extended_over_calibrated_95": say.gain_interval(v, rng),
         },
         "identifiability": say.identifiability(found),
-        "rounds": [r.__dict__ for r in found.rounds],
+        "rounds": [r.__dict__ for r in (*found.rounds, *found.rest.rounds)],
         "noise": _noise(run.bench, dataset, fold),
-        "details": details(run.bench, v, models, dataset.of("verify", fold)),
+        "details": details(run.bench, v, models, dataset.of("verify", fold))
+        | ({"maps": maps(v, extended.plant.model, found.rest.scanned, ("calibrated", "extended"))} if left else {}),
         "seed": run.seed,
         "versions": {"nfc_gym": version("nfc_gym"), "mujoco": mujoco.__version__},
     }
@@ -298,7 +310,7 @@ def _write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, An
     calibrated, extended = final
     xml, outside = corrected(bench.spec, extended.plant, extended.x)
     write_whole(out / "model.xml", xml)
-    rows = {e["id"]: e for e in report["effects"]}
+    rows = {e["id"]: e for e in report["effects"]} | {e["id"]: {**e, "proposal": True} for e in report["proposals"]}
     listed = [rows[e.id] for e, _ in effects_of(extended.plant, extended.x, outside)]
     effects = {
         "version": 1,

@@ -87,6 +87,24 @@ def interpolate(grid: Array, step: Array, quaternion: bool) -> Array:
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """Measured states of a block at n samples.
+
+    Attributes:
+      steps: (n,) physics steps after the block's start, not whole numbers.
+      qpos, qvel: (n, nq), (n, nv).
+      straight: (nq,) coordinates that are known and add plainly (no quaternions).
+      observed: (nv,) degrees of freedom that were measured.
+    """
+
+    steps: Array
+    qpos: Array
+    qvel: Array
+    straight: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class _Kit:
     """What a roll-out problem is made of, kept to lay it out again at another time step."""
 
@@ -165,6 +183,26 @@ class RolloutProblem(Problem):
                     horizon.append(h)
                     place.append(o.place)
         return Columns(tuple(group), tuple(unit), np.array(horizon), tuple(place))
+
+    def stretches(self) -> list[Stretch]:
+        """The measured states along each block."""
+        kit, out = self._kit, []
+        straight = np.zeros(kit.model.nq, bool)
+        observed, known = kit.states[0].observed, (kit.states[0].qpos_sd > 0).any(0)
+        for j in range(kit.model.njnt):
+            q, d, kind = int(kit.model.jnt_qposadr[j]), int(kit.model.jnt_dofadr[j]), int(kit.model.jnt_type[j])
+            if kind == int(mujoco.mjtJoint.mjJNT_FREE):  # of a base whose velocity alone is measured no place is known
+                straight[q : q + 3] = known[d : d + 3]
+            elif kind >= int(mujoco.mjtJoint.mjJNT_SLIDE):  # a joint's measured speed is integrated
+                straight[q] = observed[d]
+        for i, start in zip(self._where.log, self._where.start, strict=True):
+            time = kit.logs[i].time
+            last = int(np.searchsorted(time, time[start] + self.segments.steps * self.segments.dt)) + 1
+            rows = slice(start, last)
+            states = kit.states[i]
+            steps = (time[rows] - time[start]) / self.segments.dt
+            out.append(Stretch(steps, states.qpos[rows], states.qvel[rows], straight, observed))
+        return out
 
     @property
     def observers(self) -> list[Observer]:

@@ -28,7 +28,7 @@ def render(report: Row, shown: Row) -> str:
 
     Values that are missing, None or not finite are shown as a dash.
     """
-    stages = [s for s in STAGES if s != "extended" or report.get("effects")]
+    stages = [s for s in STAGES if s != "extended" or story.added(report)]
     misfit = shown.get("misfit") or {}
     return _page(
         "report.html.j2",
@@ -46,11 +46,13 @@ def render(report: Row, shown: Row) -> str:
         instant=(report.get("error") or {}).get("horizons_s") == [0.0],
         traces=[_trace(t, stages) for t in shown.get("traces") or []],
         effects=[_effect(e, report["effects"]) for e in report.get("effects") or []],
+        proposals=[_effect(e, report["proposals"]) for e in report.get("proposals") or []],
         parameters=[_parameter(p) for p in report.get("parameters") or []],
         rounds=[_round(r) for r in report.get("rounds") or []],
         places=_misfit_rows(misfit, "place", stages),
         logs_misfit=_misfit_rows(misfit, "log", stages),
         strips=_strips(misfit, stages),
+        maps=_maps(shown.get("maps") or {}, stages),
         short=_SHORT,
     )
 
@@ -228,6 +230,35 @@ def _strips(misfit: Row, stages: Sequence[str]) -> Row:
     return {"rows": rows[:_STRIPS], "left_out": max(len(rows) - _STRIPS, 0), "end": end + step, "worst": _root(top)}
 
 
+def _maps(maps: Row, stages: Sequence[str]) -> Row:
+    """Misfit over the state: shares by degree of freedom, curves over position and speed, and the ground's map."""
+    kept = [s for s in stages if s != "nominal"]
+    shares = maps.get("degrees") or {}
+    top = max((finite(s) or 0.0 for s in shares.values()), default=0.0)
+    places = [{"name": n, "share": s, "meter": charts.meter(s, top, "calibrated")} for n, s in shares.items()]
+    lines = [
+        {
+            "title": line.get("title", ""),
+            "figure": charts.misfit_chart(
+                f"misfit {line.get('title', '')}",
+                wording.unit(line.get("unit")),
+                [Series(STAGES[s], s, line.get("x") or [], [_root(v) for v in _values(line, s)]) for s in kept],
+            ),
+        }
+        for line in maps.get("lines") or []
+    ]
+    grid = maps.get("grid") or {}
+    x, y = (grid.get(k) or [] for k in "xy")
+    every = [finite(v) or 0.0 for s in kept for row in grid.get(s) or [] for v in row]
+    most = max(every, default=1.0)
+    grids = [
+        {"title": STAGES[s], "figure": charts.heat_grid(f"misfit over the ground, {STAGES[s]}", x, y, grid[s], most)}
+        for s in kept
+        if x and y and grid.get(s)
+    ]
+    return {"places": places, "lines": lines, "grids": grids}
+
+
 def _by_log(time: Row) -> dict[str, list[tuple[float, float | None]]]:
     out: dict[str, list[tuple[float, float | None]]] = {}
     columns = (time.get(k) or [] for k in ("log", "seconds", "value"))
@@ -254,7 +285,7 @@ def _strip(log: str, rows: Sequence[tuple[float, float | None]], end: float, ste
 
 def _fold(name: str, r: Row) -> Row:
     chi2 = r.get("chi2") or {}
-    after = "extended" if r.get("effects") else "calibrated"
+    after = "extended" if story.added(r) else "calibrated"
     errors = [
         {"group": c.group, "unit": c.unit, "before": c.calibrated, "after": getattr(c, after), "floor": c.floor}
         for c in story.changes(r)

@@ -17,6 +17,7 @@ _PAIRED = 3  # mechanisms that are tried in pairs
 _TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
 _LEFT = 0.1  # nats a number beyond the noise, below which a second law beside one that is believed has nothing to mend
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
+_ALIKE = 3  # families that may explain the data alike for one of them to be claimed
 
 
 @dataclass
@@ -70,7 +71,8 @@ class Contest:
         judged = self._final(first)
         arena = self.arena
         beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in judged)]
-        outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *(arena.judge(j.fitted) for j in beaten)]])
+        beaten = [arena.judge(j.fitted) for j in beaten]
+        outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *beaten]])
         believed = [j for j in judged if self._believed(j)]
         pairs = self._pairs(judged, entered) if not believed or arena.leftover > _LEFT else []
         outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
@@ -81,6 +83,11 @@ class Contest:
             outcome.reason = f"the best candidate, {arena.label(judged[0])}, gains no more on unseen logs than chance"
             return outcome, None
         best = self._simplest(believed)
+        alike = [*(e.id for e in arena.new(best)), *self._equivalents([*judged, *beaten], best, believed[0])]
+        if len({i.partition(":")[0] for i in alike}) > _ALIKE:
+            # So many causes that do alike are no finding: each would be named for want of the others.
+            outcome.reason = f"{len(alike)} effects explain it alike: {', '.join(alike)}"
+            return outcome, None
         outcome.accepted = [e.id for e in arena.new(best)]
         outcome.share = best.gain / max(float(arena.base.sum()), 1e-9)
         outcome.equivalents = self._equivalents(judged, best, believed[0])

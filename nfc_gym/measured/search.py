@@ -13,11 +13,13 @@ from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.lookout import Lookout
+from nfc_gym.measured.remainder import CLEARLY, SILENT, LawSearch, Remainder
 from nfc_gym.measured.rounds import Contest, Round
 from nfc_gym.measured.screen import Screen, Screened
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.law import Law
 
 Say = Callable[[str], None]
 
@@ -51,6 +53,7 @@ class Found:
       rounds: in order, the last one being the round that accepted nothing.
       generic: a generic alternative that beat every named effect, or None.
       screened: the last round's screening, from which the identifiability table is made.
+      rest: what the named effects left, and the laws that are proposed for it.
     """
 
     calibrated: Fit
@@ -58,6 +61,7 @@ class Found:
     rounds: list[Round]
     generic: Judged | None
     screened: list[Screened]
+    rest: Remainder
 
 
 class Search:
@@ -66,7 +70,8 @@ class Search:
     def __init__(self, fit_data: Data, select: Data, candidates: Sequence[Effect], options: Options, say: Say) -> None:
         self.fit_data, self.select = fit_data, select
         self.named = [e for e in candidates if not e.generic]
-        self.generics = [e for e in candidates if e.generic]
+        self.generics = [e for e in candidates if e.generic and not isinstance(e, Law)]
+        self.laws = [e for e in candidates if isinstance(e, Law)]
         self.options, self.say = options, say
         self.rng = np.random.default_rng(options.seed)
         self.lookout = Lookout(fit_data.problem, self.rng, say)
@@ -83,7 +88,7 @@ class Search:
         begun: tuple[Fit, list[Round]] | None = None,
         keep: Callable[[Fit, list[Round]], None] = lambda current, rounds: None,
     ) -> Found:
-        """Greedy rounds from a calibrated model until nothing more is believed; then the generic alternatives' turn.
+        """Greedy rounds from a calibrated model until nothing more is believed; then the turn of what has no name.
 
         Args:
           calibrated: psi alone, fitted.
@@ -106,12 +111,17 @@ class Search:
             if current is not arena.current:
                 arena = self.settle(current, polished=True)
             keep(arena.current, rounds)
-        generic = self._generic(arena, screen, outcome)
-        current = arena.current
-        if generic is not None and current.plant.effects and self._outdone(arena, generic, calibrated):
+        dropped: list[str] = []
+        generic = self._generic(arena, screen, outcome) if arena.leftover > SILENT else None
+        if generic is not None and arena.current.plant.effects and self._outdone(arena, generic, calibrated):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
-            current = fit(self.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6)
-        return Found(calibrated, current, rounds, generic, screened)
+            dropped = [e.id for e in arena.current.plant.effects]
+            bare = fit(self.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6)
+            arena = self.settle(bare, polished=True)
+        laws = LawSearch(self.laws, self.options.worth, self.settle, self._prune)
+        rest = laws.run(arena, calibrated)
+        rest.dropped = rest.dropped or dropped
+        return Found(calibrated, rest.fitted, rounds, generic, screened, rest)
 
     def _exchange(self, arena: Arena, rounds: list[Round]) -> Fit | None:
         """A model in which another law took the place of an earlier one, if that is clearly better."""
@@ -158,4 +168,4 @@ class Search:
         plant = calibrated.plant.with_effects([effect])
         rival = bare.judge(fit(problem, arena.under, plant, np.concatenate([bare.current.x, effect.null]), 10))
         named = bare.judge(arena.current)
-        return rival.total > 1.25 * named.total and not arena.ties(rival, named)
+        return rival.total > CLEARLY * named.total and not arena.ties(rival, named)

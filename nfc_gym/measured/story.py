@@ -109,12 +109,20 @@ def what(effect: dict[str, Any]) -> str:
     return head[:1].lower() + head[1:] if head[1:2].islower() else head
 
 
+def added(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """What the extended model has beyond psi: effects that are claimed, and laws that are proposed."""
+    return [*(report.get("effects") or []), *(report.get("proposals") or [])]
+
+
 def headline(report: dict[str, Any]) -> str:
     """What is missing, in one sentence."""
     effects = report.get("effects") or []
     word = report.get("verdict")
     left = (report.get("unexplained") or {}).get("coordinate")
     at = f", the largest share at {left}" if left else ""
+    if laws := report.get("proposals"):
+        heads = [what(e) for e in laws]
+        at += f". It looks like {listed([h[:1].lower() + h[1:] for h in heads], 3)}"
     if word == "nothing missing":
         return "Nothing is missing: once calibrated, the model predicts unseen motion as well as the sensors can tell."
     if word == "unexplained":
@@ -144,8 +152,9 @@ def error_sentence(report: dict[str, Any]) -> str:
     if c is None:
         return ""
     steps = [(c.nominal, "with the model as given"), (c.calibrated, "once calibrated")]
-    if report.get("effects"):
-        steps.append((c.extended, f"with the missing effect{'s' * (len(report['effects']) > 1)} added"))
+    if new := added(report):
+        name = "missing effect" if report.get("effects") else "proposed law"
+        steps.append((c.extended, f"with the {name}{'s' * (len(new) > 1)} added"))
     path = ", ".join(f"{quantity(v, c.unit)} {words}" for v, words in steps if v is not None)
     floor = f" The noise alone accounts for {quantity(c.floor, c.unit)}." if c.floor is not None else ""
     return f"Typical error of the {c.group}{ahead(c.horizon)}, on {unseen(report)}: {path}.{floor}"
@@ -154,7 +163,7 @@ def error_sentence(report: dict[str, Any]) -> str:
 def certainty(report: dict[str, Any]) -> str:
     """How sure: chi-squared against a perfect model's, and the interval of what the effects take away."""
     chi2 = report.get("chi2") or {}
-    after = finite(chi2.get("extended" if report.get("effects") else "calibrated"))
+    after = finite(chi2.get("extended" if added(report) else "calibrated"))
     bound, null = finite(chi2.get("null_95")), finite(chi2.get("null"))
     if after is None or bound is None:
         return ""
@@ -166,7 +175,7 @@ def certainty(report: dict[str, Any]) -> str:
         rest = f"is {number(after / null if null else after, 2)} times a perfect model's ({number(null)})"
     text = f"Chi-squared {number(after)} {rest}"
     low, high = (finite(r) for r in chi2.get("extended_over_calibrated_95") or (None, None))
-    if report.get("effects") and low is not None and high is not None:
+    if added(report) and low is not None and high is not None:
         part = f"{number(100 * low, 2)} to {number(100 * high, 2)} %"
         text += f"; that is {part} of what calibration alone leaves (95 % interval)"
     return f"{text}."

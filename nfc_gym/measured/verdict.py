@@ -100,14 +100,19 @@ def _rms(values: Array, where: NDArray[np.bool_]) -> float | None:
 
 
 def verdict(v: Verified, effects: int, generic: bool) -> str:
-    """One of: nothing missing, explained, partly explained, unexplained."""
+    """One of: nothing missing, explained, partly explained, unexplained.
+
+    Args:
+      effects: named effects that are claimed.
+      generic: whether something without a name was believed beside or instead of them.
+    """
     bound = null_bound(v)
     after = v.chi2("extended")
     # A tenth above the null's own 95 % bound is not worth alarming anybody: the noise level itself is not known better.
     settled = after <= 1.1 * bound
     if effects:
         return "explained" if settled and not generic else "partly explained"
-    return "nothing missing" if settled else "unexplained"
+    return "nothing missing" if settled and not generic else "unexplained"
 
 
 def null_bound(v: Verified) -> float:
@@ -119,32 +124,6 @@ def null_bound(v: Verified) -> float:
     # Of one more draw from a normal population of which few have been seen.
     factor = float(student.ppf(0.95, count - 1)) * np.sqrt(1 + 1 / count) if count > 1 else 1.645
     return float(v.null.mean()) + factor * spread
-
-
-def unexplained(v: Verified, found: Found) -> dict[str, Any] | None:
-    """Where the largest remaining misfit sits, and the named effect that comes nearest."""
-    squares = np.where(v.problem.mask, np.minimum(v.white["extended"] ** 2, 1e6), 0.0)
-    c = v.problem.columns
-    keys = list(dict.fromkeys(zip(c.place, c.group, strict=True)))
-    share = [squares[:, [k == key for k in zip(c.place, c.group, strict=True)]].sum() for key in keys]
-    place, group = keys[int(np.argmax(share))]
-    largest = float(np.max(share) / max(sum(share), 1e-9))
-    last = found.rounds[-1]
-    nearest = next((r for r in last.ranking if not r["generic"]), None)
-    total = max(float(found.extended.losses.sum()), 1e-9)
-    text = last.reason or "no effect of the library explains it"
-    generic = next((r for r in last.ranking if r["generic"]), None)
-    if found.generic is not None and generic is not None:
-        law, where = generic["id"].split(":", 1)
-        memory = "looks like a force with memory in" if law == "generic_memory" else "looks like a function of"
-        text = f"{memory} {where} ({law.replace('_', ' ')})"
-    return {
-        "coordinate": place if place.startswith("sensor") else f"{place} ({group})",
-        "where": place,
-        "description": f"largest share of the remaining misfit: {largest:.0%}; {text}",
-        "nearest": nearest["id"] if nearest else None,
-        "nearest_share": max(nearest["gain_fit"], 0.0) / total if nearest else 0.0,
-    }
 
 
 def parameter_rows(fitted: Fit, nominal: Array, problem: Problem) -> list[dict[str, Any]]:

@@ -116,7 +116,12 @@ def pictures() -> dict[str, Any]:
             "time": {"log": ["run_4"] * 20 + ["run_5"] * 20, "seconds": seconds * 2, "value": values},
         }
 
-    return {"traces": [trace], "misfit": {"calibrated": misfit(2.0), "extended": misfit(0.2)}}
+    line = {"title": "over the speed of hinge", "unit": "rad/s", "x": [-1.0, 0.0, 1.0]}
+    grid = {"x": [0.0, 1.0, 2.0], "y": [-1.0, 0.0, 1.0]}
+    values = {"calibrated": [9.0, None, 4.0], "extended": [1.0, None, 1.0]}
+    cells = {s: [[v[0], None], [None, v[2]]] for s, v in values.items()}
+    maps = {"degrees": {"hinge": 0.6, "slide": 0.02}, "lines": [line | values], "grid": grid | cells}
+    return {"traces": [trace], "misfit": {"calibrated": misfit(2.0), "extended": misfit(0.2)}, "maps": maps}
 
 
 class _Reader(HTMLParser):
@@ -215,6 +220,36 @@ def test_each_verdict_has_its_own_words_sign_and_colour(word: str) -> None:
     assert not any(v.meaning in page or v.cls == own.cls or v.sign == own.sign for v in others)
     assert ("joint:arm (joint angle)" in page) == (report["unexplained"] is not None)
     assert ("12\N{NO-BREAK SPACE}%" in page) == (report["unexplained"] is not None)
+
+
+def test_a_proposed_law_is_shown_apart_from_what_is_claimed() -> None:
+    report = example(0) | {"verdict": "unexplained"}
+    size = {"cosine": {"value": 0.3, "low": 0.28, "high": 0.32, "unit": "N m"}}
+    law = {
+        "id": "law_harmonic:hinge",
+        "sentence": "A torque on hinge that repeats 6 times a turn: 0.31 N m.",
+        "share_of_excess": 0.9,
+        "parameters": size,
+    }
+    near = "looks like f(q_hinge); the nearest named effect, gain:motor, explains 12%"
+    report["unexplained"] = {"coordinate": "joint:hinge:pos", "description": near, "nearest": "gain:motor"}
+    text = read(render(report | {"proposals": [law]}, pictures())).text
+    assert "It looks like a torque on hinge that repeats 6 times a turn." in text
+    assert "with the proposed law added" in text
+    assert "No effect is claimed." in text
+    assert "law_harmonic:hinge" in text
+    assert text.count("gain:motor") == 1  # said once, in the description
+    without = read(render(report, pictures())).text
+    assert "proposed law" not in without
+
+
+def test_maps_of_the_misfit() -> None:
+    page = render(example(), pictures())
+    text = read(page).text
+    assert "over the speed of hinge" in text
+    assert wording.percent(0.6) in text
+    assert page.count("3.00 × noise") == 1  # the cell of a mean square of 9; bare cells are not drawn
+    assert "By degree of freedom" not in read(render(example(), {**pictures(), "maps": {}})).text
 
 
 def test_nothing_is_loaded_from_anywhere() -> None:

@@ -19,6 +19,9 @@ from nfc_gym.physics.effects.gust import Gust
 from nfc_gym.physics.effects.hysteresis import Hysteresis
 from nfc_gym.physics.effects.inertial import ComShift, Inertia, Payload, complete_inertia
 from nfc_gym.physics.effects.joint import Armature, Cogging, DampingPoly, SpringOffset
+from nfc_gym.physics.effects.law_motion import LawCommand, LawCross, LawPolynomial, LawPower, LawRamp
+from nfc_gym.physics.effects.law_place import LawFrictionByPlace, LawHeight, LawPlace
+from nfc_gym.physics.effects.law_waves import LawHarmonic, LawWave
 from nfc_gym.physics.effects.load import ExternalForce, Slope, Wind
 from nfc_gym.physics.effects.rotor import GroundEffect, RotorDrag
 from nfc_gym.physics.effects.sensors import Misalignment, SensorBias, SensorDelay, SensorGain
@@ -35,6 +38,8 @@ _TYPES: tuple[type[Effect], ...] = (
     Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, Gust, RotorDrag, GroundEffect, ExternalForce, Slope,
     Slip, FrictionPatch, Compliance, Sinkage, SensorBias, SensorGain, SensorDelay, Misalignment,
     GenericPosition, GenericVelocity, GenericTime, GenericMemory,
+    LawHarmonic, LawPower, LawPolynomial, LawPlace, LawFrictionByPlace, LawHeight, LawRamp, LawWave, LawCommand,
+    LawCross,
 )  # fmt: skip
 
 FAMILIES: dict[str, type[Effect]] = {t.family: t for t in _TYPES}

@@ -1,0 +1,113 @@
+"""What is left when no named effect gains any more: a law in words, which the same contest must believe.
+
+A law that is believed goes into the extended model as a proposal: it predicts, and claims no cause. If a law alone
+explains clearly more than all named effects together, none of them is claimed.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from nfc_gym.measured.arena import Arena
+from nfc_gym.measured.contest import Judged
+from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.laws import Scanned, scan
+from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.screen import Screen
+from nfc_gym.physics.effects.law import Law
+
+SILENT = 0.04  # nats a number beyond the noise, below which nothing is left to explain (chi-squared about 1.08)
+CLEARLY = 1.25  # of what all named effects gain together: what a law alone must gain for none of them to be claimed
+_FURTHER = 0.1  # the same for a law beside one that is believed: it would mend the first one's rounding
+_MOST = 3  # laws, one after the other
+_ENTERED = 3  # proposals that are refitted for each
+
+
+@dataclass
+class Remainder:
+    """What the named effects left, and what it looks like.
+
+    Attributes:
+      fitted: the model with the laws that were believed.
+      scanned: of the laws' first scan, None where nothing was left to scan.
+      dropped: named effects that a law alone outdoes.
+      rounds: of the laws, for the report.
+    """
+
+    fitted: Fit
+    scanned: Scanned | None = None
+    dropped: list[str] = field(default_factory=list)
+    rounds: list[Round] = field(default_factory=list)
+
+    @property
+    def laws(self) -> list[Law]:
+        """The laws that were believed."""
+        return [e for e in self.fitted.plant.effects if isinstance(e, Law)]
+
+
+class LawSearch:
+    """Laws, tried where the named effects ended.
+
+    Args:
+      laws: the dictionary.
+      worth: share of the misfit that a law must explain.
+      settle: the arena of the round that starts from a fitted model.
+      prune: an arena's model without the effects that the others made superfluous.
+    """
+
+    def __init__(
+        self, laws: Sequence[Law], worth: float, settle: Callable[[Fit], Arena], prune: Callable[[Arena], Fit]
+    ) -> None:
+        self.laws, self.worth, self.settle, self.prune = laws, worth, settle, prune
+        self.scanned: Scanned | None = None
+        self.rounds: list[Round] = []
+
+    def run(self, arena: Arena, calibrated: Fit) -> Remainder:
+        """Add laws to an arena's model while they are believed; first ask whether one alone outdoes what it has."""
+        out = Remainder(arena.current)
+        if arena.leftover < SILENT or not self.laws:
+            return out
+        if arena.current.plant.effects and (rival := self._alone(arena, calibrated)) is not None:
+            arena.say("a law alone explains clearly more than all named effects: none is claimed")
+            out.dropped = [e.id for e in arena.current.plant.effects]
+            out.scanned = self.scanned
+            arena = self.settle(rival.fitted)
+        for _ in range(_MOST):
+            laws = [e for e in arena.current.plant.effects if isinstance(e, Law)]
+            if len(laws) >= _MOST or arena.leftover < (_FURTHER if laws else SILENT):
+                break
+            best = self._best(arena)
+            out.scanned = out.scanned or self.scanned
+            if best is None:
+                break
+            arena = self.settle(best.fitted)
+            if (kept := self.prune(arena)) is not arena.current:
+                arena = self.settle(kept)
+        out.fitted, out.rounds = arena.current, self.rounds
+        return out
+
+    def _best(self, arena: Arena) -> Judged | None:
+        """The law that adds most to an arena's model, if it is believed."""
+        problem, current = arena.fit_data.problem, arena.current
+        arena.say(f"looking for a law in what is left, among {len(self.laws)}")
+        self.scanned = scan(problem, arena.under, current, self.laws, arena.rng)
+        screen = Screen(problem, arena.under, current)
+        entered = [arena.enter([screen.try_one(p.law)]) for p in self.scanned.proposals[:_ENTERED]]
+        believed = [j for j in entered if arena.worth(j, self.worth) and arena.plausible(j) and arena.told_apart(j)]
+        best = max(believed, key=lambda j: j.total, default=None)
+        outcome = Round([], 0.0, [arena.row(j) for j in sorted(entered, key=lambda j: -j.total)])
+        if best is not None:
+            arena.say(f"proposed {arena.label(best)}")
+            outcome.accepted, outcome.share = [arena.label(best)], best.gain / max(float(arena.base.sum()), 1e-9)
+        else:
+            outcome.reason = "no law gains more on unseen logs than chance"
+        self.rounds.append(outcome)
+        return best
+
+    def _alone(self, arena: Arena, calibrated: Fit) -> Judged | None:
+        """A law that by itself explains clearly more than all named effects together."""
+        bare = arena.facing(fit(arena.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6))
+        rival = self._best(bare)
+        if rival is None:
+            return None
+        named = bare.judge(arena.current)
+        return rival if rival.total > CLEARLY * named.total and not bare.ties(rival, named) else None

@@ -1,0 +1,89 @@
+"""The rest in words: which degree of freedom is wrong, what the misfit looks like there, and what comes nearest."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from nfc_gym.measured.laws import Proposal
+from nfc_gym.measured.search import Found
+from nfc_gym.measured.verdict import Verified
+from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.law import Law, degrees
+from nfc_gym.physics.rollout import Plant
+
+_SPEEDS = ("law_power", "law_friction", "law_cross")
+
+
+def unexplained(v: Verified, found: Found, plant: Plant, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The report's `unexplained`, for a verdict of that name or `partly explained`.
+
+    Args:
+      v: on the verification logs.
+      found: what the search found.
+      plant: the extended machine.
+      rows: the report's rows of the proposed laws.
+    """
+    laws = [e for e in plant.effects if isinstance(e, Law)]
+    nearest, share = _nearest(found)
+    out: dict[str, Any] = {"nearest": nearest, "nearest_share": share, "proposed": [r["id"] for r in rows]}
+    near = f"; the nearest named effect, {nearest}, explains {share:.0%}" if nearest else "; no named effect comes near"
+    scanned = found.rest.scanned
+    reason = found.rounds[-1].reason or "no effect of the library explains it"
+    if laws:
+        parts = [f"{law.what}: {_inner(r['sentence'])}" for law, r in zip(laws, rows, strict=True)]
+        text = f"looks like {', and '.join(parts)}{near}"
+        return _place(plant.model, laws[0]) | out | {"description": f"{text}; {reason}" if "alike" in reason else text}
+    if scanned is not None and scanned.nearest is not None:
+        law = scanned.nearest.law
+        law.bind(plant.model)
+        return _place(plant.model, law) | out | {"description": f"{_guess(scanned.nearest)}; {reason}{near}"}
+    place, group, part = _worst(v)
+    coordinate = place if place.startswith("sensor") else f"{place} ({group})"
+    text = f"largest share of the remaining misfit: {part:.0%}; {reason}{near}"
+    return {"coordinate": coordinate, "where": place} | out | {"description": text}
+
+
+def _inner(sentence: str) -> str:
+    """A sentence as part of a longer one."""
+    return sentence[:1].lower() + sentence[1:].rstrip(".")
+
+
+def _guess(near: Proposal) -> str:
+    return f"depends most on {near.law.what}, which takes away {near.share:.0%} of it, but not surely on unseen logs"
+
+
+def _place(model: mujoco.MjModel, law: Effect) -> dict[str, str]:
+    """`coordinate` (a channel that shows the degree of freedom) and `where` of a law."""
+    name = law.where[0].removesuffix("@body")
+    joint, _, rest = name.partition("[")
+    if not rest:
+        kind = "vel" if law.family in _SPEEDS else "pos"
+        return {"coordinate": f"joint:{joint}:{kind}", "where": f"joint:{joint}"}
+    i = int(rest[0])
+    dof, _ = degrees(model)[name]
+    body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.dof_bodyid[dof]))
+    kind = ("linvel" if i < 3 else "angvel") if law.family in _SPEEDS else ("pos" if i < 3 else "quat")
+    return {"coordinate": f"body:{body}:{kind}[{i % 3}]", "where": f"joint:{name}"}
+
+
+def _nearest(found: Found) -> tuple[str | None, float]:
+    """The named effect that took away most of what was left where none was believed, and its share of that.
+
+    Where a law outdid all named effects together, that is the best of the first round.
+    """
+    rows = [r for r in found.rounds[0 if found.rest.dropped else -1].ranking if not r["generic"]]
+    best = max(rows, key=lambda r: r["share"], default=None)
+    if best is not None:
+        return best["id"], float(np.clip(best["share"], 0, 1))
+    # Screening saw none that gains anything; it leads with the one that comes nearest all the same.
+    return (found.screened[0].effect.id if found.screened else None), 0.0
+
+
+def _worst(v: Verified) -> tuple[str, str, float]:
+    """(place, group, share) of the columns with the largest share of the remaining misfit."""
+    squares = np.where(v.problem.mask, np.minimum(v.white["extended"] ** 2, 1e6), 0.0)
+    keys = list(zip(v.problem.columns.place, v.problem.columns.group, strict=True))
+    sums = {key: float(squares[:, [k == key for k in keys]].sum()) for key in dict.fromkeys(keys)}
+    place, group = max(sums, key=lambda k: sums[k])
+    return place, group, sums[(place, group)] / max(sum(sums.values()), 1e-9)

@@ -1,0 +1,170 @@
+"""Never silent: what no named effect explains is said in words, mapped, saved as a proposal, and never claimed."""
+
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hidden_laws import WHEEL, Machine, record, swing
+from rich.console import Console
+
+from nfc_gym.measured import rounds
+from nfc_gym.measured.loop import close_loop
+from nfc_gym.measured.rounds import Contest
+from nfc_gym.measured.unexplained import unexplained
+from nfc_gym.measured.verdict import verdict
+from nfc_gym.physics.effects.saved import from_row
+
+MAPPING = """
+version: 1
+model: wheel.xml
+parameters:
+  - {name: damping, field: dof_damping, of: [wheel], unit: N m s/rad, low: 0.0, high: 0.1}
+logs:
+  - {path: "fit_*.npz", split: fit}
+  - {path: "select.npz", split: select}
+  - {path: "verify.npz", split: verify}
+time: {column: t}
+controls:
+  "ctrl:motor": {column: u, unit: Nm}
+channels:
+  "joint:wheel:pos": {column: q, unit: rad, noise: 0.002}
+  "joint:wheel:vel": {column: v, unit: rad/s, noise: 0.02}
+segments: {length: 0.3, history: 0.0, horizons: [0.1, 0.3]}
+effects: {only: [coulomb]}
+"""
+
+
+@dataclass
+class Closed:
+    """A finished run."""
+
+    out: Path
+    report: dict[str, Any]
+    said: str
+    order: int
+    size: float
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Closed:
+    folder, rng = tmp_path_factory.mktemp("cogging"), np.random.default_rng(71)
+    order, size = int(rng.integers(3, 8)), rng.uniform(0.02, 0.05)
+
+    def push(model, data) -> None:
+        data.qfrc_applied[0] = size * np.cos(order * data.qpos[0] - 1)
+
+    machine = Machine(WHEEL, 0.01, 0.012, swing(0.1), push)
+    for seed, name in enumerate(("fit_0", "fit_1", "fit_2", "select", "verify")):
+        log = record(machine, 71 + seed, 2.5)
+        joint = {k: log.channels[f"joint:wheel:{n}"].values for k, n in (("q", "pos"), ("v", "vel"))}
+        np.savez(folder / f"{name}.npz", t=log.time, u=log.controls["ctrl:motor"], **joint)
+    (folder / "wheel.xml").write_text(WHEEL.format(known=0.01))
+    (folder / "mapping.yaml").write_text(MAPPING)
+    told = io.StringIO()
+    report = close_loop(folder / "mapping.yaml", folder / "out", jobs=1, console=Console(file=told, width=500))
+    return Closed(folder / "out", report, told.getvalue(), order, size)
+
+
+def test_the_law_is_a_proposal_and_no_claim(closed: Closed) -> None:
+    report = closed.report
+    assert report["verdict"] == "unexplained"
+    assert report["effects"] == []
+    assert [p["id"] for p in report["proposals"]] == ["law_harmonic:wheel"]
+    assert report["proposals"][0]["parameters"]["order"]["value"] == pytest.approx(closed.order, abs=0.02)
+    left = report["unexplained"]
+    assert (left["coordinate"], left["where"]) == ("joint:wheel:pos", "joint:wheel")
+    assert left["description"].startswith(f"looks like f(q_wheel): a torque on wheel that repeats {closed.order} times")
+    assert left["nearest"] == "coulomb:wheel"
+    assert left["nearest_share"] < 0.5
+    assert f"the nearest named effect, coulomb:wheel, explains {left['nearest_share']:.0%}" in left["description"]
+    chi2 = report["chi2"]
+    assert chi2["extended"] < 0.1 * chi2["calibrated"]
+    assert json.loads((closed.out / "report.json").read_text())["proposals"] == report["proposals"]
+
+
+def test_console_and_page_say_so(closed: Closed) -> None:
+    assert "UNEXPLAINED at joint:wheel:pos: looks like f(q_wheel)" in closed.said
+    page = (closed.out / "report.html").read_text()
+    for text in ("law_harmonic:wheel", "a proposed law", "By degree of freedom", "over the position of wheel"):
+        assert text in page
+    assert "over the speed of wheel" in page
+    assert "with the proposed law added" in page
+
+
+def test_effects_yaml_carries_it_marked_as_a_proposal(closed: Closed) -> None:
+    (row,) = yaml.safe_load((closed.out / "effects.yaml").read_text())["effects"]
+    assert row["proposal"] is True
+    law, theta = from_row(row)
+    assert law.id == "law_harmonic:wheel"
+    assert np.hypot(theta[0], theta[1]) == pytest.approx(closed.size, rel=0.05)
+    assert theta[2] == pytest.approx(closed.order, abs=0.02)
+
+
+def test_a_law_never_makes_a_verdict_explained() -> None:
+    fine = SimpleNamespace(chi2=lambda stage: 1.0, null=np.array([0.99, 1.0, 1.01]))
+    assert verdict(fine, 0, False) == "nothing missing"
+    assert verdict(fine, 1, False) == "explained"
+    assert verdict(fine, 0, True) == "unexplained"
+    assert verdict(fine, 1, True) == "partly explained"
+
+
+def test_even_without_a_law_the_worst_place_is_named() -> None:
+    columns = SimpleNamespace(place=("joint:a", "joint:b"), group=("joint angle", "joint speed"))
+    problem = SimpleNamespace(mask=np.ones((5, 2), bool), columns=columns)
+    v = SimpleNamespace(problem=problem, white={"extended": np.tile([1.0, 3.0], (5, 1))})
+    last = SimpleNamespace(ranking=[{"id": "lag:m", "generic": False, "share": 0.12}], reason="too small")
+    found = SimpleNamespace(rounds=[last], rest=SimpleNamespace(dropped=[], scanned=None))
+    left = unexplained(v, found, SimpleNamespace(effects=(), model=None), [])  # pyright: ignore[reportArgumentType]
+    assert left["where"] == "joint:b"
+    assert left["coordinate"] == "joint:b (joint speed)"
+    assert left["description"].startswith("largest share of the remaining misfit: 90%; too small; the nearest named")
+    assert (left["nearest"], left["nearest_share"]) == ("lag:m", 0.12)
+
+
+class _Alike:
+    """An arena in which every candidate explains the data as well as every other."""
+
+    leftover, blocks, rng, base = 0.0, (np.zeros(1, int),) * 2, None, np.ones(1)
+    fit_data = SimpleNamespace(problem=SimpleNamespace(rough=False))
+    current = SimpleNamespace(plant=SimpleNamespace(effects=()), x=np.zeros(0))
+
+    def __getattr__(self, name: str) -> Any:
+        return {"worth": True, "plausible": True, "told_apart": True, "ties": True, "unexplained": 0.0}.get(name)
+
+    def enter(self, picks: list) -> Any:
+        plant = SimpleNamespace(effects=(picks[0].effect,))
+        return SimpleNamespace(
+            fitted=SimpleNamespace(plant=plant, x=np.zeros(1)), total=1.0, gain=1.0, fit_gains=np.ones(1)
+        )
+
+    def new(self, j: Any) -> list:
+        return list(j.fitted.plant.effects)
+
+
+@pytest.mark.parametrize(
+    ("families", "claimed"), [(("lag", "gain", "payload"), True), (("lag", "gain", "payload", "wind"), False)]
+)
+def test_more_than_three_families_that_do_alike_are_no_claim(families: tuple, claimed: bool, monkeypatch) -> None:
+    """Pretend arena, real contest: only the number of families that tie differs."""
+    arena: Any = _Alike()
+    for name in ("worth", "plausible", "told_apart", "ties"):
+        setattr(arena, name, lambda *a: True)
+    arena.unexplained, arena.say, arena.likelier = (lambda f: 0.0), (lambda t: None), (lambda j: True)
+    arena.label = lambda j: j.fitted.plant.effects[0].id
+    arena.row = lambda j: {"id": arena.label(j), "generic": False}
+    arena.judge = arena.enter_again = lambda j: j
+    arena.sharper = lambda fitted: arena
+    arena.enter_apart = lambda *a: None
+    monkeypatch.setattr(Contest, "_psi_alone", lambda self, best: None)
+    monkeypatch.setattr(rounds, "contains", lambda law, plain: False)
+    effect = lambda f: SimpleNamespace(id=f"{f}:x", family=f, where=("x",), place="x", simpler=(), generic=False)  # noqa: E731
+    screened: Any = [SimpleNamespace(effect=effect(f), gain=1.0) for f in families]
+    outcome, best = Contest(arena, SimpleNamespace(chance=lambda *a: {}), screened, 8, 0.02).hold()  # pyright: ignore[reportArgumentType]
+    assert (best is not None) == claimed == bool(outcome.accepted)
+    assert ("4 effects explain it alike" in outcome.reason) != claimed
