@@ -5,7 +5,7 @@
 # The first of these that is 3.11 or later makes the virtual environment; override with `make setup PYTHON=...`.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
   $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
-EXTRAS := measured,rl,sb3,test,sysid
+EXTRAS := measured,ros,px4,minari,rl,sb3,test,sysid
 BIN := .venv/bin
 STAMP := .venv/.installed
 

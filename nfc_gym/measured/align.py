@@ -76,6 +76,7 @@ class Alignment:
       clock: what those times are.
       resampled: what was done to the other streams.
       rates: measured columns that are NaN in some rows, in gaps or between a slow sensor's samples -> Hz of those.
+      ahead: s by which the stamps of a stream lie after its receipt, if they do, which two right clocks cannot show.
       cut: s that were cut off at the start and at the end, as some stream does not reach there.
       cutters: the streams that decided where.
     """
@@ -85,6 +86,7 @@ class Alignment:
     clock: str
     resampled: tuple[Resampled, ...]
     rates: dict[str, float]
+    ahead: dict[str, float]
     cut: tuple[float, float]
     cutters: tuple[str, str]
 
@@ -138,7 +140,10 @@ def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
             told = Resampled(owner.name, owner.clock if kind == "stamps" else "receive time", use.how, **report)
             done[owner.name, use.how] = max(done.get((owner.name, use.how), told), told, key=lambda r: r.missing)
     clock = base.clock if kind == "stamps" else "receive time"
-    return Alignment(table, base.name, clock, tuple(done.values()), rates, cut, cutters)
+    used = [base, *others.values()] if kind == "stamps" else []
+    lead = {s.name: float(np.median(s.stamps - s.received)) * 1e-9 for s in used}
+    ahead = {name: seconds for name, seconds in lead.items() if seconds > 0}
+    return Alignment(table, base.name, clock, tuple(done.values()), rates, ahead, cut, cutters)
 
 
 def _require_present(streams: Streams, names: Sequence[str]) -> None:
@@ -169,7 +174,7 @@ def _single(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
             f"name one of {', '.join(clocks[:8])}"
         )
     name = "" if base is None else base.name
-    return Alignment(dict(streams), name, time, (), {}, (0.0, 0.0), ("", ""))
+    return Alignment(dict(streams), name, time, (), {}, {}, (0.0, 0.0), ("", ""))
 
 
 def _overlap(

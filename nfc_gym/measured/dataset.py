@@ -113,8 +113,13 @@ def load(path: Path | str) -> Dataset:
 def assemble(mapping: Mapping, path: Path, sources: list[Source], logs: list[Log]) -> Dataset:
     """Divide logs that were read into splits; raises `InputError` where the rule cannot be followed."""
     division = divide(mapping.split, sources, logs)
-    files = tuple(s.path for s in sources)
+    files = tuple(dict.fromkeys(file for s in sources for file in _files(s.path)))
     return Dataset(mapping, path, division.logs, division.folds, division.independent, files)
+
+
+def _files(log: Path) -> list[Path]:
+    """A log's file, or those of its folder."""
+    return sorted(f for f in log.rglob("*") if f.is_file()) if log.is_dir() else [log]
 
 
 def read_log(mapping: Mapping, source: Source) -> Reading:

@@ -148,7 +148,7 @@ class RolloutProblem(Problem):
             for name in ("qpos_sd", "qvel_sd")
         ]
 
-        def rows(log: Log, name: str, at: Array) -> Array:
+        def rows(log: Log, name: str, at: NDArray[np.intp]) -> Array:
             channel = log.channels[name]
             values = channel.values.reshape(len(log), -1)[at]
             return values if channel.mask is None else np.where(channel.mask[at][:, None], values, np.nan)

@@ -9,6 +9,7 @@ from nfc_gym.measured.findings import Severity, Suspicion
 
 MANY_MISSING = 0.05  # share of rows in gaps from which on a stream is doubtful
 LATE = 1e-3  # s; commands that come so much later than they were sent look like a delay of the machine
+AHEAD = 1e-3  # s; stamps that lie so much after their receipt are of another clock
 CUT = 1.0  # s that are cut off at an end, from which on it is told as a warning
 
 
@@ -25,6 +26,13 @@ def stream_notes(alignment: Alignment) -> Iterator[Suspicion]:
                 f"its commands wait {1e3 * r.late:.2g} ms on average for the next row of {alignment.base}, which will "
                 "look like a delay of the machine",
                 f"name {r.stream}.time, or that of a faster stream, as the time column",
+            )  # fmt: skip
+    for name, seconds in alignment.ahead.items():
+        if seconds > AHEAD:
+            yield Suspicion(
+                "warning", f"streams.{name}", "ahead",
+                f"stamped {1e3 * seconds:.3g} ms after it was received: its sender's clock is ahead by that or more",
+                f"set the clocks, or name {alignment.base}.received as the time column; nothing was shifted",
             )  # fmt: skip
     start, end = alignment.cut
     if start or end:

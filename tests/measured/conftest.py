@@ -76,6 +76,12 @@ def columns(seed: int = 0, seconds: float = 4.0, rate: float = 100.0) -> dict[st
     }
 
 
+@pytest.fixture(scope="session")
+def machine() -> str:
+    """The model."""
+    return MODEL
+
+
 Spoil = Callable[[dict[str, np.ndarray]], None]
 Build = Callable[..., Path]
 

@@ -60,7 +60,7 @@ def test_episodes_are_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         np.testing.assert_allclose(table["actions"][:, 0], 0.1 * np.arange(7), rtol=1e-6)
         np.testing.assert_array_equal(table["time"], 0.5 + 0.02 * np.arange(7))
         assert set(table) >= {"rewards", "terminations", "truncations"}
-    with pytest.raises(InputError, match="no episode 'episode_9'; there are episode_0 to episode_2"):
+    with pytest.raises(InputError, match="no episode 'episode_9'; there are 3, from episode_0 on"):
         read_table(root, "episode_9")
 
 
@@ -97,6 +97,7 @@ channels:
     data = load(tmp_path / "mapping.yaml")
     assert [log.name for log in data.logs] == [f"test-v0/episode_{i}" for i in range(3)]
     assert sorted(data.splits.values()) == ["fit", "select", "verify"]
+    assert {file.name for file in data.files} == {"main_data.hdf5", "metadata.json"}
     np.testing.assert_allclose(data.logs[0].channels["joint:x:pos"].values, np.cos(0.02 * np.arange(60)), rtol=1e-6)
 
 

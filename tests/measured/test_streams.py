@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import MODEL
 from writers import NS, START, Messages, typestore, write_bag
 
 from nfc_gym.measured.checks import check
@@ -83,7 +82,7 @@ def record(
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Any:
+def dataset(tmp_path_factory: pytest.TempPathFactory, machine: str) -> Any:
     """A mapping, edited, of three bags recorded in a certain way; each way is recorded once."""
     made: dict[Any, Path] = {}
 
@@ -98,7 +97,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Any:
             assert old in text
             text = text.replace(old, new)
         shutil.copytree(made[key], folder, dirs_exist_ok=True)
-        (folder / "machine.xml").write_text(MODEL)
+        (folder / "machine.xml").write_text(machine)
         (folder / "mapping.yaml").write_text(text)
         return folder / "mapping.yaml"
 
@@ -149,6 +148,7 @@ def test_a_clock_offset_is_found_with_its_number_and_nothing_is_shifted(tmp_path
     assert "after body:base:quat" in finding.message
     assert "nothing was shifted" in finding.message
     assert "sensor_delay:sensor:gyro" in finding.advice
+    assert "streams./imu: in 3 of 3 logs, first run_0: stamped 12.3 ms after it was received" in warnings
     assert "error" not in warnings
     log = load(path).logs[0]
     np.testing.assert_allclose(log.channels["sensor:gyro"].values[:, 2], yaw_rate(log.time + 0.2 - 0.0123), atol=6e-2)

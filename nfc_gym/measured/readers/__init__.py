@@ -50,5 +50,5 @@ for _suffix in (".db3", ".mcap", ".bag"):
     register_reader(_suffix, read_bag, selective=True)
 register_folder("metadata.yaml", read_bag, selective=True)
 register_parts(".hdf5", episodes, read_episode)
-for _marker in ("metadata.json", "data/metadata.json"):
+for _marker in ("main_data.hdf5", "data/metadata.json"):
     register_folder(_marker, read_episode, episodes)

@@ -1,10 +1,10 @@
 """Minari data sets, by `minari`: each episode is a log.
 
-A data set is the folder that holds `metadata.json` (or the one above it, whose `data` folder does), or the `.hdf5` file
-in it. Columns of an episode of T steps: `observations` (T, k) and `actions` (T, k) with entries `observations[5]`;
-of Dict and Tuple spaces `observations.<key>`, `actions.0`; `rewards`, `terminations`, `truncations`, `infos.<key>`.
-Row i holds the observation that action i answers to, so the episode's last observation, which no action follows, is
-left out. Episodes of one step are left out.
+A data set is its folder, the folder `data` in it, or the `.hdf5` file in that. Columns of an episode of T steps:
+`observations` (T, k) and `actions` (T, k) with entries `observations[5]`; of Dict and Tuple spaces
+`observations.<key>`, `actions.0`; `rewards`, `terminations`, `truncations`, `infos.<key>`. Row i holds the observation
+that action i answers to, so the episode's last observation, which no action follows, is left out. Episodes of one step
+are left out.
 
 `time` is `infos.time` where that was recorded, else the row times the environment's control interval `dt`, for which
 the environment must be registered here; its own program is run, never one that the data set names.
@@ -42,12 +42,12 @@ def episodes(path: Path) -> tuple[str, ...]:
 
 def read_episode(path: Path, part: str) -> dict[str, NDArray[Any]]:
     """One episode's columns; `part` is one of `episodes(path)`."""
-    names = episodes(path)
-    if part not in names:
-        raise InputError(f"{path}: no episode {part!r}; there are {names[0]} to {names[-1]}")
     data = _open(path)
+    there = {_PART.format(i): int(i) for i in data.episode_indices}
+    if part not in there:
+        raise InputError(f"{path}: no episode {part!r}; there are {len(there)}, from {_PART.format(0)} on")
     with parsing(path):
-        episode = next(iter(data.storage.get_episodes([int(part.removeprefix(_PART.format("")))])))
+        episode = next(iter(data.storage.get_episodes([there[part]])))
         steps = len(episode["rewards"])
         keys = ("observations", "actions", "rewards", "terminations", "truncations", "infos")
         leaves = [leaf for key in keys for leaf in _leaves(key, episode[key])]
@@ -82,6 +82,7 @@ def _open(path: Path) -> Any:
         raise InputError(f"{folder / 'metadata.json'}: not of a Minari data set, as it lacks {', '.join(lacking)}")
     if metadata["data_format"] == "hdf5":
         needed(path, "h5py", "minari")
+        needed(path, "PIL", "minari")
     with parsing(path):
         return minari.MinariDataset(folder)
 

@@ -1,6 +1,6 @@
 """Which reader opens which file: by suffix, or by what a folder holds; one file may hold several logs."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.core import InputError
+from nfc_gym.core import InputError, NfcError
 from nfc_gym.measured.readers.streams import Streams
 
 Table = dict[str, NDArray[Any]]
@@ -74,7 +74,8 @@ def log_parts(path: Path) -> tuple[str, ...]:
     if entry is None or entry.parts is None:
         return ("",)
     _require(path)
-    return entry.parts(path)
+    with parsing(path):
+        return entry.parts(path)
 
 
 def read_table(path: Path, part: str = "", names: Collection[str] | None = None) -> Table:
@@ -98,9 +99,10 @@ def read_table(path: Path, part: str = "", names: Collection[str] | None = None)
         )
     _require(path)
     arguments = ((part,) if entry.parts else ()) + ((names,) if entry.selective else ())
-    table = entry.read(path, *arguments)
-    if not isinstance(table, Streams):
-        table = {name: _as_seconds(np.asarray(values)) for name, values in table.items()}
+    with parsing(path):
+        table = entry.read(path, *arguments)
+        if not isinstance(table, Streams):
+            table = {str(name): _as_seconds(np.asarray(values)) for name, values in table.items()}
     if not table:
         raise InputError(f"{path}: the file holds no column")
     return table
@@ -153,11 +155,11 @@ def needed(path: Path, module: str, extra: str) -> Any:
 
 
 @contextmanager
-def parsing(path: Path, advice: str = "copy it again, or leave it out of `logs`"):
+def parsing(path: Path, advice: str = "copy it again, or leave it out of `logs`") -> Iterator[None]:
     """Around a foreign parser: it trips over damaged files in every way there is, and each becomes one `InputError`."""
     try:
         yield
-    except InputError:
+    except NfcError:
         raise
     except OSError as e:
         if e.errno is not None and e.filename is not None:  # the operating system's refusal, not the file's content

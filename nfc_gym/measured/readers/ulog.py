@@ -43,12 +43,12 @@ def read_ulog(path: Path) -> Streams:
         raise broken(path, "it holds bytes that are no message", _ADVICE)
     if not log.has_data_appended:
         _require_whole(path)
-    if any("timestamp" not in data.data for data in log.data_list):
-        raise broken(path, "a topic has no timestamps", _ADVICE)
-    streams = [_stream(data) for data in log.data_list]
+    timed = [data for data in log.data_list if "timestamp" in data.data]
+    left_out = {data.name: "it has no timestamp" for data in log.data_list if "timestamp" not in data.data}
+    streams = [_stream(data) for data in timed]
     if not streams:
         raise InputError(f"{path}: no topic was logged; log some (SDLOG_MODE, SDLOG_PROFILE), or leave the file out")
-    return Streams(streams, constants={f"parameters.{k}": v for k, v in log.initial_parameters.items()})
+    return Streams(streams, left_out, {f"parameters.{k}": v for k, v in log.initial_parameters.items()})
 
 
 def _require_whole(path: Path) -> None:
