@@ -10,7 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales, actuator_names, index, joint_dofs
+from nfc_gym.physics.effects.base import (
+    Array,
+    Context,
+    Effect,
+    Forces,
+    Param,
+    Scales,
+    actuator_names,
+    index,
+    joint_dofs,
+)
 from nfc_gym.physics.effects.drive import on_scalar, plain
 from nfc_gym.physics.effects.hysteresis import excursion
 from nfc_gym.physics.effects.places import angle_unit, joint_places, sized, with_units
@@ -69,11 +79,12 @@ class Drive:
 class Backlash(Effect):
     """The drive turns freely through `gap` before its force reaches the joint.
 
-    Where the drive's force changes sign its rotor leaves one flank and crosses the play under that force, its inertia
-    and the joint's own motion; until it lies against the other flank the joint coasts. The drive's force then acts for
-    the rest of that step. The rotor is taken as light: what it hits the flank with is lost, and while both touch the
-    joint moves as the model says. The law thus only withholds the drive's force and adds no energy. The actuator's law
-    (a servo's position) is read at the joint. Nordin and Gutman, Automatica 38 (2002) 1633-1649, survey such models.
+    Where the force between rotor and joint (the drive's, less what the rotor's own inertia takes) changes sign, the
+    rotor leaves one flank and crosses the play; meanwhile the joint coasts, without the rotor's inertia as far as it is
+    in the joint's `armature`. Where they meet again they go on together (a plastic impact): the momentum that the drive
+    gave its rotor arrives late but whole, and the drive pushes for the rest of that step. What is lost is the energy of
+    the impact. Two-mass models of this kind: Nordin and Gutman, Automatica 38 (2002) 1633-1649. The actuator's law (a
+    servo's position) is read at the joint, whose acceleration is that of the last step.
 
     `rotor` is not fitted: it is the joint's `armature`, or a tenth of the joint's inertia where the model has none.
     The gap is known to the same factor as the rotor is, since the time to cross it goes with their product.
@@ -81,7 +92,7 @@ class Backlash(Effect):
 
     family = "backlash"
     summary = "Backlash: dead travel between drive and joint"
-    MODULATES = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+    MODULATES = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_armature")
     PARAMS = (
         Param("gap", "rad", 0.0, 1.0, probes=(0.01, 0.05)),
         Param("rotor", "kg m^2", 1e-12, 1e6, probes=(0.01,), shape=True),
@@ -100,35 +111,49 @@ class Backlash(Effect):
     def rest(self, ctx: Context, theta: Array) -> Any:
         """The rotor lies against the flank that the drive pushes."""
         v, half = ctx.v[..., self.drive.v], theta[..., 0:1] / 2
-        return np.sign(self.drive.torque(ctx)) * half, np.array(v), np.ones_like(v)
+        return np.sign(self.drive.torque(ctx)) * half, np.array(v), np.ones_like(v), np.zeros_like(v), np.array(v)
 
     def follow(self, ctx: Context, theta: Array, memory: Any) -> Any:
-        """(place of the rotor in the play, its speed, share of the step through which it pushes), (..., n) each."""
-        place, speed, share = memory
-        v, half, dt = ctx.v[..., self.drive.v], theta[..., 0:1] / 2, ctx.dt
-        torque = self.drive.torque(ctx)
-        side, pull = np.sign(torque), np.abs(torque) / theta[..., 1:2]
-        # towards the flank that the drive pushes: speed against the joint, and the way there
+        """(place of the rotor in the play, its speed, share of the step for which it pushes, impulse with which it
+        hits, the joint's speed), (..., n) each."""
+        place, speed, share, hit, before = memory
+        v, half, rotor, dt = ctx.v[..., self.drive.v], theta[..., 0:1] / 2, theta[..., 1:2], ctx.dt
+        own = self.drive.torque(ctx) / rotor
+        pull = own - np.where(hit == 0, (v - before) / dt, 0.0)  # the rotor's acceleration as the joint sees it
+        side, pull = np.sign(pull), np.abs(pull)
+        # speed and way towards the flank that the drive pushes, as the joint sees it
         ahead, way = side * np.where(share > 0, 0.0, speed - v), np.maximum(half - side * place, 0.0)
-        back = (ahead < 0) & (way + ahead**2 / np.maximum(2 * pull, 1e-300) > 2 * half)  # it hits the other flank
+        beyond = ahead**2 - 2 * pull * (2 * half - way)
+        back = (ahead < 0) & (beyond > 0)  # it hits the other flank first
+        kick = np.where(back, -np.sqrt(np.maximum(beyond, 0.0)), 0.0)
         ahead, way = np.where(back, 0.0, ahead), np.where(back, 2 * half, way)
-        root = np.sqrt(ahead**2 + 2 * pull * way)
+        root = np.sqrt(ahead**2 + 2 * pull * way)  # speed with which it arrives
         sooner = 2 * way / np.where(ahead + root > 0, ahead + root, 1.0)
         later = (root - ahead) / np.maximum(pull, 1e-300)
-        arrival = np.where(way == 0, np.where(ahead < 0, later, 0.0), np.where(ahead >= 0, sooner, later))
+        arrival = np.where(ahead < 0, later, sooner)
         arrival = np.where((way > 0) & (root == 0), np.inf, arrival)  # nothing moves it
         pushing = np.where(arrival < dt, 1 - arrival / dt, 0.0)
-        # unless it arrives, through the step: in units of the flank's side, or as it drifts where no force acts
+        kick = side * np.where(pushing > 0, kick + root, kick)
+        # on its way through the step, or adrift where no force acts
         drift = np.where(side == 0, speed - v, side * ahead)
         moved = np.where(back, -side * half, place) + dt * (drift + dt / 2 * side * pull)
         inside = np.minimum(np.maximum(moved, -half), half)
-        free = np.where(moved == inside, v + drift + dt * side * pull, v)
-        return np.where(pushing > 0, side * half, inside), np.where(pushing > 0, v, free), pushing
+        stopped = (side == 0) & (moved != inside)
+        kick = np.where(stopped, drift, kick)
+        free = np.where(stopped, v, v + drift + dt * own)
+        met = pushing > 0
+        return np.where(met, side * half, inside), np.where(met, v, free), pushing, rotor * kick, np.array(v)
 
     def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
-        share = ctx.memory[2][..., None]
-        for name in self.MODULATES:
-            fields[name][..., self.rows, :] *= share
+        share = ctx.memory[2]
+        for name in self.MODULATES[:3]:
+            fields[name][..., self.rows, :] *= share[..., None]
+        armature = fields["dof_armature"]
+        whole = armature[..., self.drive.v]
+        armature[..., self.drive.v] = whole - np.where(share > 0, 0.0, np.minimum(whole, theta[..., 1:2]))
+
+    def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        out.qfrc[..., self.drive.v] += ctx.memory[3] / ctx.dt
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
