@@ -21,7 +21,7 @@ from nfc_gym.physics.rollout import Plant
 
 CLOCK = "impulse:clock"  # physics steps since the segment began
 _BLOCKS = 8  # of time in a segment
-_WORK = 400_000  # physics steps of all roll-outs of one tensor; more segments than that allows are thinned evenly
+_WORK = 250_000  # physics steps of all roll-outs of one tensor; more segments than that allows are thinned evenly
 _LEAST = 24  # segments that such a thinning leaves
 
 

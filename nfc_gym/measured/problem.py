@@ -188,7 +188,7 @@ class RolloutProblem(Problem):
         """The measured states along each block."""
         kit, out = self._kit, []
         straight = np.zeros(kit.model.nq, bool)
-        observed, known = kit.states[0].observed, (kit.states[0].qpos_sd > 0).any(0)
+        observed, known = kit.states[0].observed, np.any(kit.states[0].qpos_sd > 0, axis=0)
         for j in range(kit.model.njnt):
             q, d, kind = int(kit.model.jnt_qposadr[j]), int(kit.model.jnt_dofadr[j]), int(kit.model.jnt_type[j])
             if kind == int(mujoco.mjtJoint.mjJNT_FREE):  # of a base whose velocity alone is measured no place is known

@@ -247,7 +247,7 @@ def test_maps_of_the_misfit() -> None:
     page = render(example(), pictures())
     text = read(page).text
     assert "over the speed of hinge" in text
-    assert wording.percent(0.6) in text
+    assert wording.percent(0.6) in page
     assert page.count("3.00 × noise") == 1  # the cell of a mean square of 9; bare cells are not drawn
     assert "By degree of freedom" not in read(render(example(), {**pictures(), "maps": {}})).text
 
