@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -15,14 +15,18 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.log import Log
 from nfc_gym.measured import verdict as say
 from nfc_gym.measured.arena import Data
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
+from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.details import details
 from nfc_gym.measured.export import corrected, effects_of, pack, unpack
+from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.identify import Stakes, table
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
@@ -36,6 +40,7 @@ from nfc_gym.measured.stages import Stages, digest, write_whole
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
 _REPLICAS = 6
+_LOOK = 60  # segments, of those to fit and to select on, that the identifiability table is made from
 
 
 @dataclass
@@ -178,7 +183,8 @@ def _fold(
     select = bench.problem(selecting, most=max(40, int(_WORK / steps)))
     found = _search(run, fitting, work, select)
     final = _final(run, found, whole)
-    report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole)
+    known = _identify(run, final[1], [*fitting, *selecting], [work, select])
+    report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole, known)
     report["seconds"] = round(time.monotonic() - began, 1)
     _write(out, bench, final, report)
     tell(
@@ -244,8 +250,27 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
     return out[0], out[1]
 
 
+def _identify(run: _Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem]) -> list[dict[str, Any]]:
+    """The identifiability table: what the logs that the search worked with could have shown."""
+    run.say("what these logs could have shown")
+    bench, plant = run.bench, fitted.plant
+    problem = bench.problem(logs, most=_LOOK)
+    sigma = problem.covariance(plant, fitted.x)
+    lens = Lens(problem, metric(problem, sigma, slack(problem, sigma, plant, fitted.x)), plant, fitted.x)
+    count = sum(int(p.mask.sum()) for p in searched)
+    stakes = Stakes(count, dispersion(fitted), Options().worth, sum(map(len, searched)) / len(problem))
+    return table(lens, candidates(bench, logs), stakes)
+
+
 def _report(
-    run: _Run, dataset: Dataset, fold: Fold, found: Found, final: tuple[Fit, Fit], problem: Problem, whole: Problem
+    run: _Run,
+    dataset: Dataset,
+    fold: Fold,
+    found: Found,
+    final: tuple[Fit, Fit],
+    problem: Problem,
+    whole: Problem,
+    known: list[dict[str, Any]],
 ) -> dict[str, Any]:
     calibrated, extended = final
     rng = np.random.default_rng(run.seed)
@@ -273,7 +298,7 @@ def _report(
             "null_95": say.null_bound(v),
             "extended_over_calibrated_95": say.gain_interval(v, rng),
         },
-        "identifiability": say.identifiability(found),
+        "identifiability": known,
         "rounds": [r.__dict__ for r in found.rounds],
         "noise": _noise(run.bench, dataset, fold),
         "details": details(run.bench, v, models, dataset.of("verify", fold)),
