@@ -29,17 +29,17 @@ class Lens:
       problem: S blocks of m numbers.
       under: its metric.
       plant, x: the model, with the effects that are accepted.
-      weighted: whether numbers far off the model count for less, as they do in a fit.
+      weight: (S, m) of each number; None lets numbers far off the model count for less, as they do in a fit.
 
     Attributes:
       tangent: (S, m, f) columns of the free parameters, scaled as in a fit (`box`).
     """
 
-    def __init__(self, problem: Problem, under: Metric, plant: Plant, x: Array, weighted: bool = True) -> None:
+    def __init__(self, problem: Problem, under: Metric, plant: Plant, x: Array, weight: Array | None = None) -> None:
         self.problem, self.under, self.plant, self.x = problem, under, plant, x
         residual = problem.residual(plant, x[None])
         self.base, self.stable = under.whiten(residual)[0], np.isfinite(residual[0]).all(-1)
-        self.weight = loss_weight(self.base) if weighted else np.ones_like(self.base)
+        self.weight = loss_weight(self.base) if weight is None else weight
         limits, size = box(plant), COARSE if problem.rough else FINE
         slopes = jacobian(problem, under, limits, x, self.base, np.arange(len(limits.scale)), size)
         self.tangent = np.where(self.stable[:, None, None], self.weight[..., None] * slopes, 0.0)
@@ -50,14 +50,30 @@ class Lens:
         Blocks that such an effect makes unstable count as unchanged: how far off they are is arbitrary.
         """
         plant = self.plant.with_effects([*self.plant.effects, effect])
-        return self.moved(plant, np.concatenate([np.repeat(self.x[None], len(thetas), 0), thetas], 1))
-
-    def moved(self, plant: Plant, x: Array) -> Array:
-        """(S, m, r) change to other models x (r, size) of a plant."""
+        x = np.concatenate([np.repeat(self.x[None], len(thetas), 0), thetas], 1)
         residual = self.problem.residual(plant, x)
         usable = np.isfinite(residual).all(-1, keepdims=True) & self.stable[:, None]
         change = np.where(usable, self.weight * (self.under.whiten(residual) - self.base), 0.0)
         return np.moveaxis(change, 0, -1)
+
+    def less(self, effect: Effect) -> tuple["Lens", Array]:
+        """The same data seen from the model less one of its effects, and that effect's fitted parameters (k,)."""
+        psi, thetas = self.plant.split(self.x)
+        pairs = list(zip(self.plant.effects, thetas, strict=True))
+        plant = self.plant.with_effects([e for e, _ in pairs if e is not effect])
+        x = np.concatenate([psi, *(t for e, t in pairs if e is not effect)])
+        return Lens(self.problem, self.under, plant, x, self.weight), next(t for e, t in pairs if e is effect)
+
+    @property
+    def fitted(self) -> Array:
+        """(S m, j) orthonormal basis of what the free parameters can imitate."""
+        return span(self.tangent.reshape(-1, self.tangent.shape[-1]), 1e-4)
+
+
+def free_names(plant: Plant) -> list[str]:
+    """Names of a plant's free parameters, in the order in which a fit has them."""
+    psi = [n for n, free in zip(plant.space.names, plant.space.free, strict=True) if free]
+    return [*psi, *(f"{p.name.replace('_', ' ')} of {e.id}" for e in plant.effects for p in e.params)]
 
 
 def realistic(effect: Effect) -> list[tuple[Array, Array]]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from nfc_gym.measured.box import box
+from nfc_gym.measured.fisher import free_names
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import loss_weight
 from nfc_gym.measured.wording import listed
@@ -65,7 +66,7 @@ def slides(fitted: Fit) -> list[Slide]:
     limits = box(fitted.plant)
     weight = loss_weight(fitted.white)
     jac = (weight[..., None] * fitted.jacobian).reshape(-1, fitted.jacobian.shape[-1])
-    names = _names(fitted)
+    names = free_names(fitted.plant)
     plant = fitted.plant
     ranges = (plant.chart(limits.high) - plant.chart(limits.low))[limits.free] / limits.scale
     ranges = np.where(np.abs(ranges) > 0, np.abs(ranges), 1.0)
@@ -106,12 +107,6 @@ def _sparse(basis: Array) -> list[Array]:
     block = basis[pivots[: basis.shape[1]]]
     reduced = np.linalg.solve(block.T, basis.T)
     return [row / np.linalg.norm(row) for row in reduced]
-
-
-def _names(fitted: Fit) -> list[str]:
-    space = fitted.plant.space
-    psi = [n for n, free in zip(space.names, space.free, strict=True) if free]
-    return [*psi, *(f"{p.name.replace('_', ' ')} of {e.id}" for e in fitted.plant.effects for p in e.params)]
 
 
 def said(fitted: Fit) -> list[str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import contains
 from nfc_gym.measured.contest import price
-from nfc_gym.measured.fisher import Lens, realistic, sized, span, without
+from nfc_gym.measured.fisher import Lens, free_names, realistic, sized, span, without
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
@@ -23,6 +23,7 @@ _SURE = 2.576  # standard deviations: 99.5 %, one-sided
 _TOLD = 3.92  # the contest's 2.5 % level (1.96) on a difference of gains d, which scatters by 2 sqrt(d)
 _SAME = 0.95  # share of the gain beyond which the contest lists a rival as equivalent
 _GONE = 0.03  # share of a column left below which the fitted parameters can imitate the effect
+_TRIES = 4  # columns with which a size is confirmed, at most
 _STRAIGHT = 1.25  # column over expected column, either way, up to which sizes scale
 
 
@@ -56,15 +57,19 @@ class _View:
     """One effect as the data see it.
 
     Attributes:
+      lens: the data, seen from the model without it.
       thetas: (d, k) realistic sizes, or the fitted one of an accepted effect.
       columns: (n, d) what they change.
       spans: (n, r) changes each, one array a shape and size of the law: together they span what it can imitate.
+      basis: (n, j) what the fitted parameters can imitate.
     """
 
+    lens: Lens
     effect: Effect
     thetas: Array
     columns: Array
     spans: list[Array]
+    basis: Array
     claimed: bool = False
 
 
@@ -91,41 +96,20 @@ def table(
       `linear`: whether a column at that size was as long as proportion says; the size is corrected by it either way;
       `claimed`: whether the effect is accepted.
     """
-    taken = {e.id for e in lens.plant.effects}
-    views = _accepted(lens)
+    views, taken, whole = [], {e.id for e in lens.plant.effects}, lens.fitted
+    for effect in lens.plant.effects:
+        before, theta = lens.less(effect)
+        views.append(_look(before, effect, [(theta[None], np.zeros((0, len(theta))))], before.fitted, True))
     for effect in candidates:
         if effect.id not in taken and not effect.generic:
             tick(effect)
-            views.append(_look(lens, effect))
-    flat = lens.tangent.reshape(-1, lens.tangent.shape[-1])
-    names = _names(lens)
-    whole = span(flat, 1e-4)
-    bases = {v.effect.id: span(flat[:, [n[0] is not v.effect for n in names]], 1e-4) for v in views if v.claimed}
-    found = [_detect(lens, v, bases.get(v.effect.id, whole), stakes) for v in views]
+            views.append(_look(lens, effect, realistic(effect), whole))
     rivals = [_imitations(v, whole) for v in views]
-    return [
-        _row(v, d, flat, names, views, rivals, bases.get(v.effect.id), stakes)
-        for v, d in zip(views, found, strict=True)
-    ]
+    return [_row(v, _detect(v, stakes), views, rivals, stakes) for v in views]
 
 
-def _accepted(lens: Lens) -> list[_View]:
-    """Accepted effects: what they change at the size that was fitted."""
-    out, at = [], len(lens.plant.space)
-    for effect in lens.plant.effects:
-        k = len(effect.params)
-        gone = lens.x.copy()
-        gone[at : at + k] = sized(effect, lens.x[at : at + k], 0.0)
-        change = -lens.moved(lens.plant, gone[None])
-        columns = change.reshape(-1, 1)
-        out.append(_View(effect, lens.x[None, at : at + k], columns, [columns], True))
-        at += k
-    return out
-
-
-def _look(lens: Lens, effect: Effect) -> _View:
-    """A candidate at all its realistic sizes, whole and parameter by parameter, in one batch."""
-    sets = realistic(effect)
+def _look(lens: Lens, effect: Effect, sets: list[tuple[Array, Array]], basis: Array, claimed: bool = False) -> _View:
+    """An effect at sets of sizes, whole and parameter by parameter, in one batch."""
     change = lens.columns(effect, np.concatenate([rows for pair in sets for rows in pair]))
     flat, at, columns, spans = change.reshape(-1, change.shape[-1]), 0, [], []
     for whole, rows in sets:
@@ -133,19 +117,24 @@ def _look(lens: Lens, effect: Effect) -> _View:
         columns.append(flat[:, at : at + len(whole)])
         spans.append(flat[:, at : at + count])
         at += count
-    return _View(effect, np.concatenate([whole for whole, _ in sets]), np.concatenate(columns, 1), spans)
+    thetas = np.concatenate([whole for whole, _ in sets])
+    return _View(lens, effect, thetas, np.concatenate(columns, 1), spans, basis, claimed)
 
 
-def _names(lens: Lens) -> list[tuple[Effect | None, str]]:
-    """(effect or None for psi, name) of each free parameter, in the order of the tangent's columns."""
-    space = lens.plant.space
-    psi = [(None, n) for n, free in zip(space.names, space.free, strict=True) if free]
-    return [*psi, *((e, f"{p.name} of {e.id}") for e in lens.plant.effects for p in e.params)]
+def _imitations(view: _View, basis: Array) -> list[Array]:
+    """(n, j) orthonormal bases of what an effect can imitate beyond the fitted parameters, one a shape of its law."""
+    return [span(without(columns, basis)) for columns in view.spans]
 
 
 @dataclass(frozen=True)
 class _Detected:
-    """The direction in which a candidate shows first: which, its column, the share left, its size, and a check."""
+    """The direction in which an effect shows first.
+
+    Attributes:
+      theta: (k,) its realistic size; column: (n,) what is left of its column; share: how much that is.
+      size: smallest size that is sure to be found, as a share of theta; infinite where bounds or psi forbid it.
+      ratio: length of a column at that size over the expected one.
+    """
 
     theta: Array
     column: Array
@@ -154,61 +143,43 @@ class _Detected:
     ratio: float
 
 
-def _detect(lens: Lens, view: _View, basis: Array, stakes: Stakes) -> _Detected:
-    """The smallest size that is sure to be found, as a share of `theta`; infinite where bounds or psi forbid it."""
-    left = without(view.columns, basis)
+def _detect(view: _View, stakes: Stakes) -> _Detected:
+    left = without(view.columns, view.basis)
     lengths, whole = np.linalg.norm(left, axis=0), np.linalg.norm(view.columns, axis=0)
-    needed = stakes.needed(len(view.effect.params))
-    first = _first(view.effect)
-    sizes = np.array([needed / max(v, 1e-12) for v in lengths])
+    needed, first = stakes.needed(len(view.effect.params)), _first(view.effect)
+    sizes = needed / np.maximum(lengths, 1e-12)
     within = [_fits(view.effect, t, s) for t, s in zip(view.thetas, sizes, strict=True)]
     away = np.abs(view.thetas[:, first] - view.effect.null[first]) * sizes
-    # Of several realistic sizes the one nearest to the threshold extrapolates least.
-    order = sorted(range(len(sizes)), key=lambda i: (not within[i], abs(np.log(sizes[i])) > 1.5, away[i]))
-    i = order[0]
+    # Of several realistic sizes those near the threshold extrapolate least; of these the one that shows first.
+    far = np.abs(np.log(sizes)) > 1.5
+    i = min(range(len(sizes)), key=lambda i: (not within[i], far[i], away[i]))
     share = float(lengths[i] / max(whole[i], 1e-12))
     theta, column = view.thetas[i], left[:, i]
     if not within[i] or share < _GONE:
         return _Detected(theta, column, share, np.inf, np.nan)
-    size, ratio = _checked(lens, view, theta, float(sizes[i]), basis, needed, float(lengths[i]))
+    size, ratio = _checked(view, theta, float(sizes[i]), needed, float(lengths[i]))
     return _Detected(theta, column, share, size, ratio)
 
 
-def _checked(
-    lens: Lens, view: _View, theta: Array, size: float, basis: Array, needed: float, length: float
-) -> tuple[float, float]:
-    """One more column at the size found: the size corrected by it, and its length over the one that was expected.
+def _checked(view: _View, theta: Array, size: float, needed: float, length: float) -> tuple[float, float]:
+    """Columns at the size found, which correct it until one is as long as needed; and how far off the first one was.
 
     Laws that bend (a dead zone, dry friction) make columns that grow with some other power of their size.
     """
-    try_at = sized(view.effect, theta, size)
-    if view.claimed:
-        at = lens.x.copy()
-        start = len(lens.plant.space)
-        for e in lens.plant.effects:
-            if e is view.effect:
-                at[start : start + len(e.params)] = try_at
-            start += len(e.params)
-        both = np.stack([at, _less(lens, view.effect)])
-        moved = lens.moved(lens.plant, both)
-        column = (moved[..., 0] - moved[..., 1]).reshape(-1)
-    else:
-        column = lens.columns(view.effect, try_at[None]).reshape(-1)
-    seen = float(np.linalg.norm(without(column, basis)))
-    ratio = seen / needed
-    power = np.log(seen / length) / np.log(size) if seen > 0 and abs(np.log(size)) > 0.1 else 1.0
-    corrected = size * (1 / max(ratio, 1e-3)) ** (1 / np.clip(power, 0.5, 2.0))
-    return (float(corrected) if _fits(view.effect, theta, corrected) else np.inf), ratio
-
-
-def _less(lens: Lens, effect: Effect) -> Array:
-    """The fitted parameter vector with one effect at null."""
-    out, at = lens.x.copy(), len(lens.plant.space)
-    for e in lens.plant.effects:
-        if e is effect:
-            out[at : at + len(e.params)] = sized(e, lens.x[at : at + len(e.params)], 0.0)
-        at += len(e.params)
-    return out
+    first, before = np.nan, (1.0, length)
+    for _ in range(_TRIES):
+        if not _fits(view.effect, theta, size):
+            return np.inf, first
+        column = view.lens.columns(view.effect, sized(view.effect, theta, size)[None]).reshape(-1)
+        seen = max(float(np.linalg.norm(without(column, view.basis))), 1e-3 * needed)
+        ratio = seen / needed
+        first = ratio if np.isnan(first) else first
+        step = np.log(size / before[0])
+        power = np.log(seen / before[1]) / step if abs(step) > 0.1 else 1.0
+        before, size = (size, seen), float(size * ratio ** (-1 / np.clip(power, 0.5, 2.0)))
+        if 1 / _STRAIGHT < ratio < _STRAIGHT:
+            break
+    return (size if _fits(view.effect, theta, size) else np.inf), first
 
 
 def _first(effect: Effect) -> int:
@@ -218,44 +189,38 @@ def _first(effect: Effect) -> int:
 
 def _fits(effect: Effect, theta: Array, share: float) -> bool:
     """Whether a size lies within the bounds of the effect's parameters."""
-    if not np.isfinite(share) or share > 1e4:
+    if not share < 1e4:
         return False
     at, room = sized(effect, theta, share), 1e-9 * (effect.high - effect.low)
     return bool(((at >= effect.low - room) & (at <= effect.high + room)).all())
 
 
-def _imitations(view: _View, basis: Array) -> list[Array]:
-    """(n, j) orthonormal bases of what an effect can imitate beyond the fitted parameters, one a shape of its law."""
-    return [span(without(columns, basis)) for columns in view.spans]
+def _worst_mimic(
+    view: _View, column: Array, views: Sequence[_View], rivals: Sequence[list[Array]]
+) -> tuple[str | None, float]:
+    """Who imitates a column (n,) best, and the cosine; a law that has this one as its special case is no rival."""
+    mimic, like, length = None, 0.0, float(np.linalg.norm(column))
+    for other, reaches in zip(views, rivals, strict=True):
+        if other is view or contains(other.effect, view.effect):
+            continue
+        reaches = _imitations(other, view.basis) if view.claimed else reaches
+        cosine = max(float(np.linalg.norm(reach.T @ column)) for reach in reaches) / length
+        if cosine > like:
+            mimic, like = other.effect.id, min(cosine, 1.0)
+    return mimic, like
 
 
 def _row(
-    view: _View,
-    found: _Detected,
-    tangent: Array,
-    names: Sequence[tuple[Effect | None, str]],
-    views: Sequence[_View],
-    rivals: Sequence[list[Array]],
-    own: Array | None,
-    stakes: Stakes,
+    view: _View, found: _Detected, views: Sequence[_View], rivals: Sequence[list[Array]], stakes: Stakes
 ) -> dict[str, Any]:
     effect, first = view.effect, _first(view.effect)
-    length = float(np.linalg.norm(found.column))
-    mimic, like = None, 0.0
-    for other, reaches in zip(views, rivals, strict=True):
-        # A law that has this one as its special case imitates it by being it: no alternative.
-        if other is view or contains(other.effect, effect) or length < 1e-9 or found.share < _GONE:
-            continue
-        reaches = reaches if own is None else _imitations(other, own)
-        cosine = max(float(np.linalg.norm(reach.T @ found.column)) for reach in reaches) / length
-        if cosine > like:
-            mimic, like = other.effect.id, cosine
-    like = min(like, 1.0)
-    seen = np.isfinite(found.size)
+    shown = float(np.linalg.norm(found.column)) > 1e-9
+    seen, gone = np.isfinite(found.size), found.share < _GONE
+    mimic, like = _worst_mimic(view, found.column, views, rivals) if shown and not gone else (None, 0.0)
     at = sized(effect, found.theta, found.size) if seen else found.theta
-    needed = stakes.needed(len(effect.params))
-    needed = (max(needed, length) if view.claimed else needed) * np.sqrt(stakes.repeats)
-    told = like**2 <= _SAME or needed * np.sqrt(1 - like**2) > _TOLD
+    length = stakes.needed(len(effect.params))
+    length = (max(length, float(np.linalg.norm(found.column))) if view.claimed else length) * np.sqrt(stakes.repeats)
+    told = like**2 <= _SAME or length * np.sqrt(1 - like**2) > _TOLD
     return {
         "id": effect.id,
         "smallest_detectable": float(abs(at[first] - effect.params[first].null)) if seen else None,
@@ -265,19 +230,18 @@ def _row(
         "detectable_share": found.share,
         "similarity": like,
         "angle": float(np.degrees(np.arccos(like))),
-        "absorbed_by": _absorber(view, tangent, names) if found.share < _GONE and length > 0 else None,
+        "absorbed_by": _absorber(view) if shown and gone else None,
         "at": {p.name: float(v) for p, v in zip(effect.params, at, strict=True)} if seen else {},
         "linear": bool(1 / _STRAIGHT < found.ratio < _STRAIGHT) if seen else None,
         "claimed": view.claimed,
     }
 
 
-def _absorber(view: _View, tangent: Array, names: Sequence[tuple[Effect | None, str]]) -> str | None:
+def _absorber(view: _View) -> str | None:
     """The fitted parameter that alone imitates an effect best."""
     column = view.columns[:, int(np.linalg.norm(view.columns, axis=0).argmax())]
-    if not np.linalg.norm(column) > 1e-9 or not tangent.shape[1]:
+    tangent = view.lens.tangent.reshape(len(column), -1)
+    if not tangent.shape[1]:
         return None
-    sizes = np.maximum(np.linalg.norm(tangent, axis=0), 1e-12)
-    cosines = np.abs(tangent.T @ column) / sizes
-    cosines[[n[0] is view.effect for n in names]] = -1.0
-    return names[int(cosines.argmax())][1]
+    cosines = np.abs(tangent.T @ column) / np.maximum(np.linalg.norm(tangent, axis=0), 1e-12)
+    return free_names(view.lens.plant)[int(cosines.argmax())]

@@ -30,6 +30,7 @@ from nfc_gym.measured.identify import Stakes, table
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.remarks import on_parameters
 from nfc_gym.measured.report import render, render_summary
 from nfc_gym.measured.rounds import Round
 from nfc_gym.measured.search import Found, Options, Search
@@ -191,6 +192,8 @@ def _fold(
         f"[bold]{report['verdict']}[/bold]: "
         + ("; ".join(e["sentence"] for e in report["effects"]) or "no effect claimed")
     )
+    for finding in report["findings"]:
+        tell(finding["text"])
     return report
 
 
@@ -281,13 +284,14 @@ def _report(
     verdict = say.verdict(v, len(extended.plant.effects), found.generic is not None)
     shares = say.excess_shares(v, problem, extended, models.calibrated)
     splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
+    parameters = say.parameter_rows(extended, nominal[1], whole)
     return {
         "schema": 1,
         "model": dataset.mapping.model_file,
         "fold": fold.name,
         "logs": splits,
         "independent_splits": dataset.independent_splits,
-        "parameters": say.parameter_rows(extended, nominal[1], whole),
+        "parameters": parameters,
         "effects": say.effect_rows(extended, found.rounds, whole, shares),
         "verdict": verdict,
         "unexplained": say.unexplained(v, found) if verdict in ("unexplained", "partly explained") else None,
@@ -299,6 +303,7 @@ def _report(
             "extended_over_calibrated_95": say.gain_interval(v, rng),
         },
         "identifiability": known,
+        "findings": on_parameters(extended, parameters),
         "rounds": [r.__dict__ for r in found.rounds],
         "noise": _noise(run.bench, dataset, fold),
         "details": details(run.bench, v, models, dataset.of("verify", fold)),
