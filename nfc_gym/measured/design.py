@@ -1,9 +1,8 @@
-"""Which of two motions tells more: how far apart rival explanations of the logs would come to lie.
+"""Which of many motions tells most: families of them first, then an optimiser on top of the best.
 
-Atkinson and Fedorov (1975), Biometrika 62, 57: the best experiment to tell models apart is the one in which the rival,
-refitted to it, misses most (T-optimality). Here the rival's parameters and psi are refitted to the present logs and the
-new ones together, in the linear approximation around realistic sizes (`fisher`). Where there is no rival the rival is
-psi alone, and what is asked is the smallest size that would be found.
+What is maximised is the distance at which rival explanations of the logs would come to lie (`distances`). Where there
+is no rival, the rival is psi alone, the truth has an effect at a realistic size, and what counts is how small it could
+be to be found.
 """
 
 import time
@@ -15,126 +14,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.measured.box import box
+from nfc_gym.measured.distances import Distances
 from nfc_gym.measured.experiment import Stage
-from nfc_gym.measured.fisher import Lens, left_over, realistic, sized, span, without
-from nfc_gym.measured.metric import Metric, metric
 from nfc_gym.measured.motions import FAMILIES, Family, Series, faded
-from nfc_gym.measured.problem import Problem
-from nfc_gym.physics.effects.base import Effect
-from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 _AMPLITUDES = (1.0, 0.5, 0.2)
 _BATCH = 8  # sequences rolled out at once
-_STEP = 0.2  # of the optimiser's first draws
+_STEP = 0.05  # of the optimiser's first draws
 _SHRINK = 4  # times smaller that all families are tried again if none stays within bounds
 
 
-@dataclass(frozen=True)
-class Base:
-    """A model in which some effect is missing, (plant, x); several questions may share one."""
-
-    plant: Plant
-    x: Array
-
-
-@dataclass(frozen=True)
-class Ask:
-    """One question: if `effect` at `theta` were at work in the base, would `rival` at `rows` pass for it?
-
-    Attributes:
-      theta: (k,) its realistic size.
-      rival, rows: the other explanation, (r, k') what it can change; None and nothing asks for psi alone.
-      needed: length of column at which the answer is sure, sigma.
-    """
-
-    base: Base
-    effect: Effect
-    theta: Array
-    rival: Effect | None
-    rows: Array
-    needed: float
-
-
-def mimicking(lens: Lens, column: Array, rival: Effect) -> Array:
-    """(r, k) parameter vectors of a rival about the size at which it imitates a column (n,) best."""
-    basis = lens.fitted
-    target = without(column, basis)
-    best, chosen, multiples = -1.0, None, np.zeros(0)
-    for whole, rows in realistic(rival):
-        thetas = rows if len(rows) else whole
-        left = without(lens.columns(rival, thetas).reshape(len(column), -1), basis)
-        like = float(np.linalg.norm(span(left).T @ target))
-        if like > best:
-            best, chosen = like, thetas
-            multiples = np.asarray(np.linalg.lstsq(left, target, rcond=1e-6)[0], np.float64)
-    assert chosen is not None
-    null = sized(rival, chosen[0], 0.0)
-    start = rival.chart(null)
-    moved = rival.unchart(start + multiples @ (rival.chart(chosen) - start))
-    together = np.clip(moved, rival.low, rival.high)[None]
-    return together if len(chosen) == 1 else np.concatenate([together, chosen])
-
-
 class Design:
-    """Questions, what the present logs answer, and what a new motion would add.
+    """Where sequences are tried and judged.
 
     Args:
-      asks: the questions.
+      distances: the questions.
       stage: where sequences are tried.
-      present: the logs at hand, and their metric; `repeats` as many of them as are looked at.
+      rivals: whether the questions are about rival explanations, each of which must be answered; else, about what
+        would show, on the whole.
     """
 
-    def __init__(self, asks: Sequence[Ask], stage: Stage, present: Problem, under: Metric, repeats: float) -> None:
-        self.asks, self.stage = list(asks), stage
-        self.root = np.linalg.inv(np.median(np.linalg.inv(under.inverse_root), 0))
-        self.bases = list({id(a.base): a.base for a in asks}.values())
-        self.models = [(b.plant, b.x) for b in self.bases]
-        self.known = [repeats * self._grams(present, under, base, 1)[0] for base in self.bases]
-        self.before = self._answers([k[None] for k in self.known])[0]
-
-    def _columns(self, base: Base) -> list[tuple[Effect, Array]]:
-        """What is rolled out for a base: each effect once, with every size that a question has of it."""
-        out: dict[int, tuple[Effect, list[Array]]] = {}
-        for a in self.asks:
-            if a.base is base:
-                out.setdefault(id(a.effect), (a.effect, []))[1].append(a.theta[None])
-                if a.rival is not None:
-                    out.setdefault(id(a.rival), (a.rival, []))[1].append(a.rows)
-        return [(e, np.unique(np.concatenate(rows), axis=0)) for e, rows in out.values()]
-
-    def _grams(self, problem: Problem, under: Metric, base: Base, parts: int, flat: bool = False) -> Array:
-        """(N, c, c) inner products of the tangent and all effects' columns, one a sequence of `parts` logs."""
-        weight = np.ones(problem.mask.shape) if flat else None
-        lens = Lens(problem, under, base.plant, base.x, weight)
-        all_columns = [lens.tangent, *(lens.columns(e, rows) for e, rows in self._columns(base))]
-        columns = np.concatenate(all_columns, -1)
-        each = np.einsum("smi,smj->sij", columns, columns)
-        sequence = problem.log_of // parts if flat else np.zeros(len(problem), np.intp)
-        out = np.zeros((int(sequence.max()) + 1, *each.shape[1:]))
-        np.add.at(out, sequence, each)
-        return out
-
-    def _answers(self, grams: Sequence[Array]) -> Array:
-        """(N, asks) distances in sigma, from grams (N, c, c) of each base."""
-        out = np.zeros((len(grams[0]), len(self.asks)))
-        for base, of in zip(self.bases, grams, strict=True):
-            limits = box(base.plant)
-            count = len(limits.scale)
-            at, where = count, {}
-            for effect, rows in self._columns(base):
-                where |= {(id(effect), tuple(r)): at + i for i, r in enumerate(rows)}
-                at += len(rows)
-            for j, a in enumerate(self.asks):
-                if a.base is not base:
-                    continue
-                others = [*range(count), *(where[id(a.rival), tuple(r)] for r in a.rows if a.rival is not None)]
-                for i, gram in enumerate(of):
-                    gram = gram.copy()
-                    gram[range(count), range(count)] += limits.pull**2
-                    out[i, j] = np.sqrt(left_over(gram, where[id(a.effect), tuple(a.theta)], others))
-        return out
+    def __init__(self, distances: Distances, stage: Stage, rivals: bool) -> None:
+        self.distances, self.stage, self.rivals = distances, stage, rivals
+        # Where many effects are asked for they are small; rival explanations may move quite differently.
+        models = [a.truth for a in distances.asks] if rivals else []
+        self.models = [(m.plant, m.x) for m in {id(m): m for m in [*models, *distances.rivals]}.values()]
 
     def answers(self, w: Array) -> tuple[Array, Array]:
         """Distances (N, asks) that present logs and sequences w (N, T, nu) would give, and by how much each oversteps.
@@ -142,21 +47,15 @@ class Design:
         Sequences that leave what was seen have no answer: zeros.
         """
         problem, over = self.stage.trial(w, self.models)
-        out = np.zeros((len(w), len(self.asks)))
+        out = np.zeros((len(w), len(self.distances.asks)))
         if problem is not None:
-            root = np.broadcast_to(self.root, (len(problem), *self.root.shape))
-            under = Metric(root, problem.mask)
-            new = [self._grams(problem, under, base, self.stage.parts, True) for base in self.bases]
-            out[over <= 0] = self._answers([k + g for k, g in zip(self.known, new, strict=True)])
+            out[over <= 0] = self.distances.after(problem, problem.log_of // self.stage.parts)
         return out, over
 
     def worth(self, answers: Array, over: Array) -> Array:
         """(N,) what is maximised: the worst question's distance, or without rivals the mean log of what would show."""
-        needed = np.array([a.needed for a in self.asks])
-        if any(a.rival is not None for a in self.asks):
-            value = answers.min(1) + 0.01 * answers.mean(1)
-        else:
-            value = np.log1p((answers / needed) ** 2).mean(1)
+        needed = np.array([a.needed for a in self.distances.asks])
+        value = answers.min(1) + 0.01 * answers.mean(1) if self.rivals else np.log1p((answers / needed) ** 2).mean(1)
         return np.where(over <= 0, value, -np.minimum(over, 1e3))
 
     # ---- search -----------------------------------------------------------------------------------------------------
@@ -234,8 +133,3 @@ class Tried:
     answers: Array
     family: Family
     amplitude: float
-
-
-def present_metric(problem: Problem, plant: Plant, x: Array, extra: Array) -> Metric:
-    """Whitening of the logs at hand under the fitted model."""
-    return metric(problem, problem.covariance(plant, x), extra)

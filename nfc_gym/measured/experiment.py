@@ -16,6 +16,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.envelope import Envelope, envelope
+from nfc_gym.measured.observe import observer
 from nfc_gym.measured.problem import RolloutProblem, interpolate
 from nfc_gym.measured.segments import resample, servos
 from nfc_gym.measured.states import States, channel_noise
@@ -75,6 +76,15 @@ def room(bench: Bench, logs: Sequence[Log], start: Log) -> Room:
     return Room(names, low, rest, high)
 
 
+def _require_motion(model: mujoco.MjModel, log: Log) -> None:
+    """Raises `InputError` where the channels show no motion that a roll-out could be compared with."""
+    if not any(observer(model, name, c.axes) is not None for name, c in log.channels.items()):
+        raise InputError(
+            f"the mapping's channels ({', '.join(log.channels)}) show no motion: a proposal is judged by the motion that "
+            "it makes; map joint:<name>:pos or vel, a body's pose, or a sensor"
+        )
+
+
 class Stage:
     """Where proposed commands are tried.
 
@@ -93,6 +103,7 @@ class Stage:
     """
 
     def __init__(self, bench: Bench, plant: Plant, x: Array, logs: Sequence[Log], seconds: float) -> None:
+        _require_motion(plant.model, logs[0])
         self.bench, self.plant, self.x = bench, plant, x
         speeds = [float(np.linalg.norm(bench.states[log.name].qvel[0])) for log in logs]
         self.start = logs[int(np.argmin(speeds))]
@@ -103,18 +114,26 @@ class Stage:
         idle = np.zeros((1, len(self.time), len(self.room.names)))
         _, over = self.motion(self.room.commands(idle), [(plant, x)])
         self.open_loop = bool(over[0] <= 0)
+        self.allowed = np.zeros(0)
         self.recorded = [] if self.open_loop else _stretch(bench, logs, seconds)
         if not self.open_loop:
             self._require_stands()
 
     def _require_stands(self) -> None:
-        """Raises `InputError` where not even recorded motion can be followed for one segment."""
+        """Note how far recorded motion itself oversteps when it is followed segment by segment.
+
+        Raises:
+          InputError: it cannot be followed at all.
+        """
         problem = self.problem(np.zeros((1, len(self.time), len(self.room.names))))
-        if not np.isfinite(problem.residual(self.plant, self.x[None])).all(-1).any():
+        t = self.plant.shoot(self.x[None], problem.segments)
+        if not t.stable.any():
             raise InputError(
-                "nothing can be proposed: the simulated machine does not stay within the motion that the logs show, "
-                "neither under its resting command nor for one segment from the recorded states"
+                "nothing can be proposed: the simulated machine is unstable, under its resting command and from every "
+                "recorded state that was tried; check segments.timestep, gains and units"
             )
+        over = self.envelope.overstep(t.qpos[0], t.qvel[0], moving=False)
+        self.allowed = np.where(t.stable[0], over, np.inf)
 
     def commands(self, w: Array) -> Array:
         """What is written out (..., nu): commands, or additions to a controller's where the loop must stay closed."""
@@ -177,6 +196,7 @@ class Stage:
         for plant, x in [(self.plant, self.x), *models]:
             t = plant.shoot(x[None], problem.segments)
             each = np.where(t.stable[0], self.envelope.overstep(t.qpos[0], t.qvel[0], moving=False), 1e3)
+            each = np.where(each <= np.tile(self.allowed, len(w)), 0.0, each)
             np.maximum.at(over, problem.log_of // len(self.recorded), each)
         inside = over <= 0
         return (self.problem(w[inside]) if inside.any() else None), over

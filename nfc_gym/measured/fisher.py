@@ -19,7 +19,7 @@ from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-_ALIKE = 0.1  # singular value of unit columns below which they span nothing new: a bend of the law, not another law
+_ALIKE = 0.01  # singular value of unit columns below which they span nothing new: a bend of the law, not another law
 
 
 class Lens:
@@ -41,7 +41,10 @@ class Lens:
         self.base, self.stable = under.whiten(residual)[0], np.isfinite(residual[0]).all(-1)
         self.weight = loss_weight(self.base) if weight is None else weight
         limits, size = box(plant), COARSE if problem.rough else FINE
-        slopes = jacobian(problem, under, limits, x, self.base, np.arange(len(limits.scale)), size)
+        free = np.arange(len(limits.scale))
+        slopes = np.zeros((*self.base.shape, 0))
+        if len(free):
+            slopes = jacobian(problem, under, limits, x, self.base, free, size)
         self.tangent = np.where(self.stable[:, None, None], self.weight[..., None] * slopes, 0.0)
 
     def columns(self, effect: Effect, thetas: Array) -> Array:
@@ -50,24 +53,37 @@ class Lens:
         Blocks that such an effect makes unstable count as unchanged: how far off they are is arbitrary.
         """
         plant = self.plant.with_effects([*self.plant.effects, effect])
-        x = np.concatenate([np.repeat(self.x[None], len(thetas), 0), thetas], 1)
+        return self.moved(plant, np.concatenate([np.repeat(self.x[None], len(thetas), 0), thetas], 1))
+
+    def moved(self, plant: Plant, x: Array) -> Array:
+        """(S, m, r) change to other models of the machine, x (r, size)."""
         residual = self.problem.residual(plant, x)
         usable = np.isfinite(residual).all(-1, keepdims=True) & self.stable[:, None]
         change = np.where(usable, self.weight * (self.under.whiten(residual) - self.base), 0.0)
         return np.moveaxis(change, 0, -1)
 
-    def less(self, effect: Effect) -> tuple["Lens", Array]:
-        """The same data seen from the model less one of its effects, and that effect's fitted parameters (k,)."""
-        psi, thetas = self.plant.split(self.x)
-        pairs = list(zip(self.plant.effects, thetas, strict=True))
-        plant = self.plant.with_effects([e for e, _ in pairs if e is not effect])
-        x = np.concatenate([psi, *(t for e, t in pairs if e is not effect)])
-        return Lens(self.problem, self.under, plant, x, self.weight), next(t for e, t in pairs if e is effect)
+    def places(self, effect: Effect) -> slice:
+        """Where an accepted effect's parameters stand in x."""
+        at = len(self.plant.space)
+        for e in self.plant.effects:
+            if e is effect:
+                break
+            at += len(e.params)
+        return slice(at, at + len(effect.params))
 
-    @property
-    def fitted(self) -> Array:
-        """(S m, j) orthonormal basis of what the free parameters can imitate."""
-        return span(self.tangent.reshape(-1, self.tangent.shape[-1]), 1e-4)
+    def fitted(self, without: Effect | None = None) -> Array:
+        """(S m, j) orthonormal basis of what the free parameters can imitate, all or less those of one effect."""
+        columns = flat(self.tangent)
+        if without is not None:
+            own = self.places(without)
+            anchored = int((~self.plant.space.free).sum())
+            columns = np.delete(columns, np.arange(own.start, own.stop) - anchored, 1)
+        return span(columns, 1e-4)
+
+
+def flat(columns: Array) -> Array:
+    """(S m, r) of columns (S, m, r)."""
+    return columns.reshape(columns.shape[0] * columns.shape[1], columns.shape[2])
 
 
 def free_names(plant: Plant) -> list[str]:

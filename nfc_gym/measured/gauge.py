@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from nfc_gym.measured.box import box
-from nfc_gym.measured.fisher import free_names
+from nfc_gym.measured.fisher import flat, free_names
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import loss_weight
 from nfc_gym.measured.wording import listed
@@ -65,7 +65,7 @@ def slides(fitted: Fit) -> list[Slide]:
     """Near-null directions of psi and accepted effects among parameters that are each well seen by themselves."""
     limits = box(fitted.plant)
     weight = loss_weight(fitted.white)
-    jac = (weight[..., None] * fitted.jacobian).reshape(-1, fitted.jacobian.shape[-1])
+    jac = flat(weight[..., None] * fitted.jacobian)
     names = free_names(fitted.plant)
     plant = fitted.plant
     ranges = (plant.chart(limits.high) - plant.chart(limits.low))[limits.free] / limits.scale

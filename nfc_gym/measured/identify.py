@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import contains
 from nfc_gym.measured.contest import price
-from nfc_gym.measured.fisher import Lens, free_names, realistic, sized, span, without
+from nfc_gym.measured.fisher import Lens, flat, free_names, realistic, sized, span, without
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
 _SURE = 2.576  # standard deviations: 99.5 %, one-sided
 _TOLD = 3.92  # the contest's 2.5 % level (1.96) on a difference of gains d, which scatters by 2 sqrt(d)
 _SAME = 0.95  # share of the gain beyond which the contest lists a rival as equivalent
+_NUDGE = 0.1  # of an accepted effect's size, that is taken away to see what it does
+_MOSTLY = 0.3  # share of a column left below which it is said who takes the rest: nine tenths of the gain
 _GONE = 0.03  # share of a column left below which the fitted parameters can imitate the effect
 _TRIES = 4  # columns with which a size is confirmed, at most
 _STRAIGHT = 1.25  # column over expected column, either way, up to which sizes scale
@@ -57,14 +59,12 @@ class _View:
     """One effect as the data see it.
 
     Attributes:
-      lens: the data, seen from the model without it.
       thetas: (d, k) realistic sizes, or the fitted one of an accepted effect.
-      columns: (n, d) what they change.
+      columns: (n, d) what they change; of an accepted effect, what a change of it does, taken for its whole size.
       spans: (n, r) changes each, one array a shape and size of the law: together they span what it can imitate.
       basis: (n, j) what the fitted parameters can imitate.
     """
 
-    lens: Lens
     effect: Effect
     thetas: Array
     columns: Array
@@ -92,33 +92,47 @@ def table(
         `similarity`: the cosine between the two, `angle`: in degrees;
       `distinguishable`: whether the contest could tell the two apart at that size, or at the size that is claimed;
       `detectable_share`: what the fitted parameters leave of its column; `absorbed_by`: the one that takes most of it
-        where next to nothing is left;
+        where little is left;
       `linear`: whether a column at that size was as long as proportion says; the size is corrected by it either way;
       `claimed`: whether the effect is accepted.
     """
-    views, taken, whole = [], {e.id for e in lens.plant.effects}, lens.fitted
-    for effect in lens.plant.effects:
-        before, theta = lens.less(effect)
-        views.append(_look(before, effect, [(theta[None], np.zeros((0, len(theta))))], before.fitted, True))
+    taken, whole = {e.id for e in lens.plant.effects}, lens.fitted()
+    views = [_accepted(lens, effect) for effect in lens.plant.effects]
     for effect in candidates:
         if effect.id not in taken and not effect.generic:
             tick(effect)
-            views.append(_look(lens, effect, realistic(effect), whole))
+            views.append(_look(lens, effect, whole))
     rivals = [_imitations(v, whole) for v in views]
-    return [_row(v, _detect(v, stakes), views, rivals, stakes) for v in views]
+    return [_row(lens, v, _detect(lens, v, stakes), views, rivals, stakes) for v in views]
 
 
-def _look(lens: Lens, effect: Effect, sets: list[tuple[Array, Array]], basis: Array, claimed: bool = False) -> _View:
-    """An effect at sets of sizes, whole and parameter by parameter, in one batch."""
-    change = lens.columns(effect, np.concatenate([rows for pair in sets for rows in pair]))
-    flat, at, columns, spans = change.reshape(-1, change.shape[-1]), 0, [], []
+def _accepted(lens: Lens, effect: Effect) -> _View:
+    """An accepted effect: seen from the fitted model, in which the motion is what it is with the effect."""
+    theta = lens.x[lens.places(effect)]
+    columns = _change(lens, effect, theta, _NUDGE, True) / _NUDGE
+    return _View(effect, theta[None], columns, [columns], lens.fitted(effect), True)
+
+
+def _look(lens: Lens, effect: Effect, basis: Array) -> _View:
+    """A candidate at its realistic sizes, whole and parameter by parameter, in one batch."""
+    sets = realistic(effect)
+    change = flat(lens.columns(effect, np.concatenate([rows for pair in sets for rows in pair])))
+    at, columns, spans = 0, [], []
     for whole, rows in sets:
         count = len(whole) + len(rows)
-        columns.append(flat[:, at : at + len(whole)])
-        spans.append(flat[:, at : at + count])
+        columns.append(change[:, at : at + len(whole)])
+        spans.append(change[:, at : at + count])
         at += count
-    thetas = np.concatenate([whole for whole, _ in sets])
-    return _View(lens, effect, thetas, np.concatenate(columns, 1), spans, basis, claimed)
+    return _View(effect, np.concatenate([whole for whole, _ in sets]), np.concatenate(columns, 1), spans, basis)
+
+
+def _change(lens: Lens, effect: Effect, theta: Array, share: float, claimed: bool) -> Array:
+    """(n, 1) what a share of the size theta changes: added to the model, or taken from what is in it."""
+    if not claimed:
+        return flat(lens.columns(effect, sized(effect, theta, share)[None]))
+    x = lens.x.copy()
+    x[lens.places(effect)] = sized(effect, theta, 1 - share)
+    return -flat(lens.moved(lens.plant, x[None]))
 
 
 def _imitations(view: _View, basis: Array) -> list[Array]:
@@ -143,7 +157,7 @@ class _Detected:
     ratio: float
 
 
-def _detect(view: _View, stakes: Stakes) -> _Detected:
+def _detect(lens: Lens, view: _View, stakes: Stakes) -> _Detected:
     left = without(view.columns, view.basis)
     lengths, whole = np.linalg.norm(left, axis=0), np.linalg.norm(view.columns, axis=0)
     needed, first = stakes.needed(len(view.effect.params)), _first(view.effect)
@@ -157,11 +171,11 @@ def _detect(view: _View, stakes: Stakes) -> _Detected:
     theta, column = view.thetas[i], left[:, i]
     if not within[i] or share < _GONE:
         return _Detected(theta, column, share, np.inf, np.nan)
-    size, ratio = _checked(view, theta, float(sizes[i]), needed, float(lengths[i]))
+    size, ratio = _checked(lens, view, theta, float(sizes[i]), needed, float(lengths[i]))
     return _Detected(theta, column, share, size, ratio)
 
 
-def _checked(view: _View, theta: Array, size: float, needed: float, length: float) -> tuple[float, float]:
+def _checked(lens: Lens, view: _View, theta: Array, size: float, needed: float, length: float) -> tuple[float, float]:
     """Columns at the size found, which correct it until one is as long as needed; and how far off the first one was.
 
     Laws that bend (a dead zone, dry friction) make columns that grow with some other power of their size.
@@ -170,7 +184,7 @@ def _checked(view: _View, theta: Array, size: float, needed: float, length: floa
     for _ in range(_TRIES):
         if not _fits(view.effect, theta, size):
             return np.inf, first
-        column = view.lens.columns(view.effect, sized(view.effect, theta, size)[None]).reshape(-1)
+        column = _change(lens, view.effect, theta, size, view.claimed)[:, 0]
         seen = max(float(np.linalg.norm(without(column, view.basis))), 1e-3 * needed)
         ratio = seen / needed
         first = ratio if np.isnan(first) else first
@@ -211,7 +225,12 @@ def _worst_mimic(
 
 
 def _row(
-    view: _View, found: _Detected, views: Sequence[_View], rivals: Sequence[list[Array]], stakes: Stakes
+    lens: Lens,
+    view: _View,
+    found: _Detected,
+    views: Sequence[_View],
+    rivals: Sequence[list[Array]],
+    stakes: Stakes,
 ) -> dict[str, Any]:
     effect, first = view.effect, _first(view.effect)
     shown = float(np.linalg.norm(found.column)) > 1e-9
@@ -230,18 +249,20 @@ def _row(
         "detectable_share": found.share,
         "similarity": like,
         "angle": float(np.degrees(np.arccos(like))),
-        "absorbed_by": _absorber(view) if shown and gone else None,
+        "absorbed_by": _absorber(lens, view) if shown and found.share < _MOSTLY else None,
         "at": {p.name: float(v) for p, v in zip(effect.params, at, strict=True)} if seen else {},
         "linear": bool(1 / _STRAIGHT < found.ratio < _STRAIGHT) if seen else None,
         "claimed": view.claimed,
     }
 
 
-def _absorber(view: _View) -> str | None:
+def _absorber(lens: Lens, view: _View) -> str | None:
     """The fitted parameter that alone imitates an effect best."""
-    column = view.columns[:, int(np.linalg.norm(view.columns, axis=0).argmax())]
-    tangent = view.lens.tangent.reshape(len(column), -1)
+    column, tangent = view.columns[:, int(np.linalg.norm(view.columns, axis=0).argmax())], flat(lens.tangent)
     if not tangent.shape[1]:
         return None
     cosines = np.abs(tangent.T @ column) / np.maximum(np.linalg.norm(tangent, axis=0), 1e-12)
-    return free_names(view.lens.plant)[int(cosines.argmax())]
+    own = lens.places(view.effect) if view.claimed else slice(0, 0)
+    anchored = int((~lens.plant.space.free).sum())
+    cosines[own.start - anchored * view.claimed : own.stop - anchored * view.claimed] = -1.0
+    return free_names(lens.plant)[int(cosines.argmax())]

@@ -17,6 +17,7 @@ from rich.console import Console
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured import verdict as say
+from nfc_gym.measured.advice import advise
 from nfc_gym.measured.arena import Data
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
@@ -30,6 +31,7 @@ from nfc_gym.measured.identify import Stakes, table
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.questions import Present
 from nfc_gym.measured.remarks import on_parameters
 from nfc_gym.measured.report import render, render_summary
 from nfc_gym.measured.rounds import Round
@@ -185,7 +187,11 @@ def _fold(
     found = _search(run, fitting, work, select)
     final = _final(run, found, whole)
     known = _identify(run, final[1], [*fitting, *selecting], [work, select])
-    report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole, known)
+    report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole)
+    report["identifiability"] = table(known.lens, candidates(bench, [*fitting, *selecting]), known.stakes)
+    advice = advise(bench, [*fitting, *selecting], report, known, tell, seed)
+    report["identifiability"] = advice.rows
+    report["findings"] += advice.findings
     report["seconds"] = round(time.monotonic() - began, 1)
     _write(out, bench, final, report)
     tell(
@@ -253,16 +259,16 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
     return out[0], out[1]
 
 
-def _identify(run: _Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem]) -> list[dict[str, Any]]:
-    """The identifiability table: what the logs that the search worked with could have shown."""
+def _identify(run: _Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem]) -> Present:
+    """The logs that the search worked with, seen from the fitted model, and what it charged."""
     run.say("what these logs could have shown")
     bench, plant = run.bench, fitted.plant
     problem = bench.problem(logs, most=_LOOK)
     sigma = problem.covariance(plant, fitted.x)
     lens = Lens(problem, metric(problem, sigma, slack(problem, sigma, plant, fitted.x)), plant, fitted.x)
     count = sum(int(p.mask.sum()) for p in searched)
-    stakes = Stakes(count, dispersion(fitted), Options().worth, sum(map(len, searched)) / len(problem))
-    return table(lens, candidates(bench, logs), stakes)
+    repeats = sum(map(len, searched)) / len(problem)
+    return Present(lens, repeats, Stakes(count, dispersion(fitted), Options().worth, repeats))
 
 
 def _report(
@@ -273,7 +279,6 @@ def _report(
     final: tuple[Fit, Fit],
     problem: Problem,
     whole: Problem,
-    known: list[dict[str, Any]],
 ) -> dict[str, Any]:
     calibrated, extended = final
     rng = np.random.default_rng(run.seed)
@@ -302,7 +307,7 @@ def _report(
             "null_95": say.null_bound(v),
             "extended_over_calibrated_95": say.gain_interval(v, rng),
         },
-        "identifiability": known,
+        "identifiability": [],
         "findings": on_parameters(extended, parameters),
         "rounds": [r.__dict__ for r in found.rounds],
         "noise": _noise(run.bench, dataset, fold),
