@@ -15,7 +15,7 @@ from rich.console import Console
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import write_whole
 from nfc_gym.measured import questions, units
-from nfc_gym.measured.bench import Bench, make_bench
+from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import losses
 from nfc_gym.measured.design import Design, Tried
@@ -130,7 +130,7 @@ def _task(bench: Bench, folder: Path | None, seconds: float, seed: int, say: Any
         say("calibrating psi")
         plant, x = questions.calibrated(bench, logs, seed)
     else:
-        report, plant, x = questions.reported(bench, folder)
+        report, plant, x = questions.reported(bench, logs, folder)
     stage = Stage(bench, plant, x, logs, seconds)
     say("looking at the present logs")
     present = questions.look(bench, logs, plant, x)
@@ -141,12 +141,15 @@ def _task(bench: Bench, folder: Path | None, seconds: float, seed: int, say: Any
     if not asks:
         if folder is not None:
             say("the report leaves no rival explanations: asking for the motion in which most would show")
-        effects, count = questions.visibilities(bench, logs, present)
+        taken = {e.id for e in plant.effects}
+        pool = [e for e in candidates(bench, logs) if not e.generic and e.id not in taken]
+        present = questions.look(bench, logs, plant, x, questions.blocks_for(len(pool)))
+        effects = questions.visibilities(pool, present)
         asks = [v.ask for v in effects]
         if not asks:
             raise InputError("no effect of the library can be at work in this model: there is nothing to look for")
-        if count > len(asks):
-            say(f"designing for {len(asks)} of {count} effects, the hardest to see of each family")
+        if len(pool) > len(asks):
+            say(f"designing for {len(asks)} of {len(pool)} effects, the hardest to see of each family")
     design = Design(Distances(asks, present.lens, present.repeats), stage, rivals=bool(pairs))
     return _Task(bench, present, design, pairs, effects), report
 

@@ -16,7 +16,6 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.envelope import Envelope, envelope
-from nfc_gym.measured.observe import observer
 from nfc_gym.measured.problem import RolloutProblem, interpolate
 from nfc_gym.measured.segments import resample, servos
 from nfc_gym.measured.states import States, channel_noise
@@ -76,15 +75,6 @@ def room(bench: Bench, logs: Sequence[Log], start: Log) -> Room:
     return Room(names, low, rest, high)
 
 
-def _require_motion(model: mujoco.MjModel, log: Log) -> None:
-    """Raises `InputError` where the channels show no motion that a roll-out could be compared with."""
-    if not any(observer(model, name, c.axes) is not None for name, c in log.channels.items()):
-        raise InputError(
-            f"the mapping's channels ({', '.join(log.channels)}) show no motion: a proposal is judged by the motion that "
-            "it makes; map joint:<name>:pos or vel, a body's pose, or a sensor"
-        )
-
-
 class Stage:
     """Where proposed commands are tried.
 
@@ -103,7 +93,6 @@ class Stage:
     """
 
     def __init__(self, bench: Bench, plant: Plant, x: Array, logs: Sequence[Log], seconds: float) -> None:
-        _require_motion(plant.model, logs[0])
         self.bench, self.plant, self.x = bench, plant, x
         speeds = [float(np.linalg.norm(bench.states[log.name].qvel[0])) for log in logs]
         self.start = logs[int(np.argmin(speeds))]

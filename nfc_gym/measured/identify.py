@@ -7,7 +7,7 @@ which an effect is sure to be found follows from its column (`fisher`) by scalin
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ _SAME = 0.95  # share of the gain beyond which the contest lists a rival as equi
 _NUDGE = 0.1  # of an accepted effect's size, that is taken away to see what it does
 _MOSTLY = 0.3  # share of a column left below which it is said who takes the rest: nine tenths of the gain
 _GONE = 0.03  # share of a column left below which the fitted parameters can imitate the effect
+_LEADING = 12  # effects whose sizes are confirmed
 _TRIES = 4  # columns with which a size is confirmed, at most
 _STRAIGHT = 1.25  # column over expected column, either way, up to which sizes scale
 
@@ -94,6 +95,7 @@ def table(
       `detectable_share`: what the fitted parameters leave of its column; `absorbed_by`: the one that takes most of it
         where little is left;
       `linear`: whether a column at that size was as long as proportion says; the size is corrected by it either way;
+        None where it was not tried, as is done for what is accepted and for the effects that show best;
       `claimed`: whether the effect is accepted.
     """
     taken, whole = {e.id for e in lens.plant.effects}, lens.fitted()
@@ -103,7 +105,16 @@ def table(
             tick(effect)
             views.append(_look(lens, effect, whole))
     rivals = [_imitations(v, whole) for v in views]
-    return [_row(lens, v, _detect(lens, v, stakes), views, rivals, stakes) for v in views]
+    found = [_detect(v, stakes) for v in views]
+    strength = [
+        np.linalg.norm(d.column) / stakes.needed(len(v.effect.params)) for v, d in zip(views, found, strict=True)
+    ]
+    leading = set(np.argsort(strength)[::-1][:_LEADING])
+    found = [
+        _confirmed(lens, v, d, stakes) if v.claimed or i in leading else d
+        for i, (v, d) in enumerate(zip(views, found, strict=True))
+    ]
+    return [_row(lens, v, d, views, rivals, stakes) for v, d in zip(views, found, strict=True)]
 
 
 def _accepted(lens: Lens, effect: Effect) -> _View:
@@ -147,17 +158,18 @@ class _Detected:
     Attributes:
       theta: (k,) its realistic size; column: (n,) what is left of its column; share: how much that is.
       size: smallest size that is sure to be found, as a share of theta; infinite where bounds or psi forbid it.
-      ratio: length of a column at that size over the expected one.
+      ratio: length of a column at that size over the expected one; None where none was rolled out.
     """
 
     theta: Array
     column: Array
     share: float
     size: float
-    ratio: float
+    ratio: float | None
 
 
-def _detect(lens: Lens, view: _View, stakes: Stakes) -> _Detected:
+def _detect(view: _View, stakes: Stakes) -> _Detected:
+    """By proportion, from realistic sizes."""
     left = without(view.columns, view.basis)
     lengths, whole = np.linalg.norm(left, axis=0), np.linalg.norm(view.columns, axis=0)
     needed, first = stakes.needed(len(view.effect.params)), _first(view.effect)
@@ -168,11 +180,16 @@ def _detect(lens: Lens, view: _View, stakes: Stakes) -> _Detected:
     far = np.abs(np.log(sizes)) > 1.5
     i = min(range(len(sizes)), key=lambda i: (not within[i], far[i], away[i]))
     share = float(lengths[i] / max(whole[i], 1e-12))
-    theta, column = view.thetas[i], left[:, i]
-    if not within[i] or share < _GONE:
-        return _Detected(theta, column, share, np.inf, np.nan)
-    size, ratio = _checked(lens, view, theta, float(sizes[i]), needed, float(lengths[i]))
-    return _Detected(theta, column, share, size, ratio)
+    hidden = not within[i] or share < _GONE
+    return _Detected(view.thetas[i], left[:, i], share, np.inf if hidden else float(sizes[i]), None)
+
+
+def _confirmed(lens: Lens, view: _View, found: _Detected, stakes: Stakes) -> _Detected:
+    if not np.isfinite(found.size):
+        return found
+    needed, length = stakes.needed(len(view.effect.params)), float(np.linalg.norm(found.column))
+    size, ratio = _checked(lens, view, found.theta, found.size, needed, length)
+    return replace(found, size=size, ratio=ratio)
 
 
 def _checked(lens: Lens, view: _View, theta: Array, size: float, needed: float, length: float) -> tuple[float, float]:
@@ -251,7 +268,7 @@ def _row(
         "angle": float(np.degrees(np.arccos(like))),
         "absorbed_by": _absorber(lens, view) if shown and found.share < _MOSTLY else None,
         "at": {p.name: float(v) for p, v in zip(effect.params, at, strict=True)} if seen else {},
-        "linear": bool(1 / _STRAIGHT < found.ratio < _STRAIGHT) if seen else None,
+        "linear": bool(1 / _STRAIGHT < found.ratio < _STRAIGHT) if seen and found.ratio is not None else None,
         "claimed": view.claimed,
     }
 

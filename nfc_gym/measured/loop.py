@@ -31,7 +31,7 @@ from nfc_gym.measured.identify import Stakes, table
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.questions import Present
+from nfc_gym.measured.questions import Present, blocks_for
 from nfc_gym.measured.remarks import on_parameters
 from nfc_gym.measured.report import render, render_summary
 from nfc_gym.measured.rounds import Round
@@ -39,11 +39,11 @@ from nfc_gym.measured.search import Found, Options, Search
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole
+from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
 _REPLICAS = 6
-_LOOK = 60  # segments, of those to fit and to select on, that the identifiability table is made from
 
 
 @dataclass
@@ -186,9 +186,10 @@ def _fold(
     select = bench.problem(selecting, most=max(40, int(_WORK / steps)))
     found = _search(run, fitting, work, select)
     final = _final(run, found, whole)
-    known = _identify(run, final[1], [*fitting, *selecting], [work, select])
+    pool = candidates(bench, [*fitting, *selecting])
+    known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
     report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole)
-    report["identifiability"] = table(known.lens, candidates(bench, [*fitting, *selecting]), known.stakes)
+    report["identifiability"] = table(known.lens, pool, known.stakes)
     advice = advise(bench, [*fitting, *selecting], report, known, tell, seed)
     report["identifiability"] = advice.rows
     report["findings"] += advice.findings
@@ -259,11 +260,13 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
     return out[0], out[1]
 
 
-def _identify(run: _Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem]) -> Present:
+def _identify(
+    run: _Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem], pool: Sequence[Effect]
+) -> Present:
     """The logs that the search worked with, seen from the fitted model, and what it charged."""
     run.say("what these logs could have shown")
     bench, plant = run.bench, fitted.plant
-    problem = bench.problem(logs, most=_LOOK)
+    problem = bench.problem(logs, most=blocks_for(len(pool)))
     sigma = problem.covariance(plant, fitted.x)
     lens = Lens(problem, metric(problem, sigma, slack(problem, sigma, plant, fitted.x)), plant, fitted.x)
     count = sum(int(p.mask.sum()) for p in searched)

@@ -29,7 +29,7 @@ from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 TOLD = 3.92  # sigma between two explanations from which the contest tells them apart (`identify`)
-_LOOK = 60  # segments of the present logs that are looked at
+_FEWEST, _LOOK, _WORK = 20, 60, 2400  # segments of the logs that are looked at: between these, and times candidates
 _MOST = 24  # effects that a motion is designed for at once; of more, the hardest to see of each family
 _SIZES = (0.3, 1.0, 3.0)  # times a realistic size, from the best of which a rival's fit starts
 _ROUNDS = 12  # iterations of that fit
@@ -50,11 +50,16 @@ class Present:
     stakes: Stakes
 
 
-def look(bench: Bench, logs: Sequence[Log], plant: Plant, x: Array) -> Present:
-    """See the logs at hand from a fitted model, as roll-outs whatever the mapping's mode."""
+def blocks_for(candidates: int) -> int:
+    """How many segments of the logs are looked at when so many effects are rolled out on them."""
+    return int(np.clip(_WORK // max(candidates, 1), _FEWEST, _LOOK))
+
+
+def look(bench: Bench, logs: Sequence[Log], plant: Plant, x: Array, most: int = _LOOK) -> Present:
+    """See at most so many segments of the logs from a fitted model, as roll-outs whatever the mapping's mode."""
     states = [bench.states[log.name] for log in logs]
     whole = bench.rollouts(logs, states)
-    problem = bench.rollouts(logs, states, most=_LOOK)
+    problem = bench.rollouts(logs, states, most=most)
     lens = Lens(problem, *_metric(problem, plant, x), plant, x)
     repeats = len(whole) / len(problem)
     stakes = Stakes(int(whole.mask.sum()), dispersion(_as_fit(lens)), Options().worth, repeats)
@@ -78,7 +83,7 @@ def calibrated(bench: Bench, logs: Sequence[Log], seed: int) -> tuple[Plant, Arr
     return plant, fitted.x
 
 
-def reported(bench: Bench, folder: Path) -> tuple[dict[str, Any], Plant, Array]:
+def reported(bench: Bench, logs: Sequence[Log], folder: Path) -> tuple[dict[str, Any], Plant, Array]:
     """Report and extended model that `close-loop` left in a folder.
 
     Raises:
@@ -97,15 +102,18 @@ def reported(bench: Bench, folder: Path) -> tuple[dict[str, Any], Plant, Array]:
         raise InputError(f"{folder}: not what close-loop writes ({type(e).__name__}: {e})") from None
     if given != ours:
         raise InputError(f"{folder} is of the model {given}, the mapping of {ours}: give the folder of this mapping")
-    return report, *unpack(packed, bench.plant)
+    plant, x = unpack(packed, bench.plant)
+    # Saved effects know their values alone; those of the library come with bounds and sizes that fit the machine.
+    pool = [e for e in candidates(bench, logs) if not e.generic]
+    return report, plant.with_effects([find(bench, pool, e.id) or e for e in plant.effects]), x
 
 
-def find(bench: Bench, logs: Sequence[Log], label: str) -> Effect | None:
-    """A candidate by its id, `:each` included; None for pairs and for what is no candidate of these logs."""
-    pool = {e.id: e for e in candidates(bench, logs)}
-    if label in pool:
-        return pool[label]
-    tied = pool.get(label.removesuffix(":each"))
+def find(bench: Bench, pool: Sequence[Effect], label: str) -> Effect | None:
+    """An effect of a pool by its id, `:each` included; None for pairs and for what is not there."""
+    known = {e.id: e for e in pool}
+    if label in known:
+        return known[label]
+    tied = known.get(label.removesuffix(":each"))
     parts = split(tied, bench.plant) if tied is not None and label.endswith(":each") else None
     return parts[0] if parts else None
 
@@ -120,11 +128,12 @@ def rivalries(
     """
     rows = {r["id"]: r for r in report.get("identifiability") or []}
     asks, pairs, skipped = [], [], []
+    pool = candidates(bench, logs)
     for effect in present.lens.plant.effects:
         claim = next((e for e in report.get("effects") or [] if e["id"] == effect.id), {})
         mimic = rows.get(effect.id, {}).get("worst_mimic")
         for label in (rivals_of(claim, report["effects"]) or ([mimic] if mimic else []))[:_RIVALS]:
-            rival = find(bench, logs, label)
+            rival = find(bench, pool, label)
             if rival is None:
                 skipped.append(label)
                 continue
@@ -157,15 +166,10 @@ class Visible:
     ask: Ask
 
 
-def visibilities(bench: Bench, logs: Sequence[Log], present: Present) -> tuple[list[Visible], int]:
-    """Every candidate against psi and what is accepted; of many, the hardest to see of each family.
-
-    Returns:
-      The questions, and how many candidates there are in all.
-    """
-    lens, taken = present.lens, {e.id for e in present.lens.plant.effects}
+def visibilities(pool: Sequence[Effect], present: Present) -> list[Visible]:
+    """Every effect of a pool against psi and what is accepted; of many, the hardest to see of each family."""
+    lens = present.lens
     basis, here, found = lens.fitted(), Model(lens.plant, lens.x), []
-    pool = [e for e in candidates(bench, logs) if not e.generic and e.id not in taken]
     for effect in pool:
         thetas = np.concatenate([whole for whole, _ in realistic(effect)])
         lengths = np.linalg.norm(without(flat(lens.columns(effect, thetas)), basis), axis=0)
@@ -177,4 +181,4 @@ def visibilities(bench: Bench, logs: Sequence[Log], present: Present) -> tuple[l
     found.sort(key=lambda pair: pair[0])
     if len(found) > _MOST:
         found = list({v.effect.family: (f, v) for f, v in reversed(found)}.values())
-    return [v for _, v in found][:_MOST], len(pool)
+    return [v for _, v in found][:_MOST]
