@@ -20,7 +20,7 @@ from nfc_gym.measured.questions import TOLD, Present, look, rivalries
 from nfc_gym.measured.wording import number
 
 _SECONDS = 5.0  # of the motions that are compared: families differ in kind, not in length
-_AMPLITUDES = (0.5, 0.15)
+_DRAWS = 1  # of each family
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def _best_motion(
         stage = Stage(bench, present.lens.plant, present.lens.x, logs, _SECONDS)
         seen = present if bench.mode == "rollout" else look(bench, logs, present.lens.plant, present.lens.x)
         design = Design(Distances(asks, seen.lens, seen.repeats), stage, rivals=True)
-        best = design.families(np.random.default_rng(seed), _AMPLITUDES)[0]
+        best = design.families(np.random.default_rng(seed), _DRAWS)[0]
     except InputError as e:
         why = str(e)
         return lambda k: f"{why[:1].upper()}{why[1:]}."

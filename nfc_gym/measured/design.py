@@ -7,7 +7,7 @@ be to be found.
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cma
 import numpy as np
@@ -15,14 +15,17 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured.distances import Distances
+from nfc_gym.measured.envelope import MARGIN
 from nfc_gym.measured.experiment import Stage
 from nfc_gym.measured.motions import FAMILIES, Family, Series, faded
 
 Array = NDArray[np.float64]
-_AMPLITUDES = (1.0, 0.5, 0.2)
+_DRAWS = 3  # of each family
+_FIRST = 0.5  # of the time, that families may take
+_LARGEST = tuple(0.6**k for k in range(9))  # scales of which a family's draw takes the largest that bounds allow
+_REPAIR = (1.0, 0.8, 0.5)  # the same for what the optimiser draws
 _BATCH = 8  # sequences rolled out at once
 _STEP = 0.05  # of the optimiser's first draws
-_SHRINK = 4  # times smaller that all families are tried again if none stays within bounds
 
 
 class Design:
@@ -41,54 +44,69 @@ class Design:
         models = [a.truth for a in distances.asks] if rivals else []
         self.models = [(m.plant, m.x) for m in {id(m): m for m in [*models, *distances.rivals]}.values()]
 
-    def answers(self, w: Array) -> tuple[Array, Array]:
-        """Distances (N, asks) that present logs and sequences w (N, T, nu) would give, and by how much each oversteps.
+    def within(self, w: Array, scales: Sequence[float]) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Sequences (N, T, nu), each at the largest of some scales (falling) at which it stays within bounds.
 
-        Sequences that leave what was seen have no answer: zeros.
+        Returns:
+          The scaled sequences, the scales (N,), and which of them do stay within bounds.
         """
-        problem, over = self.stage.trial(w, self.models)
-        out = np.zeros((len(w), len(self.distances.asks)))
-        if problem is not None:
-            out[over <= 0] = self.distances.after(problem, problem.log_of // self.stage.parts)
-        return out, over
+        chosen, left = np.full(len(w), scales[-1]), np.arange(len(w))
+        for scale in scales:
+            over = self.stage.overstep(scale * w[left], self.models)
+            chosen[left] = scale
+            left = left[over > 0]
+            if not len(left):
+                break
+        return chosen[:, None, None] * w, chosen, ~np.isin(np.arange(len(w)), left)
 
-    def worth(self, answers: Array, over: Array) -> Array:
-        """(N,) what is maximised: the worst question's distance, or without rivals the mean log of what would show."""
+    def judge(self, w: Array, scales: Sequence[float]) -> tuple[Array, Array, Array, Array]:
+        """Sequences (N, T, nu) within bounds, their scales (N,), values (N,), -1 where there are none, and answers."""
+        w, chosen, fine = self.within(w, scales)
+        answers = np.zeros((len(w), len(self.distances.asks)))
+        if fine.any():
+            problem = self.stage.data(w[fine])
+            answers[fine] = self.distances.after(problem, problem.log_of // self.stage.parts)
         needed = np.array([a.needed for a in self.distances.asks])
+        # All of the rivals must fall; what would show counts on the whole.
         value = answers.min(1) + 0.01 * answers.mean(1) if self.rivals else np.log1p((answers / needed) ** 2).mean(1)
-        return np.where(over <= 0, value, -np.minimum(over, 1e3))
+        return w, chosen, np.where(fine, value, -1.0), answers
 
     # ---- search -----------------------------------------------------------------------------------------------------
 
-    def families(self, rng: np.random.Generator, amplitudes: Sequence[float] = _AMPLITUDES) -> list["Tried"]:
-        """Every family of motion at some amplitudes, best first; those that stay within bounds.
+    def families(self, rng: np.random.Generator, draws: int = _DRAWS, until: float = np.inf) -> list["Tried"]:
+        """Every family of motion, drawn so many times, as large as bounds allow; best first.
+
+        Args:
+          until: `time.monotonic()` from which on what was found is enough.
 
         Raises:
-          InputError: none does, however small.
+          InputError: none stays within bounds, however small.
         """
-        time_, count = self.stage.time, len(self.stage.room.names)
-        for shrink in (1, _SHRINK, _SHRINK**2):
-            drawn = [
-                (f, a / shrink, faded(np.clip(a / shrink * f.make(rng, time_, count), -1, 1), time_))
-                for f in FAMILIES
-                for a in amplitudes
+        time_, patterns = self.stage.time, self.stage.patterns
+        drawn = [
+            (f, pattern, f.make(rng, time_, len(pattern)))
+            for f in FAMILIES
+            for pattern in (patterns[k % len(patterns)] for k in range(draws))
+            if len(pattern) > 1 or not f.takes_turns
+        ]
+        out: list[Tried] = []
+        for i in range(0, len(drawn), _BATCH):
+            if out and time.monotonic() > until:
+                break
+            part = drawn[i : i + _BATCH]
+            w = np.stack([faded(np.clip(s @ pattern, -1, 1), time_) for _, pattern, s in part])
+            found = self.judge(w, _LARGEST)
+            out += [
+                Tried(w, v, a, f, c, pattern, c * s)
+                for (f, pattern, s), w, c, v, a in zip(part, *found, strict=True)
+                if v >= 0
             ]
-            out: list[Tried] = []
-            for i in range(0, len(drawn), _BATCH):
-                part = drawn[i : i + _BATCH]
-                answers, over = self.answers(np.stack([w for *_, w in part]))
-                value = self.worth(answers, over)
-                out += [
-                    Tried(w, float(v), a, f, s)
-                    for (f, s, w), v, a, o in zip(part, value, answers, over, strict=True)
-                    if o <= 0
-                ]
-            if out:
-                return sorted(out, key=lambda t: -t.value)
-        raise InputError(
-            "nothing can be proposed: however small, no motion that was tried stays within the joint ranges and "
-            "the motion that the logs show"
-        )
+        if not out:
+            raise InputError(
+                "nothing can be proposed: however small, no motion that was tried stays within the joint ranges and "
+                f"{MARGIN:g} times the motion that the logs show"
+            )
+        return sorted(out, key=lambda t: -t.value)
 
     def search(
         self, rng: np.random.Generator, tries: int, budget: float, tick: Callable[[int, float], None]
@@ -103,33 +121,42 @@ class Design:
           tick: called with the number tried and the best value so far.
         """
         began = time.monotonic()
-        best = self.families(rng)[0]
-        done = len(FAMILIES) * len(_AMPLITUDES)
+        best = self.families(rng, until=began + _FIRST * budget)[0]
+        done = _DRAWS * len(FAMILIES)
         tick(done, best.value)
-        series = Series(best.w, self.stage.time)
+        start = best
+        series = Series(start.series, start.pattern, self.stage.time)
         options = {"verbose": -9, "seed": int(rng.integers(1, 2**31)), "popsize": 2 * _BATCH}
         walk = cma.CMAEvolutionStrategy(np.zeros(series.size), _STEP, options)
         while done < tries and time.monotonic() - began < budget and not walk.stop():
             z = walk.ask()
             w = np.stack([series(row) for row in z])
-            parts = [self.answers(w[i : i + _BATCH]) for i in range(0, len(w), _BATCH)]
-            answers, over = (np.concatenate(p) for p in zip(*parts, strict=True))
-            value = self.worth(answers, over)
+            parts = [self.judge(w[i : i + _BATCH], _REPAIR) for i in range(0, len(w), _BATCH)]
+            w, _, value, answers = (np.concatenate(p) for p in zip(*parts, strict=True))
             walk.tell(z, (-value).tolist())
             done += len(w)
             i = int(value.argmax())
             if value[i] > best.value:
-                best = Tried(w[i], float(value[i]), answers[i], best.family, best.amplitude)
+                best = replace(start, w=w[i], value=float(value[i]), answers=answers[i])
             tick(done, best.value)
         return best, done
 
 
 @dataclass(frozen=True)
 class Tried:
-    """A sequence (T, nu) in -1..1 that stays within bounds, its value and answers, and the family it comes from."""
+    """A sequence that stays within bounds.
+
+    Attributes:
+      w: (T, nu) in -1..1.
+      value: what is maximised; answers: (asks,) sigma.
+      family, amplitude: of which it was drawn, and how large.
+      pattern, series: (m, nu) controls that move together, and (T, m) how much each set of them was to move.
+    """
 
     w: Array
     value: float
     answers: Array
     family: Family
     amplitude: float
+    pattern: Array
+    series: Array

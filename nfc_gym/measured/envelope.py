@@ -12,6 +12,7 @@ from nfc_gym.measured.states import States
 Array = NDArray[np.float64]
 MARGIN = 1.2  # times what was seen
 _LEAST = 0.02  # m, m/s, rad, rad/s: nearer to rest than this everything is allowed
+_SLIGHT = np.array([0.02, 0.02, 0.05])  # m, m, rad: the same for a free body's ways and tilt
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 
@@ -67,7 +68,7 @@ def envelope(model: mujoco.MjModel, seen: Sequence[States], margin: float = MARG
         if kind == _FREE:
             ways = np.concatenate([travel(s.qpos[:, q : q + 7]) for s in seen]).max(0)
             free.append(q)
-            reach.append(np.where(seen[0].observed[[v, v, v + 3]], margin * np.maximum(ways, _LEAST), np.inf))
+            reach.append(np.where(seen[0].observed[[v, v, v + 3]], margin * np.maximum(ways, _SLIGHT), np.inf))
         elif kind >= int(mujoco.mjtJoint.mjJNT_SLIDE):
             values = np.concatenate([s.qpos[:, q] for s in seen])
             bounds = _bounds(model, j, values, margin) if seen[0].observed[v] or model.jnt_limited[j] else None

@@ -233,9 +233,7 @@ def _verify(task: _Task, best: Tried, result: dict[str, Any], rng: np.random.Gen
     if not task.pairs:
         return
     plant, x = task.present.lens.plant, task.present.lens.x
-    clean, _ = task.design.stage.trial(best.w[None])
-    assert clean is not None
-    new = clean.synthetic(plant, x, rng)
+    new = task.design.stage.data(best.w[None]).synthetic(plant, x, rng)
     under = metric(new, new.covariance(plant, x))
     for i, row in enumerate(result["pairs"]):
         other = task.design.distances.asks[2 * i].rival

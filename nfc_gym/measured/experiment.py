@@ -16,6 +16,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.envelope import Envelope, envelope
+from nfc_gym.measured.motions import patterns
 from nfc_gym.measured.problem import RolloutProblem, interpolate
 from nfc_gym.measured.segments import resample, servos
 from nfc_gym.measured.states import States, channel_noise
@@ -87,6 +88,7 @@ class Stage:
     Attributes:
       open_loop: False where the resting command does not keep the machine within what was seen.
       start: the log whose first state a proposal starts from.
+      patterns: sets of controls to be moved together, (m, nu) each.
 
     Raises:
       InputError: nothing can be proposed, and why.
@@ -100,6 +102,8 @@ class Stage:
         self.time = np.arange(round(seconds / self.interval) + 1) * self.interval
         self.room = room(bench, logs, self.start)
         self.envelope: Envelope = envelope(plant.model, [bench.states[log.name] for log in logs])
+        moved = [np.stack([log.controls[n] for n in self.room.names], 1) for log in logs]
+        self.patterns = patterns(np.concatenate(moved) / np.maximum(self.room.high - self.room.low, 1e-12))
         idle = np.zeros((1, len(self.time), len(self.room.names)))
         _, over = self.motion(self.room.commands(idle), [(plant, x)])
         self.open_loop = bool(over[0] <= 0)
@@ -114,7 +118,7 @@ class Stage:
         Raises:
           InputError: it cannot be followed at all.
         """
-        problem = self.problem(np.zeros((1, len(self.time), len(self.room.names))))
+        problem = self._added(np.zeros((1, len(self.time), len(self.room.names))))
         t = self.plant.shoot(self.x[None], problem.segments)
         if not t.stable.any():
             raise InputError(
@@ -167,36 +171,37 @@ class Stage:
             ],
         )
 
-    def trial(self, w: Array, models: Sequence[tuple[Plant, Array]] = ()) -> tuple[RolloutProblem | None, Array]:
-        """The data that the sequences (N, T, nu) in -1..1 which stay within bounds would give, noise left out.
+    def overstep(self, w: Array, models: Sequence[tuple[Plant, Array]] = ()) -> Array:
+        """(N,) by how much the motion under sequences (N, T, nu) in -1..1 leaves what is allowed; 0 within it.
 
         Args:
           models: whose motion must stay within bounds besides the stage's own.
-
-        Returns:
-          A problem of those sequences in their order (None if there are none), and by how much each oversteps, (N,).
         """
+        models = [(self.plant, self.x), *(m for m in models if m[0] is not self.plant)]
         if self.open_loop:
-            commands = self.room.commands(w)
-            found, over = self.motion(commands, [(self.plant, self.x), *models])
-            inside = over <= 0
-            return (self._made(commands[inside], found[0], inside) if inside.any() else None), over
-        problem, over = self.problem(w), np.zeros(len(w))
-        for plant, x in [(self.plant, self.x), *models]:
+            return self.motion(self.room.commands(w), models)[1]
+        problem, over = self._added(w), np.zeros(len(w))
+        for plant, x in models:
             t = plant.shoot(x[None], problem.segments)
             each = np.where(t.stable[0], self.envelope.overstep(t.qpos[0], t.qvel[0], moving=False), 1e3)
             each = np.where(each <= np.tile(self.allowed, len(w)), 0.0, each)
             np.maximum.at(over, problem.log_of // len(self.recorded), each)
-        inside = over <= 0
-        return (self.problem(w[inside]) if inside.any() else None), over
+        return over
+
+    def data(self, w: Array) -> RolloutProblem:
+        """What recordings of sequences (N, T, nu) would give, noise left out; each makes `parts` logs, in order."""
+        if not self.open_loop:
+            return self._added(w)
+        commands = self.room.commands(w)
+        return self._made(commands, self.motion(commands, [(self.plant, self.x)])[0][0])
 
     @property
     def parts(self) -> int:
-        """Logs that one sequence makes in a trial's problem."""
+        """Logs that one sequence makes in `data`."""
         return 1 if self.open_loop else len(self.recorded)
 
-    def _made(self, commands: Array, motion: Trajectory, rows: NDArray[np.bool_]) -> RolloutProblem:
-        """Logs of some of the simulated motions, with their commands."""
+    def _made(self, commands: Array, motion: Trajectory) -> RolloutProblem:
+        """Logs of simulated motions."""
         model = self.plant.model
         sd = self.bench.states[self.start.name]
         spread = [np.tile(np.median(s, 0), (len(self.time), 1)) for s in (sd.qpos_sd, sd.qvel_sd)]
@@ -204,10 +209,8 @@ class Stage:
         step = (self.time / float(model.opt.timestep))[None]
         step = np.minimum(step, motion.qpos.shape[2] - 1)
         logs, states = [], []
-        for i, row in enumerate(np.flatnonzero(rows)):
-            one = Trajectory(
-                *(a[:, row : row + 1] for a in (motion.qpos, motion.qvel)), None, motion.stable[:, row : row + 1]
-            )
+        for i in range(len(commands)):
+            one = Trajectory(*(a[:, i : i + 1] for a in (motion.qpos, motion.qvel)), None, motion.stable[:, i : i + 1])
             at = lambda a: interpolate(a, step, False)[0, 0]  # noqa: E731
             qpos, qvel = at(one.qpos), at(one.qvel)
             states.append(States(qpos, qvel, np.zeros_like(qvel), *spread, sd.observed))
@@ -236,7 +239,7 @@ class Stage:
             servo={k: {n: hold(v) for n, v in terms.items()} for k, terms in start.servo.items()},
         )
 
-    def problem(self, w: Array) -> RolloutProblem:
+    def _added(self, w: Array) -> RolloutProblem:
         """Recorded stretches whose commands have sequences (N, T, nu) added to them."""
         logs, states = [], []
         for row in self.room.additions(w):

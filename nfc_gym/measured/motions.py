@@ -13,16 +13,21 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 _FASTEST = 3.0  # Hz: what drives of legged and wheeled machines still follow
 _HARMONICS = (1, 2, 3, 5, 8, 13, 21)  # of one period a sequence; those up to the fastest are used
+_SHOWN = 0.1  # of the largest: spread from which a set of controls that moved together counts
 _FADE = 0.3  # s, over which a sequence leaves the resting command and returns to it
 
 
 @dataclass(frozen=True)
 class Family:
-    """A kind of motion: `say` names it in a sentence, `make` draws commands (T, nu) in -1..1 at times (T,)."""
+    """A kind of motion: `say` names it in a sentence, `make` draws commands (T, nu) in -1..1 at times (T,).
+
+    `takes_turns`: it makes sense with several sets of controls only.
+    """
 
     name: str
     say: str
     make: Callable[[np.random.Generator, Array, int], Array]
+    takes_turns: bool = False
 
 
 def _sines(rng: np.random.Generator, time: Array, count: int, low: float, high: float) -> Array:
@@ -78,7 +83,7 @@ FAMILIES = (
     Family("jumps", "quick steps", lambda r, t, n: _held(r, t, n, 0.1, 0.4)),
     Family("pulses", "pushes with free motion between them", _pulses),
     Family("stairs", "a staircase of levels up and down", _stairs),
-    Family("turns", "one actuator after the other", _turns),
+    Family("turns", "one set of actuators after the other", _turns, takes_turns=True),
 )
 
 
@@ -92,13 +97,14 @@ class Series:
     """A drawn sequence times a gain plus a Fourier series, squeezed into -1..1: what the optimiser walks in.
 
     Args:
-      start: (T, nu) the sequence to improve.
+      start: (T, m) the sequence to improve.
+      pattern: (m, nu) sets of controls that move together.
       time: (T,) s.
-      most: coefficients at most; with many actuators fewer harmonics are used.
+      most: coefficients at most; with many sets fewer harmonics are used.
     """
 
-    def __init__(self, start: Array, time: Array, most: int = 60) -> None:
-        self.start, self.time, self.count = start, time, start.shape[1]
+    def __init__(self, start: Array, pattern: Array, time: Array, most: int = 60) -> None:
+        self.start, self.pattern, self.time, self.count = start, pattern, time, start.shape[1]
         use = [h for h in _HARMONICS if h / time[-1] <= _FASTEST][: max(1, most // (2 * self.count))]
         waves = 2 * np.pi * np.outer(time / time[-1], use)
         self.basis = np.concatenate([np.sin(waves), np.cos(waves), np.ones((len(time), 1))], 1)
@@ -106,8 +112,26 @@ class Series:
 
     def __call__(self, z: Array) -> Array:
         """(T, nu) commands in -1..1 at coefficients z (size,); z = 0 is the start itself, but for the squeezing."""
-        w = np.exp(z[0]) * self.start + self.basis @ z[1:].reshape(-1, self.count)
-        return faded(squeezed(w), self.time)
+        s = np.exp(z[0]) * self.start + self.basis @ z[1:].reshape(-1, self.count)
+        return faded(squeezed(s @ self.pattern), self.time)
+
+
+def patterns(commands: Array) -> list[Array]:
+    """Sets of controls that may be moved together, (m, nu) each: as logged commands (T, nu) moved, and one by one.
+
+    A vehicle's wheels, driven each for itself, only fight: what moved together in the logs may be tried together.
+    """
+    alone = np.eye(commands.shape[1])
+    spread = commands - commands.mean(0)
+    size = spread.std(0)
+    if commands.shape[1] == 1 or not (size > 0).any():
+        return [alone]
+    _, values, modes = np.linalg.svd(spread / np.where(size > 0, size, 1.0), full_matrices=False)
+    kept = modes[values > _SHOWN * values[0]] * size
+    if len(kept) == len(alone):
+        return [alone]
+    together = kept / np.maximum(np.abs(kept).max(1, keepdims=True), 1e-12)
+    return [together, together, alone]
 
 
 def squeezed(w: Array) -> Array:
