@@ -50,9 +50,9 @@ class Design:
         Returns:
           The scaled sequences, the scales (N,), and which of them do stay within bounds.
         """
-        chosen, left = np.full(len(w), scales[-1]), np.arange(len(w))
+        chosen, left = np.full(len(w), scales[-1], np.float64), np.arange(len(w))
         for scale in scales:
-            over = self.stage.overstep(scale * w[left], self.models)
+            over = self.stage.overstep(np.asarray(scale * w[left], np.float64), self.models)
             chosen[left] = scale
             left = left[over > 0]
             if not len(left):

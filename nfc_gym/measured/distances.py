@@ -55,7 +55,9 @@ class Distances:
 
     def __init__(self, asks: Sequence[Ask], present: Lens, repeats: float) -> None:
         self.asks = list(asks)
-        self.root = np.linalg.inv(np.median(np.linalg.inv(present.under.inverse_root), 0))
+        self.root: Array = np.asarray(
+            np.linalg.inv(np.median(np.linalg.inv(present.under.inverse_root), 0)), np.float64
+        )
         self.rivals = list({id(a.rival): a.rival for a in asks}.values())
         grams = [self._grams(present.problem, present.under, rival, present.weight) for rival in self.rivals]
         self.known = [repeats * g.sum(0) for g in grams]

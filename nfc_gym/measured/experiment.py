@@ -99,7 +99,7 @@ class Stage:
         speeds = [float(np.linalg.norm(bench.states[log.name].qvel[0])) for log in logs]
         self.start = logs[int(np.argmin(speeds))]
         self.interval = self.start.interval
-        self.time = np.arange(round(seconds / self.interval) + 1) * self.interval
+        self.time: Array = np.arange(round(seconds / self.interval) + 1, dtype=np.float64) * self.interval
         self.room = room(bench, logs, self.start)
         self.envelope: Envelope = envelope(plant.model, [bench.states[log.name] for log in logs])
         moved = [np.stack([log.controls[n] for n in self.room.names], 1) for log in logs]
@@ -144,7 +144,7 @@ class Stage:
         """Commands on the grid of physics steps, from the start log's first state; all other inputs held."""
         model, log, states = self.plant.model, self.start, self.bench.states[self.start.name]
         count, dt = len(commands), float(model.opt.timestep)
-        at = np.arange(round(self.time[-1] / dt)) * dt
+        at: Array = np.arange(round(self.time[-1] / dt), dtype=np.float64) * dt
         ctrl = np.zeros((count, len(at), model.nu))
         laws = self.bench.dataset.mapping.controls
         for i, name in enumerate(self.room.names):
@@ -204,16 +204,17 @@ class Stage:
         """Logs of simulated motions."""
         model = self.plant.model
         sd = self.bench.states[self.start.name]
-        spread = [np.tile(np.median(s, 0), (len(self.time), 1)) for s in (sd.qpos_sd, sd.qvel_sd)]
+        q_sd, v_sd = (np.tile(np.median(s, 0), (len(self.time), 1)) for s in (sd.qpos_sd, sd.qvel_sd))
         base = self.bench.rollouts([self.start], [sd])
         step = (self.time / float(model.opt.timestep))[None]
         step = np.minimum(step, motion.qpos.shape[2] - 1)
         logs, states = [], []
         for i in range(len(commands)):
-            one = Trajectory(*(a[:, i : i + 1] for a in (motion.qpos, motion.qvel)), None, motion.stable[:, i : i + 1])
+            part = slice(i, i + 1)
+            one = Trajectory(motion.qpos[:, part], motion.qvel[:, part], None, motion.stable[:, part])
             at = lambda a: interpolate(a, step, False)[0, 0]  # noqa: E731
             qpos, qvel = at(one.qpos), at(one.qvel)
-            states.append(States(qpos, qvel, np.zeros_like(qvel), *spread, sd.observed))
+            states.append(States(qpos, qvel, np.zeros_like(qvel), q_sd, v_sd, sd.observed))
             channels = {}
             for o in base.observers:
                 old = self.start.channels[o.name]

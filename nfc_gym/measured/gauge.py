@@ -103,7 +103,7 @@ def _sparse(basis: Array) -> list[Array]:
     """Unit vectors that span the same space (f, j), each with as many zeros as elimination can make."""
     if not basis.shape[1]:
         return []
-    _, _, pivots = qr(basis.T, pivoting=True)
+    pivots = qr(basis.T, mode="r", pivoting=True)[-1]
     block = basis[pivots[: basis.shape[1]]]
     reduced = np.linalg.solve(block.T, basis.T)
     return [row / np.linalg.norm(row) for row in reduced]

@@ -56,7 +56,7 @@ def _motions(stage: Stage, motion: Trajectory) -> list[dict[str, Any]]:
         if o.needs_sensors:
             continue
         values = o.predict(motion)[0, 0]
-        time = np.arange(len(values)) * float(stage.plant.model.opt.timestep)
+        time: Array = np.arange(len(values), dtype=np.float64) * float(stage.plant.model.opt.timestep)
         out += [_figure(_title(o, i, values.shape[1]), o.unit, time, values[:, i]) for i in range(values.shape[1])]
     return out
 

@@ -19,7 +19,6 @@ from nfc_gym.measured.fisher import Lens, flat, realistic, sized, without
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.identify import Stakes
 from nfc_gym.measured.metric import loss, metric
-from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.search import Options
 from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.story import rivals_of
@@ -60,15 +59,11 @@ def look(bench: Bench, logs: Sequence[Log], plant: Plant, x: Array, most: int = 
     states = [bench.states[log.name] for log in logs]
     whole = bench.rollouts(logs, states)
     problem = bench.rollouts(logs, states, most=most)
-    lens = Lens(problem, *_metric(problem, plant, x), plant, x)
+    sigma = problem.covariance(plant, x)
+    lens = Lens(problem, metric(problem, sigma, slack(problem, sigma, plant, x)), plant, x)
     repeats = len(whole) / len(problem)
     stakes = Stakes(int(whole.mask.sum()), dispersion(_as_fit(lens)), Options().worth, repeats)
     return Present(lens, repeats, stakes)
-
-
-def _metric(problem: Problem, plant: Plant, x: Array) -> tuple:
-    sigma = problem.covariance(plant, x)
-    return (metric(problem, sigma, slack(problem, sigma, plant, x)),)
 
 
 def _as_fit(lens: Lens) -> Fit:
