@@ -64,8 +64,10 @@ def _chirp(rng: np.random.Generator, time: Array, count: int) -> Array:
 
 def _turns(rng: np.random.Generator, time: Array, count: int) -> Array:
     """One actuator after the other, each for its share of the time."""
-    turn = np.minimum((time / time[-1] * count).astype(int), count - 1)
-    return np.where(turn[:, None] == rng.permutation(count), _sines(rng, time, count, 0.5, 2.0), 0.0)
+    phase = time / time[-1] * count
+    turn = np.minimum(phase.astype(int), count - 1)
+    edge = np.clip(8 * np.minimum(phase - turn, 1 + turn - phase), 0, 1)  # led in and out
+    return np.where(turn[:, None] == rng.permutation(count), edge[:, None] * _sines(rng, time, count, 0.5, 2.0), 0.0)
 
 
 def _stairs(rng: np.random.Generator, time: Array, count: int) -> Array:

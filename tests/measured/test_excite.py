@@ -19,6 +19,7 @@ from typer.testing import CliRunner, Result
 
 from nfc_gym.cli import app
 from nfc_gym.core import InputError
+from nfc_gym.measured.advice import advise
 from nfc_gym.measured.bench import candidates, make_bench
 from nfc_gym.measured.contest import price
 from nfc_gym.measured.dataset import load
@@ -27,6 +28,7 @@ from nfc_gym.measured.fisher import Lens, left_over, span, without
 from nfc_gym.measured.fit import fit
 from nfc_gym.measured.identify import Stakes, table
 from nfc_gym.measured.metric import metric
+from nfc_gym.measured.questions import look, reported
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.saved import to_row
 
@@ -296,6 +298,58 @@ def test_without_a_report_every_effect_is_to_show_at_a_smaller_size(mapping: Pat
     again = excite(mapping, None, tmp_path / "b.csv", seconds=4.0, tries=30, jobs=1)
     assert (tmp_path / "b.csv").read_text() == out.read_text()
     assert again == result
+
+
+POLE = """
+<mujoco>
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="pole">
+      <joint name="pivot" axis="0 1 0" damping="0.01"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="0.3"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="pivot" ctrlrange="-2 2"/></actuator>
+</mujoco>
+"""
+
+
+def test_what_only_a_controller_keeps_upright_gets_a_feed_forward(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(POLE)
+    for seed, name in enumerate(("fit_0", "fit_1", "select", "verify")):
+        rng, data, rows = np.random.default_rng(seed), mujoco.MjData(model), []
+        for k in range(200):
+            q, v = data.qpos[0] + 0.001 * rng.normal(), data.qvel[0] + 0.01 * rng.normal()
+            data.ctrl[0] = 4 * (0.2 * np.sin(0.06 * k + seed) - q) - 0.4 * v
+            rows.append((10 * k, data.ctrl[0], q, v))
+            mujoco.mj_step(model, data, 2)
+        np.savetxt(tmp_path / f"{name}.csv", rows, "%.9g", ",", header="t,torque,q,v", comments="")
+    (tmp_path / "rotor.xml").write_text(POLE)
+    text = MAPPING.replace("joint:shaft", "joint:pivot")
+    both = '  "joint:pivot:pos": {column: q, unit: rad, noise: 0.001}\nsegments:'
+    (tmp_path / "mapping.yaml").write_text(text.replace("segments:", both))
+    result = excite(tmp_path / "mapping.yaml", None, tmp_path / "next.csv", seconds=3.0, tries=10, jobs=1)
+    assert result["kind"] == "feed-forward"
+    assert "add them to the controller's own" in result["sentences"][-1]
+    added = np.loadtxt(tmp_path / "next.csv", delimiter=",", skiprows=1)[:, 1]
+    assert 0 < np.abs(added).max() <= 0.2 * 2  # a fifth of the actuator's room: the rest is the controller's
+    assert added[[0, -1]] == pytest.approx(0)
+
+
+def test_the_report_advises_a_motion_for_what_it_cannot_tell_apart(mapping: Path, closed: Path) -> None:
+    bench = make_bench(load(mapping), 1)
+    logs = [*bench.dataset.of("fit"), *bench.dataset.of("select")]
+    report, plant, x = reported(bench, logs, closed)
+    report["identifiability"] = [{"id": "coulomb:shaft", "worst_mimic": None, "distinguishable": True}]
+    advice = advise(bench, logs, report, look(bench, logs, plant, x), lambda text: None, 0)
+    (row,) = advice.rows
+    assert row["worst_mimic"] == "damping_poly:shaft"
+    assert row["sigma"] < 4
+    assert not row["distinguishable"]
+    (finding,) = advice.findings
+    assert finding["kind"] == "advice"
+    assert "coulomb:shaft and damping_poly:shaft lie" in finding["text"]
+    assert "`nfc-gym excite MAPPING.yaml --fit DIR` writes such commands" in finding["text"]
 
 
 # ---- bad input ------------------------------------------------------------------------------------------------------
