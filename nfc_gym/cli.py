@@ -1,4 +1,4 @@
-"""`nfc-gym`: check, close-loop, predict, demo. Everything heavy is imported inside the command that needs it.
+"""`nfc-gym`: check, close-loop, predict, excite, demo. Everything heavy is imported inside the command that needs it.
 
 Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the same command resumes; 1 a fault of ours.
 """
@@ -137,6 +137,51 @@ def predict(
         from nfc_gym.measured.predict import predict as run
 
         run(mapping, fit, mode.value, stage.value, out, restart=restart)
+
+
+@app.command()
+def excite(
+    ctx: typer.Context,
+    mapping: MappingFile,
+    fit: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="What close-loop wrote: tell its claims from their rivals. Without it: see more."
+        ),
+    ] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", help="Length of the proposed recording.")] = 10.0,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.csv", help="Commands; .json and .html go beside it. Default: excite.csv."),
+    ] = None,
+    seed: Seed = 0,
+    tries: Annotated[int, typer.Option(min=1, help="Motions to try in simulation, at most.")] = 250,
+    budget: Annotated[
+        float, typer.Option(metavar="S", min=1, help="Seconds after which the best so far is taken.")
+    ] = 120,
+    jobs: Annotated[int, typer.Option(min=0, help="Threads; 0 takes all cores.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier proposal.")] = False,
+) -> None:
+    """Propose what to record next: ten seconds of commands that tell apart what the present logs cannot.
+
+    After close-loop, with --fit DIR: for each claim and its equivalents (or its worst mimic), the motion in which they
+    would differ most once everything is refitted. Before it, without --fit: the motion in which every effect would show
+    at the smallest size. Nothing of the machine is touched: the motion is found on the model, inside the actuators' and
+    joints' ranges and within 1.2 times what the logs show.
+
+    FILE.csv holds `time` and one `ctrl:` column an actuator, in the mapping's own units; FILE.json what is expected, in
+    sigma, before and after; FILE.html a picture. A machine that only its controller keeps upright gets a feed-forward,
+    to be added to the controller's commands. The new log goes into the mapping like any other; then close-loop again.
+
+    Example: nfc-gym excite mapping.yaml --fit result --out next.csv
+    """
+    with _outcome(ctx):
+        from nfc_gym.measured.excite import excite as run
+
+        run(
+            mapping, fit, out, seconds=seconds, seed=seed, tries=tries, budget=budget, jobs=jobs, overwrite=overwrite,
+            console=Console(),
+        )  # fmt: skip
 
 
 @app.command()

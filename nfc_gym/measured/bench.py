@@ -53,6 +53,11 @@ class Bench:
         if self.mode != "rollout":
             kind = InverseProblem if self.mode == "inverse" else ForwardProblem
             return kind(model, logs, states, segments.length, max(1, -(-sum(map(len, self.dataset.logs)) // _SAMPLES)))
+        return self.rollouts(logs, states, most)
+
+    def rollouts(self, logs: Sequence[Log], states: Sequence[States], most: int | None = None) -> RolloutProblem:
+        """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs."""
+        segments, model = self.dataset.mapping.segments, self.plant.model
         controls = self.dataset.mapping.controls
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")

@@ -84,10 +84,20 @@ def judge(
     blocks = clusters(select)
     both = np.concatenate([gains, fit_gains])
     draws = bootstrap(both, np.concatenate([blocks, fit_blocks + int(blocks.max()) + 1]), rng)
-    # Schwarz's price of a parameter: which law is at work is asked, and not only which predicts best.
     count = int(problem.mask.sum()) + int(select.mask.sum())
-    total = float(both.sum()) - np.log(max(count, 2)) * extra * dispersion(base)
+    total = float(both.sum()) - price(count, extra, dispersion(base))
     return Judged(fitted, gains, fit_gains, total, float(np.quantile(draws, 0.005)))
+
+
+def price(count: int, extra: int, dispersion: float) -> float:
+    """Schwarz's price (1978) of parameters: which law is at work is asked, and not only which predicts best.
+
+    Args:
+      count: numbers that are compared.
+      extra: parameters that the candidate adds.
+      dispersion: loss per number of the model without it.
+    """
+    return float(np.log(max(count, 2)) * extra * dispersion)
 
 
 def left_out_losses(problem: Problem, under: Metric, fitted: Fit, folds: NDArray[np.intp]) -> Array:

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -15,18 +15,25 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.log import Log
 from nfc_gym.measured import verdict as say
+from nfc_gym.measured.advice import advise
 from nfc_gym.measured.arena import Data
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
+from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.details import details
 from nfc_gym.measured.export import corrected, effects_of, pack, unpack
+from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.identify import Stakes, table
 from nfc_gym.measured.maps import maps
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.questions import Present, blocks_for
+from nfc_gym.measured.remarks import on_parameters
 from nfc_gym.measured.report import render, render_summary
 from nfc_gym.measured.rounds import Round
 from nfc_gym.measured.search import Found, Options, Search
@@ -34,10 +41,12 @@ from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole
 from nfc_gym.measured.unexplained import unexplained
+from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
 _REPLICAS = 6
+_SOME_LOGS = 6  # that the identifiability table of an instant problem is made from
 
 
 @dataclass
@@ -180,7 +189,13 @@ def _fold(
     select = bench.problem(selecting, most=max(40, int(_WORK / steps)))
     found = _search(run, fitting, work, select)
     final = _final(run, found, whole)
+    pool = candidates(bench, [*fitting, *selecting])
+    known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
     report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole)
+    report["identifiability"] = table(known.lens, pool, known.stakes)
+    advice = advise(bench, [*fitting, *selecting], report, known, tell, seed)
+    report["identifiability"] = advice.rows
+    report["findings"] += advice.findings
     report["seconds"] = round(time.monotonic() - began, 1)
     _write(out, bench, final, report)
     tell(
@@ -191,6 +206,8 @@ def _fold(
         tell(
             f"[bold]UNEXPLAINED[/bold] at {report['unexplained']['coordinate']}: {report['unexplained']['description']}"
         )
+    for finding in report["findings"]:
+        tell(finding["text"])
     return report
 
 
@@ -250,8 +267,30 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
     return out[0], out[1]
 
 
+def _identify(
+    run: _Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem], pool: Sequence[Effect]
+) -> Present:
+    """The logs that the search worked with, seen from the fitted model, and what it charged."""
+    run.say("what these logs could have shown")
+    bench, plant = run.bench, fitted.plant
+    # An instant problem evaluates whole logs: some of them must do.
+    some = logs if bench.mode == "rollout" else logs[:: -(-len(logs) // _SOME_LOGS)]
+    problem = bench.problem(some, most=blocks_for(len(pool)))
+    sigma = problem.covariance(plant, fitted.x)
+    lens = Lens(problem, metric(problem, sigma, slack(problem, sigma, plant, fitted.x)), plant, fitted.x)
+    count = sum(int(p.mask.sum()) for p in searched)
+    repeats = sum(map(len, searched)) / len(problem)
+    return Present(lens, repeats, Stakes(count, dispersion(fitted), Options().worth, repeats))
+
+
 def _report(
-    run: _Run, dataset: Dataset, fold: Fold, found: Found, final: tuple[Fit, Fit], problem: Problem, whole: Problem
+    run: _Run,
+    dataset: Dataset,
+    fold: Fold,
+    found: Found,
+    final: tuple[Fit, Fit],
+    problem: Problem,
+    whole: Problem,
 ) -> dict[str, Any]:
     calibrated, extended = final
     rng = np.random.default_rng(run.seed)
@@ -266,13 +305,14 @@ def _report(
     verdict = say.verdict(v, len(claimed), found.generic is not None or bool(proposed))
     left = verdict in ("unexplained", "partly explained")
     splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
+    parameters = say.parameter_rows(extended, nominal[1], whole)
     return {
         "schema": 1,
         "model": dataset.mapping.model_file,
         "fold": fold.name,
         "logs": splits,
         "independent_splits": dataset.independent_splits,
-        "parameters": say.parameter_rows(extended, nominal[1], whole),
+        "parameters": parameters,
         "effects": claimed,
         "proposals": proposed,
         "verdict": verdict,
@@ -284,7 +324,8 @@ def _report(
             "null_95": say.null_bound(v),
             "extended_over_calibrated_95": say.gain_interval(v, rng),
         },
-        "identifiability": say.identifiability(found),
+        "identifiability": [],
+        "findings": on_parameters(extended, parameters),
         "rounds": [r.__dict__ for r in (*found.rounds, *found.rest.rounds)],
         "noise": _noise(run.bench, dataset, fold),
         "details": details(run.bench, v, models, dataset.of("verify", fold))

@@ -30,7 +30,7 @@ def render(report: Row, shown: Row) -> str:
     """
     stages = [s for s in STAGES if s != "extended" or story.added(report)]
     misfit = shown.get("misfit") or {}
-    return _page(
+    return page(
         "report.html.j2",
         report=report,
         verdict=story.verdict_of(report),
@@ -63,7 +63,7 @@ def render_summary(summary: Row) -> str:
     tally: dict[str, int] = {}
     for f in folds:
         tally[f["verdict"].word] = tally.get(f["verdict"].word, 0) + 1
-    return _page(
+    return page(
         "summary.html.j2",
         report=summary,
         folds=folds,
@@ -72,7 +72,8 @@ def render_summary(summary: Row) -> str:
     )
 
 
-def _page(template: str, **values: Any) -> str:
+def page(template: str, **values: Any) -> str:
+    """One of `templates` with its values: a self-contained page."""
     # autoescape for every file: `select_autoescape` would pass over names that end in .j2
     env = Environment(
         loader=PackageLoader("nfc_gym.measured", "templates"),

@@ -191,8 +191,10 @@ def notices(report: dict[str, Any]) -> list[str]:
             "independent, and the errors may be too rosy. Record more logs to be sure."
         )
     out += _on_effects(report)
+    findings = report.get("findings") or []
+    out += [str(f.get("text")) for f in findings]
     moved = [p.get("name") for p in parameters if p.get("left_prior")]
-    if moved:
+    if moved and not any(f.get("kind") == "left_prior" for f in findings):
         out.append(
             f"{listed(moved)} {'lies' if len(moved) == 1 else 'lie'} at the bound of the allowed range. Either "
             "the range is too narrow, or the parameter stands in for something else."

@@ -61,6 +61,17 @@ def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
     return np.asarray(values, np.float64) * factor + offset
 
 
+def from_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
+    """The inverse of `to_si`: `from_si(pi, "deg")` is 180."""
+    _, factor, offset = _row(unit)
+    return (np.asarray(values, np.float64) - offset) / factor
+
+
+def change_from_si(changes: ArrayLike, unit: str) -> NDArray[np.float64]:
+    """Differences of SI values, any shape, in `unit`: scaled, but not shifted."""
+    return np.asarray(changes, np.float64) / _row(unit)[1]
+
+
 def spread_to_si(deviation: float, unit: str) -> float:
     """A standard deviation in `unit`, in SI: scaled, but not shifted as a temperature in degC would be."""
     return deviation * _row(unit)[1]

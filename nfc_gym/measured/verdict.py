@@ -183,31 +183,6 @@ def effect_rows(
     return rows
 
 
-def identifiability(found: Found) -> list[dict[str, Any]]:
-    """For each candidate of the last screening the smallest size that would show, and its worst mimic."""
-    kept = [s for s in found.screened if s.columns.shape[1]]
-    columns = [c / max(np.linalg.norm(c), 1e-12) for c in (s.columns @ np.ones(s.columns.shape[1]) for s in kept)]
-    if not columns:
-        return []
-    like = np.abs(np.array(columns) @ np.array(columns).T)
-    np.fill_diagonal(like, 0)
-    rows = []
-    for i, s in enumerate(kept):
-        first = next(j for j, p in enumerate(s.effect.params) if not p.shape)
-        size = float(np.linalg.norm(s.columns[:, 0]))
-        j = int(like[i].argmax())
-        rows.append(
-            {
-                "id": s.effect.id,
-                "smallest_detectable": None if size < 1e-6 else float(abs(s.probe[0]) * 3.3 / size),
-                "unit": s.effect.params[first].unit,
-                "worst_mimic": kept[j].effect.id if len(kept) > 1 else None,
-                "distinguishable": bool(like[i, j] < 0.95),
-            }
-        )
-    return rows
-
-
 def excess_shares(v: Verified, problem: Problem, fitted: Fit, calibrated: tuple[Plant, Array]) -> dict[str, float]:
     """Share of the excess chi-squared that comes back when each effect alone is taken out, on the verification logs."""
     measure = metric(problem, v.sigma)

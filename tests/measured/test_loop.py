@@ -141,7 +141,7 @@ def test_the_report_has_the_promised_keys(closed: Closed) -> None:
     assert same(report, closed.report)
     assert set(report) >= {
         "schema", "model", "logs", "independent_splits", "parameters", "effects", "verdict", "unexplained", "error",
-        "chi2", "identifiability", "seconds", "seed", "versions",
+        "chi2", "identifiability", "findings", "seconds", "seed", "versions",
     }  # fmt: skip
     assert report["schema"] == 1
     assert report["model"] == "arm.xml"

@@ -1,0 +1,98 @@
+"""What to record next: for each claim that the logs cannot tell from a rival, the kind of motion that would.
+
+Not a table of sayings: families of motion are tried on the model, and the one in which the two explanations come to lie
+farthest apart is named (`design`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.log import Log
+from nfc_gym.measured.bench import Bench
+from nfc_gym.measured.design import Design
+from nfc_gym.measured.distances import Ask, Distances
+from nfc_gym.measured.experiment import Stage
+from nfc_gym.measured.questions import TOLD, Present, look, rivalries
+from nfc_gym.measured.wording import number
+
+_SECONDS = 5.0  # of the motions that are compared: families differ in kind, not in length
+_DRAWS = 1  # of each family
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What was found out.
+
+    Attributes:
+      rows: the identifiability table, the rows of claims with `sigma`: how far their nearest rival lies in these logs.
+      findings: in words, for `report.json`.
+    """
+
+    rows: list[dict[str, Any]]
+    findings: list[dict[str, Any]]
+
+
+def advise(
+    bench: Bench, logs: Sequence[Log], report: dict[str, Any], present: Present, say: Callable[[str], None], seed: int
+) -> Advice:
+    """Measure how far each claim lies from its rivals, and look for a motion where that is too near.
+
+    Args:
+      report: `effects` and `identifiability`, as in `report.json`.
+      present: the logs at hand, seen from the extended model.
+    """
+    rows = [dict(r) for r in report["identifiability"]]
+    asks, pairs, _ = rivalries(bench, logs, report, present)
+    if not asks:
+        return Advice(rows, [])
+    say("how far the claims lie from their rivals")
+    before = Distances(asks, present.lens, present.repeats).before.reshape(-1, 2).min(1)
+    for row in rows:
+        own = [(s, rival) for s, (claim, rival) in zip(before, pairs, strict=True) if claim == row["id"]]
+        if own:
+            sigma, rival = min(own)
+            row |= {"sigma": float(sigma), "worst_mimic": rival, "distinguishable": bool(sigma > TOLD)}
+    near = [i for i, s in enumerate(before) if s <= TOLD]
+    if not near:
+        return Advice(rows, [])
+    open_asks = [a for i in near for a in asks[2 * i : 2 * i + 2]]
+    told = _best_motion(bench, logs, present, open_asks, say, seed)
+    findings = []
+    for k, i in enumerate(near):
+        claim, rival = pairs[i]
+        text = f"{claim} and {rival} lie {number(before[i], 2)} sigma apart in these logs, too near to choose."
+        findings.append({"kind": "advice", "text": f"{text} {told(k)}"})
+    return Advice(rows, findings)
+
+
+def _best_motion(
+    bench: Bench, logs: Sequence[Log], present: Present, asks: list[Ask], say: Callable[[str], None], seed: int
+) -> Callable[[int], str]:
+    """What to say of each pair: the family of motion that separates the worst of them most."""
+    try:
+        say("which motion would tell them apart")
+        stage = Stage(bench, present.lens.plant, present.lens.x, logs, _SECONDS)
+        seen = present if bench.mode == "rollout" else look(bench, logs, present.lens.plant, present.lens.x)
+        design = Design(Distances(asks, seen.lens, seen.repeats), stage, rivals=True)
+        best = design.families(np.random.default_rng(seed), _DRAWS)[0]
+    except InputError as e:
+        why = str(e)
+        return lambda k: f"{why[:1].upper()}{why[1:]}."
+    added = "" if stage.open_loop else " added to what the controller commands"
+    command = "`nfc-gym excite MAPPING.yaml --fit DIR` writes such commands."
+
+    def told(k: int) -> str:
+        sigma = float(best.answers[2 * k : 2 * k + 2].min())
+        size = f"{number(100 * best.amplitude, 2)} % of the commands' range"
+        if sigma <= TOLD:
+            return (
+                f"None of the kinds of motion that were tried does better than {number(sigma, 2)} sigma in "
+                f"{_SECONDS:g} s; another sensor may."
+            )
+        return f"{_SECONDS:g} s of {best.family.say}{added}, {size}, would make it {number(sigma, 2)}: {command}"
+
+    return told

@@ -1,0 +1,262 @@
+"""`excite`: commands for the next recording, such that it tells apart what the present logs cannot."""
+
+import json
+import time
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import write_whole
+from nfc_gym.measured import questions, units
+from nfc_gym.measured.bench import Bench, candidates, make_bench
+from nfc_gym.measured.checks import require
+from nfc_gym.measured.contest import losses
+from nfc_gym.measured.design import Design, Tried
+from nfc_gym.measured.distances import Distances
+from nfc_gym.measured.experiment import Stage
+from nfc_gym.measured.fit import fit
+from nfc_gym.measured.metric import metric
+from nfc_gym.measured.proposal_page import render
+from nfc_gym.measured.questions import TOLD, Present, Visible
+from nfc_gym.measured.wording import number
+
+Array = NDArray[np.float64]
+_ROUNDS = 8  # iterations of a rival's refit to the simulated recording
+_SHORTEST, _LONGEST = 1.0, 120.0  # s
+
+
+@dataclass
+class _Task:
+    """What the steps share."""
+
+    bench: Bench
+    present: Present
+    design: Design
+    pairs: list[tuple[str, str]]
+    effects: list[Visible]
+
+
+def excite(
+    mapping: Path,
+    fit: Path | None = None,
+    out: Path | None = None,
+    *,
+    seconds: float = 10.0,
+    seed: int = 0,
+    tries: int = 250,
+    budget: float = 120.0,
+    jobs: int = 0,
+    overwrite: bool = False,
+    console: Console | None = None,
+) -> dict[str, Any]:
+    """Propose commands that best tell apart what the present logs leave open.
+
+    Args:
+      mapping: the mapping file.
+      fit: folder that `close_loop` wrote: its claims are told from their rivals; None asks for the motion in which
+        every effect would show at the smallest size.
+      out: CSV file of the commands, in the mapping's own units; beside it go the same name with .json (what is
+        expected of them) and .html (a picture). None is `excite.csv` beside the mapping.
+      seconds: how long.
+      seed: the same inputs, seed and number of tries give the same commands, unless the budget ends them.
+      tries: sequences that are rolled out, at most.
+      budget: s, after which the best so far is taken.
+      jobs: threads of the roll-outs; 0 takes every core.
+      overwrite: replace such files.
+      console: where progress goes; None is silent.
+
+    Returns:
+      What the JSON file holds.
+
+    Raises:
+      InputError: bad input, or nothing can be proposed, and why.
+    """
+    if not _SHORTEST <= seconds <= _LONGEST:
+        raise InputError(f"--seconds {seconds:g}: want {_SHORTEST:g} to {_LONGEST:g}")
+    out = _outputs(out if out is not None else mapping.with_name("excite.csv"), overwrite)
+    mujoco.set_mju_user_warning(lambda message: None)
+    began = time.monotonic()
+
+    def say(text: str) -> None:
+        if console:
+            console.print(f"[dim]{time.monotonic() - began:6.1f} s[/dim]  {text}", highlight=False)
+
+    bench = make_bench(require(mapping)[0], jobs)
+    task, report = _task(bench, fit, seconds, seed, say)
+    stage = task.design.stage
+    if not stage.open_loop:
+        say("the resting command alone does not keep this machine up: proposing a feed-forward to its controller's")
+    last = [0.0]
+
+    def tick(done: int, best: float) -> None:
+        if time.monotonic() - last[0] > 2 or done >= tries:
+            last[0] = time.monotonic()
+            say(f"{done} of at most {tries} motions tried; best so far {best:.3g}")
+
+    rng = np.random.default_rng(seed)
+    best, done = task.design.search(rng, tries, budget, tick)
+    result = _result(task, best, done, report) | {"seconds": seconds, "seed": seed}
+    _verify(task, best, result, rng, say)
+    _write(out, bench, stage, best, result)
+    for line in result["sentences"]:
+        say(line)
+    say(f"written: {out}, {out.with_suffix('.json').name}, {out.with_suffix('.html').name}")
+    return result
+
+
+def _outputs(out: Path, overwrite: bool) -> Path:
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"--out {out}: the commands are a CSV file; name it so, {out.with_suffix('.csv').name}")
+    if not out.parent.is_dir():
+        raise InputError(f"--out {out}: no such folder as {out.parent}")
+    for path in (out, out.with_suffix(".json"), out.with_suffix(".html")):
+        if path.exists() and not overwrite:
+            raise InputError(f"{path} exists: choose another --out, or say --overwrite to replace it")
+    return out
+
+
+def _task(bench: Bench, folder: Path | None, seconds: float, seed: int, say: Any) -> tuple[_Task, dict[str, Any]]:
+    """The questions, and where answers are tried."""
+    logs = [log for log in bench.dataset.logs if bench.dataset.splits[log.name] != "verify"] or list(bench.dataset.logs)
+    report: dict[str, Any] = {}
+    if folder is None:
+        say("calibrating psi")
+        plant, x = questions.calibrated(bench, logs, seed)
+    else:
+        report, plant, x = questions.reported(bench, logs, folder)
+    stage = Stage(bench, plant, x, logs, seconds)
+    say("looking at the present logs")
+    present = questions.look(bench, logs, plant, x)
+    asks, pairs, skipped = questions.rivalries(bench, logs, report, present) if plant.effects else ([], [], [])
+    if skipped:
+        say(f"passed over, since it is no single effect: {', '.join(skipped)}")
+    effects: list[Visible] = []
+    if not asks:
+        if folder is not None:
+            say("the report leaves no rival explanations: asking for the motion in which most would show")
+        taken = {e.id for e in plant.effects}
+        pool = [e for e in candidates(bench, logs) if not e.generic and e.id not in taken]
+        present = questions.look(bench, logs, plant, x, questions.blocks_for(len(pool)))
+        effects = questions.visibilities(pool, present)
+        asks = [v.ask for v in effects]
+        if not asks:
+            raise InputError("no effect of the library can be at work in this model: there is nothing to look for")
+        if len(pool) > len(asks):
+            say(f"designing for {len(asks)} of {len(pool)} effects, the hardest to see of each family")
+    design = Design(Distances(asks, present.lens, present.repeats), stage, rivals=bool(pairs))
+    return _Task(bench, present, design, pairs, effects), report
+
+
+def _result(task: _Task, best: Tried, done: int, report: dict[str, Any]) -> dict[str, Any]:
+    """What is expected of the commands, and the sentences that say so."""
+    stage = task.design.stage
+    kind = "commands" if stage.open_loop else "feed-forward"
+    rows = _pair_rows(task, best) if task.pairs else _size_rows(task, best)
+    sentences = [_pair_sentence(r) for r in rows] if task.pairs else [_size_sentence(rows)]
+    if not stage.open_loop:
+        sentences.append(
+            "These are no commands by themselves: add them to the controller's own. The machine was followed segment "
+            "by segment from recorded states; what the controller does against them is not in the figures."
+        )
+    key = "pairs" if task.pairs else "sizes"
+    return {
+        "schema": 1,
+        "model": task.bench.dataset.mapping.model_file,
+        "kind": kind,
+        "motion": f"{best.family.say}, improved",
+        key: rows,
+        "sentences": sentences,
+        "tried": done,
+        "starts_from": stage.start.name if stage.open_loop else [log.name for log, _ in stage.recorded],
+        "verdict": report.get("verdict"),
+        "versions": {"nfc_gym": version("nfc_gym"), "mujoco": mujoco.__version__},
+    }
+
+
+def _pair_rows(task: _Task, best: Tried) -> list[dict[str, Any]]:
+    rows = []
+    for i, (claim, rival) in enumerate(task.pairs):
+        before, after = (float(a[2 * i : 2 * i + 2].min()) for a in (task.design.distances.before, best.answers))
+        row = {"claim": claim, "rival": rival, "sigma_before": before, "sigma_after": after}
+        rows.append(row | {"told_apart": after > TOLD})
+    return rows
+
+
+def _pair_sentence(row: dict[str, Any]) -> str:
+    """Before and after, and whether that is enough."""
+    enough = "enough to tell them apart" if row["told_apart"] else f"still less than the {TOLD:g} that tells them apart"
+    return (
+        f"{row['claim']} and {row['rival']} lie {number(row['sigma_before'], 2)} sigma apart in the present logs, and "
+        f"would lie {number(row['sigma_after'], 2)} apart with this motion: {enough}."
+    )
+
+
+def _size_rows(task: _Task, best: Tried) -> list[dict[str, Any]]:
+    rows = []
+    for seen, before, after in zip(task.effects, task.design.distances.before, best.answers, strict=True):
+        i = next(i for i, p in enumerate(seen.effect.params) if not p.shape)
+        size, needed = abs(float(seen.theta[i] - seen.effect.params[i].null)), seen.ask.needed
+        smallest = [size * needed / v if v > 1e-3 * needed else None for v in map(float, (before, after))]
+        keys = ("smallest_detectable_before", "smallest_detectable_after")
+        rows.append({"id": seen.effect.id, "unit": seen.effect.params[i].unit} | dict(zip(keys, smallest, strict=True)))
+    return rows
+
+
+def _size_sentence(rows: list[dict[str, Any]]) -> str:
+    ratios = [
+        r["smallest_detectable_before"] / r["smallest_detectable_after"]
+        for r in rows
+        if r["smallest_detectable_before"] and r["smallest_detectable_after"]
+    ]
+    new = sum(r["smallest_detectable_before"] is None and r["smallest_detectable_after"] is not None for r in rows)
+    text = (
+        f"With this motion {len(rows)} effects would show at sizes {number(float(np.median(ratios)), 2)} times smaller"
+        if ratios
+        else ""
+    )
+    shown = f"{new} that the present logs do not show at all would show" if new else ""
+    return "; ".join(t for t in (text, shown) if t) + " (median)." if text or shown else "No motion shows more."
+
+
+def _verify(task: _Task, best: Tried, result: dict[str, Any], rng: np.random.Generator, say: Any) -> None:
+    """Simulate the recording, noise included, and refit each rival to it without straight lines: how far it stays off.
+
+    The expected figures above are linear and count the present logs too; these count the new recording alone.
+    """
+    if not task.pairs:
+        return
+    plant, x = task.present.lens.plant, task.present.lens.x
+    new = task.design.stage.data(best.w[None]).synthetic(plant, x, rng)
+    under = metric(new, new.covariance(plant, x))
+    for i, row in enumerate(result["pairs"]):
+        other = task.design.distances.asks[2 * i].rival
+        say(f"refitting {row['rival']} to a simulated recording")
+        rival = fit(new, under, other.plant, other.x, _ROUNDS)
+        own = fit(new, under, plant, x, _ROUNDS)
+        gap = float(losses(new, under, rival).sum() - losses(new, under, own).sum())
+        row["sigma_refitted"] = float(np.sqrt(max(gap, 0.0)))
+
+
+def _write(out: Path, bench: Bench, stage: Stage, best: Tried, result: dict[str, Any]) -> None:
+    """CSV in the mapping's units, JSON and a picture; the CSV last, since it is what is used."""
+    mapping = bench.dataset.mapping
+    commands = stage.commands(best.w)
+    columns = {"time": units.from_si(stage.time, mapping.time.unit)}
+    for i, name in enumerate(stage.room.names):
+        convert = units.from_si if stage.open_loop else units.change_from_si
+        columns[name] = convert(commands[:, i], mapping.controls[name].unit)
+    lines = [",".join(columns), *(",".join(f"{v:.9g}" for v in row) for row in np.stack(list(columns.values()), 1))]
+    shown = {n: (mapping.controls[n].unit, columns[n]) for n in stage.room.names}
+    motion = None
+    if stage.open_loop:
+        motion = stage.motion(commands[None], [(stage.plant, stage.x)])[0][0]
+    write_whole(out.with_suffix(".json"), json.dumps(result, indent=1))
+    write_whole(out.with_suffix(".html"), render(result, stage, shown, motion))
+    write_whole(out, "\n".join(lines) + "\n")
