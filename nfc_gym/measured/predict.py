@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import replacing, require_writable
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench, make_bench
 from nfc_gym.measured.dataset import Dataset, load
@@ -38,6 +39,9 @@ def predict(
     Raises:
       InputError: the fit does not belong to the mapping, or a model is unstable on a log.
     """
+    if out.is_dir():
+        raise InputError(f"{out} is a folder: name the file to write in it, as --out {out / 'predicted.npz'}")
+    require_writable(out.parent)
     dataset = load(mapping)
     bench = make_bench(dataset)
     models = _models(bench, dataset, fit, stage)
@@ -48,9 +52,9 @@ def predict(
             plant, x = models[fold.name]
             results |= _predict(bench, plant, x, logs, mode, restart)
     joined = _join(results)
-    part = out.with_name(f".{out.name}.part.npz")
-    np.savez_compressed(part, **joined)  # type: ignore[arg-type]
-    part.replace(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(out) as part, open(part, "wb") as handle:
+        np.savez_compressed(handle, **joined)  # type: ignore[arg-type]
     return joined
 
 

@@ -5,9 +5,10 @@ with secants for the screening; a moving-block bootstrap (Kuensch 1989) for what
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.contest import Judged
@@ -17,7 +18,9 @@ from nfc_gym.measured.rounds import Contest, Round
 from nfc_gym.measured.screen import Screen, Screened
 from nfc_gym.measured.settle import settle
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.rollout import Plant
 
+Array = NDArray[np.float64]
 Say = Callable[[str], None]
 
 
@@ -36,6 +39,22 @@ class Options:
     worth: float = 0.02
     short: int = 8
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a search stands between two rounds: all that the rounds to come depend on, besides data and options.
+
+    Attributes:
+      plant, x: the model that the next round starts from, as the last round's contest left it.
+      rounds: so far.
+      hopeless: places that showed nothing (`Lookout.hopeless`).
+    """
+
+    plant: Plant
+    x: Array
+    rounds: tuple[Round, ...] = ()
+    hopeless: frozenset[str] = field(default_factory=frozenset)
 
 
 @dataclass
@@ -68,45 +87,52 @@ class Search:
         self.rng = np.random.default_rng(options.seed)
         self.lookout = Lookout(fit_data.problem, self.rng, say)
 
-    def settle(self, current: Fit, polished: bool = False) -> Arena:
+    def settle(self, plant: Plant, x: Array, polished: bool = False) -> Arena:
         """The arena of the round that starts from a model, which is refitted first."""
         data, seed = self.fit_data, None if polished else self.options.seed
-        fitted, under, extra = settle(data.problem, data.sigma, current.plant, current.x, seed)
+        fitted, under, extra = settle(data.problem, data.sigma, plant, x, seed)
         return Arena(data, self.select, fitted, under, extra, self.rng, self.say)
 
     def run(
-        self,
-        calibrated: Fit,
-        begun: tuple[Fit, list[Round]] | None = None,
-        keep: Callable[[Fit, list[Round]], None] = lambda current, rounds: None,
+        self, calibrated: Fit, begun: State | None = None, keep: Callable[[State], None] = lambda state: None
     ) -> Found:
         """Greedy rounds from a calibrated model until nothing more is believed; then the generic alternatives' turn.
 
         Args:
           calibrated: psi alone, fitted.
-          begun: model and rounds of a search that was interrupted, to go on from.
-          keep: called with model and rounds after every round that accepted something.
+          begun: state of a search that was interrupted, to go on from; the outcome is that of one that was not.
+          keep: called with the state after every round that accepted something.
         """
-        current, rounds = begun or (calibrated, [])
-        arena = self.settle(current, polished=True)
+        state = begun or State(calibrated.plant, calibrated.x)
+        self.lookout.hopeless = set(state.hopeless)
+        rounds = list(state.rounds)
         while True:
+            arena = self._begin(state)
             screen = Screen(self.fit_data.problem, arena.under, arena.current)
             screened = self.lookout.closer(screen, self.lookout.screen(screen, self.named))
             outcome, best = Contest(arena, screen, screened, self.options.short, self.options.worth).hold()
             rounds.append(outcome)
             if best is None or len(arena.current.plant.effects) >= self.options.most:
                 break
-            arena = self.settle(best.fitted)
-            current = self._prune(arena)
-            if current is not arena.current:
-                arena = self.settle(current, polished=True)
-            keep(arena.current, rounds)
+            state = State(best.fitted.plant, best.fitted.x, tuple(rounds), frozenset(self.lookout.hopeless))
+            keep(state)
         generic = self._generic(arena, screen, outcome)
         current = arena.current
         if generic is not None and current.plant.effects and self._outdone(arena, generic, calibrated):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
             current = fit(self.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6)
         return Found(calibrated, current, rounds, generic, screened)
+
+    def _begin(self, state: State) -> Arena:
+        """The arena of the round that follows a state.
+
+        Each round draws from a generator of its own: what it draws does not depend on which rounds ran before it in
+        this process, and a search that goes on after an interruption draws the same.
+        """
+        self.rng = self.lookout.rng = np.random.default_rng([self.options.seed, len(state.rounds)])
+        arena = self.settle(state.plant, state.x, polished=not state.rounds)
+        current = self._prune(arena) if state.rounds else arena.current
+        return arena if current is arena.current else self.settle(current.plant, current.x, polished=True)
 
     def _prune(self, arena: Arena) -> Fit:
         """Drop earlier effects that the later ones have made superfluous."""
