@@ -30,10 +30,11 @@ from nfc_gym.measured.model import model_path
 from nfc_gym.measured.numerics import fingerprint, one_blas_thread
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.report import render, render_summary
-from nfc_gym.measured.search import Found, Options, Search
+from nfc_gym.measured.search import Found, Options, Search, State
 from nfc_gym.measured.settle import TURNS, settle
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole, written_by
+from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
@@ -233,13 +234,30 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     sigma = work.covariance(plant, x)
     calibrated = stand(work, metric(work, sigma), plant, x)
     pool = candidates(bench, fitting)
-    data = Data(work, sigma)
-    search = Search(data, Data(select, select.covariance(plant, x)), pool, Options(seed=run.seed), run.say)
+    if run.stages.get("found") is None:
+        data = Data(work, sigma), Data(select, select.covariance(plant, x))
+        _keep_found(run.stages, _hunt(run, Search(*data, pool, Options(seed=run.seed), run.say), calibrated, pool))
+    kept = run.stages.get("found")
+    state = unpack_state(kept, plant, pool)
+    assert state is not None  # every effect that was found is one of the pool's
+    under = metric(work, sigma, np.array(kept["slack"], float))
+    extended = stand(work, under, state.plant, state.x)
+    return Found(calibrated, extended, np.array(kept["slack"], float), list(state.rounds), kept["generic"], [])
+
+
+def _hunt(run: _Run, search: Search, calibrated: Fit, pool: list[Effect]) -> Found:
+    """The search, from where it was interrupted if it was."""
     saved = run.stages.get("search")
-    begun = unpack_state(saved, plant, pool) if saved else None
+    begun = unpack_state(saved, run.bench.plant, pool) if saved else None
     if begun:
         run.say(f"going on after {len(begun.rounds)} rounds of the search")
     return search.run(calibrated, begun, lambda state: run.stages.put("search", pack_state(state)))
+
+
+def _keep_found(stages: Stages, found: Found) -> None:
+    state = State(found.extended.plant, found.extended.x, tuple(found.rounds))
+    rest = {"slack": found.slack.tolist(), "generic": found.generic, "identifiability": say.identifiability(found)}
+    stages.put("found", pack_state(state) | rest)
 
 
 def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
@@ -285,7 +303,7 @@ def _report(
             "null_95": say.null_bound(v),
             "extended_over_calibrated_95": say.gain_interval(v, rng),
         },
-        "identifiability": say.identifiability(found),
+        "identifiability": run.stages.get("found")["identifiability"],
         "rounds": [r.__dict__ for r in found.rounds],
         "noise": _noise(run.bench, dataset, fold),
         "details": details(run.bench, v, models, dataset.of("verify", fold)),

@@ -64,15 +64,17 @@ class Found:
     Attributes:
       calibrated: psi alone, fitted.
       extended: psi and the accepted effects, fitted.
+      slack: (m,) that of the metric of the last round, under which `extended` was fitted.
       rounds: in order, the last one being the round that accepted nothing.
-      generic: a generic alternative that beat every named effect, or None.
+      generic: id of a generic alternative that beat every named effect, or None.
       screened: the last round's screening, from which the identifiability table is made.
     """
 
     calibrated: Fit
     extended: Fit
+    slack: Array
     rounds: list[Round]
-    generic: Judged | None
+    generic: str | None
     screened: list[Screened]
 
 
@@ -121,7 +123,8 @@ class Search:
         if generic is not None and current.plant.effects and self._outdone(arena, generic, calibrated):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
             current = fit(self.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6)
-        return Found(calibrated, current, rounds, generic, screened)
+        label = None if generic is None else arena.label(generic)
+        return Found(calibrated, current, arena.extra, rounds, label, screened)
 
     def _begin(self, state: State) -> Arena:
         """The arena of the round that follows a state.
