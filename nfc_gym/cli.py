@@ -4,7 +4,9 @@ Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the sa
 """
 
 import errno
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -156,7 +158,8 @@ def demo(
 def _outcome(ctx: typer.Context, resumes: bool = False) -> Iterator[None]:
     """Turn whatever a command raises into one clear message on stderr and the exit code that goes with it."""
     try:
-        yield
+        with _terminable():
+            yield
     except typer.Exit:
         raise
     except KeyboardInterrupt:
@@ -171,6 +174,23 @@ def _outcome(ctx: typer.Context, resumes: bool = False) -> Iterator[None]:
         _fail(ctx, BAD_INPUT, f"{e.filename}: {refusal}" if e.filename else refusal)
     except Exception as e:
         _fault(ctx, e)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """A request to terminate (SIGTERM, as job schedulers send it) interrupts like Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
+        yield
+        return
+
+    def interrupt(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _fail(ctx: typer.Context, code: int, message: str) -> NoReturn:

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -33,7 +33,7 @@ from nfc_gym.measured.report import render, render_summary
 from nfc_gym.measured.search import Found, Options, Search, State
 from nfc_gym.measured.settle import TURNS, settle
 from nfc_gym.measured.splits import Fold
-from nfc_gym.measured.stages import Stages, digest, write_whole, written_by
+from nfc_gym.measured.stages import Stages, digest, require_free, write_whole, written_by
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
@@ -107,21 +107,29 @@ def _close_loop(
         return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)
     if fold is not None:  # other folds may be running beside this one; the summary is the whole run's
         return _fold(bench, dataset, folds[0], out / fold, seed, digest(extra=key + fold), overwrite, resume, console)
+    require_free(out, key, overwrite, own=[f.name for f in folds])
+    keys = {f.name: digest(extra=key + f.name) for f in folds}
+
+    def finished(f: Fold, of: Container[str]) -> bool:
+        """By this run, or by a single fold's run beside it; what an earlier run left is no answer where it goes."""
+        known = resume and (f.name in of or not overwrite) and written_by(out / f.name, keys[f.name])
+        return known and (out / f.name / "report.json").exists()
+
+    for f in folds:
+        if not finished(f, ()):
+            require_free(out / f.name, keys[f.name], overwrite)
     stages = Stages(out, key, overwrite, resume, own=[f.name for f in folds])
-    finished: list[str] = stages.get("folds") or []
+    done: list[str] = stages.get("folds") or []
     reports = {}
     for f in folds:
         if console:
             console.print(f"[bold]fold {f.name}[/bold] ({len(reports) + 1} of {len(folds)})")
-        own, report = digest(extra=key + f.name), out / f.name / "report.json"
-        # Of this run, or of a single fold's run beside it; what an earlier run left is not asked when it is replaced.
-        known = f.name in finished or not overwrite
-        if known and resume and report.exists() and written_by(out / f.name, own):
-            reports[f.name] = json.loads(report.read_text(encoding="utf-8"))
+        if finished(f, done):
+            reports[f.name] = json.loads((out / f.name / "report.json").read_text(encoding="utf-8"))
         else:
-            reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, own, overwrite, resume, console)
-        finished = [*finished, f.name]
-        stages.put("folds", finished)
+            reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, keys[f.name], overwrite, resume, console)
+        done = [*done, f.name]
+        stages.put("folds", done)
     summary = _summary(dataset, reports)
     write_whole(out / "report.html", render_summary(summary))
     write_whole(out / "report.json", json.dumps(summary, indent=1))

@@ -41,32 +41,12 @@ class Stages:
     """
 
     def __init__(self, out: Path, key: str, overwrite: bool, resume: bool, own: Iterable[str] = ()) -> None:
+        require_free(out, key, overwrite, own)
         self.folder = out / _FOLDER
-        if out.exists() and not out.is_dir():
-            raise InputError(f"{out} exists and is not a folder: choose another --out")
-        if out.exists() and not overwrite:
-            self._refuse(out, key, set(own))
         if self.folder.exists() and not (resume and written_by(out, key)):
             shutil.rmtree(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self.folder / "key", key)
-
-    def _refuse(self, out: Path, key: str, own: set[str]) -> None:
-        known = own | {*OUTPUTS, _FOLDER}
-        foreign = sorted(p.name for p in out.iterdir() if p.name not in known and not p.name.startswith("."))
-        if (out / "report.json").exists():
-            raise InputError(
-                f"{out} holds the report of a finished run: choose another --out, or say --overwrite to replace it"
-            )
-        if foreign and not self.folder.exists():
-            raise InputError(
-                f"{out} exists and holds {foreign[0]!r}, which is not a run's: choose another --out, or say --overwrite"
-            )
-        if self.folder.exists() and _key(out) not in ("", key):
-            raise InputError(
-                f"{out} holds an unfinished run on other inputs or another seed: "
-                "choose another --out, or say --overwrite"
-            )
 
     def get(self, name: str) -> Any | None:
         """Result of a finished stage, or None."""
@@ -82,6 +62,30 @@ class Stages:
         for file in self.folder.iterdir():
             if file.name != "key":
                 file.unlink()
+
+
+def require_free(out: Path, key: str, overwrite: bool, own: Iterable[str] = ()) -> None:
+    """Whether a run may write to a folder; the arguments and what is raised are those of `Stages`."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} exists and is not a folder: choose another --out")
+    if not out.exists() or overwrite:
+        return
+    known = {*own, *OUTPUTS, _FOLDER}
+    foreign = sorted(p.name for p in out.iterdir() if p.name not in known and not p.name.startswith("."))
+    begun = (out / _FOLDER).exists()
+    if (out / "report.json").exists():
+        raise InputError(
+            f"{out} holds the report of a finished run: choose another --out, or say --overwrite to replace it"
+        )
+    if foreign and not begun:
+        raise InputError(
+            f"{out} exists and holds {foreign[0]!r}, which is not a run's: choose another --out, or say --overwrite"
+        )
+    if begun and _key(out) not in ("", key):
+        raise InputError(
+            f"{out} holds an unfinished run on other inputs or another seed: "
+            "choose another --out, or say --overwrite"
+        )
 
 
 def written_by(out: Path, key: str) -> bool:
