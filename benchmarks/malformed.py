@@ -137,7 +137,7 @@ class Bench:
         case = healthy(rng.choice(FORMATS))
         INPUTS[kind](case, rng)
         path, out = case.write(self.folder), self.folder / "out"
-        words = ("mapping.yaml", "machine.xml", "model", *INPUTS_WORDS, *case.logs)
+        words = ("mapping.yaml", "machine.xml", "model", "run_", *INPUTS_WORDS)
         line = ["check", str(path)]
         checked = command(line)
         self.ended(kind, number, line, checked, words)

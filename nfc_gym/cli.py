@@ -61,7 +61,7 @@ class Stage(StrEnum):
 MappingFile = Annotated[
     Path, typer.Argument(metavar="MAPPING.yaml", help="Names the model, its parameters and the logs.")
 ]
-Seed = Annotated[int, typer.Option(min=0, help="The same inputs and seed give the same report.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**32 - 2, help="The same inputs and seed give the same report.")]
 
 
 def _say_version(wanted: bool) -> None:
@@ -99,7 +99,7 @@ def close_loop(
         Path, typer.Option(metavar="DIR", help="Folder for report.json, report.html, model.xml, effects.yaml.")
     ],
     seed: Seed = 0,
-    jobs: Annotated[int, typer.Option(min=0, help="Threads; 0 takes all cores.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 takes all cores.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left in DIR.")] = False,
     resume: Annotated[bool, typer.Option(help="Go on from the last finished stage of an interrupted run.")] = True,
     fold: Annotated[

@@ -65,10 +65,24 @@ def _models(bench: Bench, dataset: Dataset, fit: Path | None, stage: str) -> dic
             out[fold.name] = (bench.plant, bench.plant.null)
             continue
         file = fit / fold.name / "fit.json" if len(dataset.folds) > 1 else fit / "fit.json"
-        if not file.exists():
+        if not file.is_file():
             raise InputError(f"{file} does not exist: run close-loop on this mapping with --out {fit} first")
-        out[fold.name] = unpack(json.loads(file.read_text())[stage], bench.plant)
+        out[fold.name] = _read_fit(file, stage, bench.plant)
     return out
+
+
+def _read_fit(file: Path, stage: str, plant: Plant) -> tuple[Plant, Array]:
+    again = "run close-loop on this mapping again, with --overwrite"
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as e:
+        raise InputError(f"{file}: not the JSON that close-loop writes ({e}); {again}") from None
+    if not isinstance(data, dict) or stage not in data:
+        raise InputError(f"{file}: has no model {stage!r}; {again}")
+    try:
+        return unpack(data[stage], plant)
+    except InputError as e:
+        raise InputError(f"{file}: {stage}: {e}; {again}") from None
 
 
 def _predict(
@@ -87,6 +101,11 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None)
     """One open-loop roll-out of a log, or pieces of `restart` seconds, at the log's own samples."""
     mapping = bench.dataset.mapping
     dt = float(plant.model.opt.timestep)
+    if restart is not None and not restart >= max(dt, log.interval):
+        raise InputError(
+            f"--restart {restart:g}: log {log.name!r} has a sample every {log.interval:.3g} s and the model a step every "
+            f"{dt:g} s; give {max(dt, log.interval):.3g} or more"
+        )
     length = min(restart, log.duration) if restart else log.duration
     starts = np.searchsorted(log.time, np.arange(0.0, log.duration, length) - 1e-9) if restart else np.array([0])
     laws = servos(

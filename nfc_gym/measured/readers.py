@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.core import InputError
+from nfc_gym.core import InputError, NfcError
 
 Table = dict[str, NDArray[Any]]
 Reader = Callable[[Path], Table]
@@ -45,7 +45,12 @@ def read_table(path: Path) -> Table:
         raise InputError(f"{path}: {'is a folder, not a file' if path.is_dir() else 'no such file'}")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty; record or copy it again, or leave it out of `logs`")
-    table = {name: _as_seconds(np.asarray(values)) for name, values in reader(path).items()}
+    try:
+        table = {str(name): _as_seconds(np.asarray(values)) for name, values in reader(path).items()}
+    except (NfcError, PermissionError):
+        raise
+    except Exception as e:  # parsers trip over damaged files in every way there is
+        raise _broken(path, e) from None
     if not table:
         raise InputError(f"{path}: the file holds no column")
     return table

@@ -195,6 +195,8 @@ def _position_commands(joint: str, log: Log, model: mujoco.MjModel | None) -> It
 
 def _ratio(x: Array, y: Array) -> float | None:
     """Slope of y over x, of either sign, where the two follow each other (correlation above 0.8); else None."""
+    if not len(x):
+        return None
     x, y = x - x.mean(), y - y.mean()
     spread = float(np.linalg.norm(x) * np.linalg.norm(y))
     if spread == 0 or abs(float(x @ y)) < 0.8 * spread:

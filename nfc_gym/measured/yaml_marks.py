@@ -9,6 +9,7 @@ import yaml
 from nfc_gym.core import InputError
 
 Place = tuple[str | int, ...]
+_LARGEST = 5_000_000  # bytes
 _MOST_NODES = 100_000  # aliases of aliases can make a small file explode; no mapping comes near this
 
 
@@ -26,11 +27,17 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
       InputError: the file is missing, not text, not YAML, or holds a key twice; with the line where there is one.
     """
     try:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder: name the mapping file in it")
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: not an ordinary file; a mapping is one, beside its model and logs")
+        if path.stat().st_size > _LARGEST:
+            raise InputError(f"{path}: larger than {_LARGEST / 1e6:g} MB; a mapping is a small YAML file")
         text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a folder: name the mapping file in it") from None
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read ({e.strerror or e})") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; a mapping is YAML in UTF-8") from None
     try:
