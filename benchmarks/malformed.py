@@ -99,8 +99,13 @@ def command(line: list[str], limit: float = LIMIT) -> Ending:
             code, _ = -2, out.write(f"{type(e).__name__}: {e}")
         finally:
             sys.argv = before
-    warned = next((f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in seen), "")
-    return Ending(code, out.getvalue(), time.monotonic() - began, warned)
+    return Ending(code, out.getvalue(), time.monotonic() - began, first(seen))
+
+
+def first(seen: list[warnings.WarningMessage]) -> str:
+    """The first warning that a user would see."""
+    shown = [w for w in seen if not issubclass(w.category, DeprecationWarning | ResourceWarning)]
+    return next((f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in shown), "")
 
 
 def program(line: list[str]) -> Ending:
@@ -195,8 +200,8 @@ class Bench:
                 code, text = 2, str(e)
             except BaseException as e:
                 code, text = 1, f"{type(e).__name__}: {e}"
-        warned = f"{seen[0].message}" if seen else ""
-        self.ended(kind, number, ["from_file", str(file)], Ending(code, text, time.monotonic() - began, warned), ("effects.yaml", "effect"))
+        ending = Ending(code, text, time.monotonic() - began, first(seen))
+        self.ended(kind, number, ["from_file", str(file)], ending, ("effects.yaml",))
 
     def run(self, cases: int, only: str, one: int | None) -> None:
         turns = {k: self.inputs for k in INPUTS} | {k: self.options for k in OPTIONS} | {k: self.results for k in FITS}

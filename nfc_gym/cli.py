@@ -31,6 +31,7 @@ _REFUSALS = {
     errno.EDQUOT: "your disk quota is used up: free some space and run the same command again",
     errno.EACCES: "permission denied: choose a place that you may write to, or change the permissions",
     errno.EPERM: "not permitted: choose a place that you may write to, or change the permissions",
+    errno.ENAMETOOLONG: "a name is too long for this file system: choose a shorter one",
     errno.EROFS: "the file system is read-only: choose another --out",
 }
 

@@ -11,7 +11,8 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing, require_writable
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench, make_bench
-from nfc_gym.measured.dataset import Dataset, load
+from nfc_gym.measured.checks import require
+from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.export import unpack
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
@@ -37,12 +38,13 @@ def predict(
       restart: rollout only: start anew from the measured state every so many seconds.
 
     Raises:
-      InputError: the fit does not belong to the mapping, or a model is unstable on a log.
+      InputError: the mapping, the model or the logs cannot be used, the fit does not belong to the mapping, or a model
+        is unstable on a log.
     """
     if out.is_dir():
         raise InputError(f"{out} is a folder: name the file to write in it, as --out {out / 'predicted.npz'}")
     require_writable(out.parent)
-    dataset = load(mapping)
+    dataset = require(mapping)[0]
     bench = make_bench(dataset)
     models = _models(bench, dataset, fit, stage)
     results: dict[str, Array] = {}

@@ -63,7 +63,8 @@ def _sampling(log: Log) -> Iterator[Suspicion]:
         yield Suspicion("warning", "time", "jitter", message, "use the sensor's own time stamps, if it has them")
     if not 1e-5 < median < 1.0:
         message = f"samples are {median:.3g} s apart"
-        yield Suspicion("warning", "time", "unit", message, "check `time.unit` (s, ms, us or ns)")
+        severity = "warning" if 1e-7 < median < 60.0 else "error"  # no robot is measured so
+        yield Suspicion(severity, "time", "unit", message, "check `time.unit` (s, ms, us or ns)")
 
 
 def _command(name: str, values: Array, model: mujoco.MjModel | None) -> Iterator[Suspicion]:
@@ -155,7 +156,7 @@ def _angle(name: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Suspic
     for command in _position_commands(joint, log, model):
         ratio = _ratio(command, values)
         for factor, what in ((DEGREES, "the angle is in degrees"), (1 / DEGREES, "the command is in degrees")):
-            if ratio is not None and abs(np.log(ratio / factor)) < 0.35:
+            if ratio is not None and ratio > 0 and abs(np.log(ratio / factor)) < 0.35:
                 message = f"moves {ratio:.3g} times as far as it is commanded: {what} where radians are declared"
                 yield Suspicion("error", where, "degrees", message, "say `unit: deg`")
                 return

@@ -62,11 +62,11 @@ def _build(path: Path, loader: yaml.SafeLoader, node: yaml.Node, place: Place, l
             lines[(*place, i)] = item.start_mark.line + 1
         return [_build(path, loader, item, (*place, i), lines) for i, item in enumerate(node.value)]
     if not isinstance(node, yaml.MappingNode):
-        return loader.construct_object(node)
+        return _scalar(path, loader, node)
     result: dict[str, Any] = {}
     for key_node, value_node in node.value:
         line = key_node.start_mark.line + 1
-        key = loader.construct_object(key_node)
+        key = _scalar(path, loader, key_node)
         if not isinstance(key, str):
             raise InputError(f"{path}:{line}: key {key!r} is not text: put it in quotes")
         if key in result:
@@ -74,6 +74,16 @@ def _build(path: Path, loader: yaml.SafeLoader, node: yaml.Node, place: Place, l
         lines[(*place, key)] = line
         result[key] = _build(path, loader, value_node, (*place, key), lines)
     return result
+
+
+def _scalar(path: Path, loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+    try:
+        return loader.construct_object(node, deep=True)
+    except (yaml.YAMLError, RecursionError):
+        raise
+    except Exception as e:  # dates, numbers and binaries that are none, each in its own way
+        text, kind = str(node.value)[:40], node.tag.rpartition(":")[2]
+        raise InputError(f"{path}:{node.start_mark.line + 1}: {text!r} is no {kind} ({e})") from None
 
 
 def line_of(lines: dict[Place, int], place: Place) -> int:
