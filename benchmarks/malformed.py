@@ -1,4 +1,4 @@
-"""Malformed inputs, thousands of them: no traceback, no hang, no half of a report, and a message that says what is wrong.
+"""Malformed inputs, thousands of them: no traceback, no hang, no half of a report, a message that says what is wrong.
 
     python benchmarks/malformed.py [--quick] [--cases N] [--seed S] [--json FILE]
 
@@ -73,7 +73,9 @@ def alarm(seconds: float):
 
     before = signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, seconds)
-    faulthandler.dump_traceback_later(3 * seconds, exit=True, file=sys.__stderr__)  # compiled code does not listen to alarms
+    faulthandler.dump_traceback_later(
+        3 * seconds, exit=True, file=sys.__stderr__
+    )  # compiled code does not listen to alarms
     try:
         yield
     finally:
@@ -138,7 +140,7 @@ class Bench:
                 print(f"{self.faults[-1]}\n    {' '.join(ending.text.split())[-600:]}", flush=True)
 
     def inputs(self, number: int, kind: str, rng: random.Random) -> None:
-        """Damaged inputs go through `check`; what passes is sometimes fitted, what does not must be refused there too."""
+        """Damaged inputs go through `check`; of what passes some is fitted, what does not must be refused there too."""
         case = healthy(rng.choice(FORMATS))
         INPUTS[kind](case, rng)
         path, out = case.write(self.folder), self.folder / "out"
@@ -214,7 +216,19 @@ class Bench:
             turns[kind](number, kind, rng)
 
 
-INPUTS_WORDS = ("version", "parameters", "logs", "split", "time", "controls", "channels", "exogenous", "known", "segments", "effects")
+INPUTS_WORDS = (
+    "version",
+    "parameters",
+    "logs",
+    "split",
+    "time",
+    "controls",
+    "channels",
+    "exogenous",
+    "known",
+    "segments",
+    "effects",
+)
 
 
 def main() -> None:

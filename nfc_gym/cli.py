@@ -4,6 +4,7 @@ Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the sa
 """
 
 import errno
+import io
 import signal
 import sys
 import threading
@@ -198,8 +199,13 @@ def _fail(ctx: typer.Context, code: int, message: str) -> NoReturn:
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     if ctx.obj:
         console.print(traceback.format_exc(), markup=False)
-    console.print(f"nfc-gym {ctx.info_name}: {message}", markup=False)
+    console.print(f"nfc-gym {ctx.info_name}: {_printable(message)}", markup=False)
     raise typer.Exit(code)
+
+
+def _printable(text: str) -> str:
+    """File names may hold bytes that are no text: these are shown as escapes."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def _fault(ctx: typer.Context, error: Exception) -> NoReturn:
@@ -223,7 +229,8 @@ def _print_findings(findings: "list[Finding]") -> None:
     colours = {"error": "bold red", "warning": "yellow", "note": "cyan"}
     table = Table("", "where", "what", "what to do", show_lines=True)
     for f in findings:
-        table.add_row(Text(f.severity, colours[f.severity]), Text(f.where), Text(f.message), Text(f.advice))
+        cells = (Text(_printable(text)) for text in (f.where, f.message, f.advice))
+        table.add_row(Text(f.severity, colours[f.severity]), *cells)
     console.print(table)
     counts = [(s, sum(f.severity == s for f in findings)) for s in colours]
     console.print(", ".join(f"{n} {s}{'s' * (n != 1)}" for s, n in counts))
@@ -231,5 +238,8 @@ def _print_findings(findings: "list[Finding]") -> None:
 
 def main() -> None:
     """The entry point of `nfc-gym`; `--debug` may stand anywhere on the line."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show is no reason to fail
     args = [a for a in sys.argv[1:] if a != "--debug"]
     app(["--debug", *args] if len(args) < len(sys.argv) - 1 else args, prog_name="nfc-gym")

@@ -124,7 +124,9 @@ def _save(path: Path, columns: dict[str, np.ndarray]) -> None:
     else:
         import pandas as pd
 
-        frame = pd.DataFrame({k: pd.Series(list(v) if np.ndim(v) > 1 else np.atleast_1d(v)) for k, v in columns.items()})
+        frame = pd.DataFrame(
+            {k: pd.Series(list(v) if np.ndim(v) > 1 else np.atleast_1d(v)) for k, v in columns.items()}
+        )
         frame.to_csv(path, index=False) if path.suffix == ".csv" else frame.to_parquet(path)
 
 

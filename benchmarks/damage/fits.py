@@ -7,6 +7,7 @@ from random import Random
 from typing import Any
 
 import yaml
+
 from damage.mappings import places
 from damage.values import BYTES, odd
 
@@ -54,7 +55,23 @@ def names(data: dict[str, Any], dump: Callable[[Any], str], rng: Random) -> Dama
     """Other families, places and parameters."""
     text = dump(data)
     old = rng.choice(("coulomb", "hinge", "level", "mass", "value", "psi", "effects", "delay", "servo", "time"))
-    new = rng.choice(("", "x", "gain", "spring_offset", "payload", "generic_time", "wind", "slip", "bob", "world", "hinge+root", "ü", "0"))
+    new = rng.choice(
+        (
+            "",
+            "x",
+            "gain",
+            "spring_offset",
+            "payload",
+            "generic_time",
+            "wind",
+            "slip",
+            "bob",
+            "world",
+            "hinge+root",
+            "ü",
+            "0",
+        )
+    )
     return text.replace(old, new).encode()
 
 
@@ -69,6 +86,6 @@ def _of(what: dict[str, Any], dump: Callable[[Any], str], damage: Kind) -> Calla
     return lambda rng: damage(copy.deepcopy(what), dump, rng)
 
 
-FITS: dict[str, Callable[[Random], Damaged]] = {
-    f"fit.json: {d.__name__}": _of(FIT, json.dumps, d) for d in _DAMAGE
-} | {f"effects.yaml: {d.__name__}": _of(EFFECTS, yaml.safe_dump, d) for d in _DAMAGE}
+FITS: dict[str, Callable[[Random], Damaged]] = {f"fit.json: {d.__name__}": _of(FIT, json.dumps, d) for d in _DAMAGE} | {
+    f"effects.yaml: {d.__name__}": _of(EFFECTS, yaml.safe_dump, d) for d in _DAMAGE
+}

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from random import Random
 
 import numpy as np
+
 from damage.case import FORMATS, Case, save, table
 from damage.values import BYTES
 
@@ -22,7 +23,9 @@ def dropped(case: Case, rng: Random) -> None:
 
 def renamed(case: Case, rng: Random) -> None:
     columns, name = _pick(case, rng)
-    columns[rng.choice((name + " ", name.upper(), "ü", "", "x" * 300, name + "[0]", "file", "a/b", "\n"))] = columns.pop(name)
+    columns[rng.choice((name + " ", name.upper(), "ü", "", "x" * 300, name + "[0]", "file", "a/b", "\n"))] = (
+        columns.pop(name)
+    )
 
 
 def numbers(case: Case, rng: Random) -> None:
@@ -38,7 +41,9 @@ def numbers(case: Case, rng: Random) -> None:
 def sizes(case: Case, rng: Random) -> None:
     """A whole column is multiplied or shifted."""
     columns, name = _pick(case, rng)
-    columns[name] = columns[name] * rng.choice((0, -1, 1e-300, 1e300, 57.29578, 1e9, 1e-9, 1e3)) + rng.choice((0, 0, 1e9, -1e300))
+    columns[name] = columns[name] * rng.choice((0, -1, 1e-300, 1e300, 57.29578, 1e9, 1e-9, 1e3)) + rng.choice(
+        (0, 0, 1e9, -1e300)
+    )
 
 
 def times(case: Case, rng: Random) -> None:
@@ -71,13 +76,17 @@ def types(case: Case, rng: Random) -> None:
     v = np.asarray(columns[name])
     n = len(v)
     made = (
-        lambda: v.astype(np.float16), lambda: v.astype(np.int8), lambda: v > 0, lambda: v.astype("U12"), lambda: v.astype("S12"),
+        lambda: v.astype(np.float16), lambda: v.astype(np.int8), lambda: v > 0, lambda: v.astype("U12"),
+        lambda: v.astype("S12"),
         lambda: v.astype(complex), lambda: np.array(1.0), lambda: np.zeros(0), lambda: v[:1], lambda: v[: n // 2],
-        lambda: np.concatenate([v, v]), lambda: v[:, None], lambda: v[None], lambda: np.zeros((n, 3)), lambda: np.zeros((n, 0)),
-        lambda: np.zeros((2, n, 2)), lambda: np.array(["", "a", "1"] * n)[:n], lambda: np.arange(n).astype("datetime64[s]"),
+        lambda: np.concatenate([v, v]), lambda: v[:, None], lambda: v[None], lambda: np.zeros((n, 3)),
+        lambda: np.zeros((n, 0)),
+        lambda: np.zeros((2, n, 2)), lambda: np.array(["", "a", "1"] * n)[:n],
+        lambda: np.arange(n).astype("datetime64[s]"),
         lambda: np.arange(n).astype("timedelta64[ms]"), lambda: np.array([None, 1.0, "x"] * n, object)[:n],
         lambda: np.array([[1.0], [1.0, 2.0]] * n, object)[:n], lambda: v.astype(">f8"), lambda: v.astype(np.longdouble),
-        lambda: np.full(n, 2**64 - 1, np.uint64), lambda: np.zeros(n, [("a", float), ("b", int)]), lambda: np.array("text"),
+        lambda: np.full(n, 2**64 - 1, np.uint64), lambda: np.zeros(n, [("a", float), ("b", int)]),
+        lambda: np.array("text"),
     )  # fmt: skip
     columns[name] = rng.choice(made)()
 
@@ -137,12 +146,17 @@ def csv_text(case: Case, rng: Random) -> None:
     """What people and spreadsheets do to tables."""
     case.suffix = "csv"
     old, new = rng.choice(
-        ((",", ";"), (",", "\t"), (",", " "), (".", ","), ("\n", "\r"), ("\n", "\r\n"), ("\n", "\n\n"), ("0", "O"), ("-", "−"),
-         ("\n", ",\n"), ("\n", "\n,"), ("t,", "t,t,"), ("t,", '"t,'), ("t,", ",,"), ("\n0.1", '\n"0.1'), ("\n", "\n# "), ("e-", "E-"),
-         ("t,goal", "# t,goal"), ("\n", "\0\n"), ("1", "１"), ("0.", "0x"), ("t,goal", "\ufefft,goal"), ("0.5", "1" * 5000), ("0.5", "#NAME?"))
+        ((",", ";"), (",", "\t"), (",", " "), (".", ","), ("\n", "\r"), ("\n", "\r\n"), ("\n", "\n\n"), ("0", "O"),
+        ("-", "−"),
+         ("\n", ",\n"), ("\n", "\n,"), ("t,", "t,t,"), ("t,", '"t,'), ("t,", ",,"), ("\n0.1", '\n"0.1'), ("\n",
+         "\n# "), ("e-", "E-"),
+         ("t,goal", "# t,goal"), ("\n", "\0\n"), ("1", "１"), ("0.", "0x"), ("t,goal", "\ufefft,goal"), ("0.5",
+         "1" * 5000), ("0.5", "#NAME?"))
     )  # fmt: skip
     count = rng.choice((1, 3, 10**6))
-    case.edits[f"{rng.choice(sorted(case.logs))}.csv"] = lambda content: content.decode().replace(old, new, count).encode()
+    case.edits[f"{rng.choice(sorted(case.logs))}.csv"] = lambda content: (
+        content.decode().replace(old, new, count).encode()
+    )
 
 
 def npz_headers(case: Case, rng: Random) -> None:
@@ -151,7 +165,8 @@ def npz_headers(case: Case, rng: Random) -> None:
     import zipfile
 
     header = str({
-        "descr": rng.choice(("<f8", "|O", "<U9", "|V8", "<f9", "", [("a", "<f8")], "<c16", "<M8[s]")), "fortran_order": rng.choice((False, True, 3)),
+        "descr": rng.choice(("<f8", "|O", "<U9", "|V8", "<f9", "", [("a", "<f8")], "<c16", "<M8[s]")),
+        "fortran_order": rng.choice((False, True, 3)),
         "shape": rng.choice(((10**12,), (60,), (), (-1,), (2**63,), (60, 10**9), "60", (60.5,), (0,))),
     })  # fmt: skip
     header = rng.choice((header, header[:20], "{'__import__'}", "(" * 300, ""))
@@ -167,5 +182,19 @@ def npz_headers(case: Case, rng: Random) -> None:
 
 LOGS: dict[str, Kind] = {
     f"log: {f.__name__.replace('_', ' ')}": f
-    for f in (dropped, renamed, numbers, sizes, times, types, lengths, files, rotations, contents, disguised, csv_text, npz_headers)
+    for f in (
+        dropped,
+        renamed,
+        numbers,
+        sizes,
+        times,
+        types,
+        lengths,
+        files,
+        rotations,
+        contents,
+        disguised,
+        csv_text,
+        npz_headers,
+    )
 }

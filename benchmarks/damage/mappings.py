@@ -5,6 +5,7 @@ from random import Random
 from typing import Any
 
 import yaml
+
 from damage.case import Case
 from damage.values import BYTES, odd
 
@@ -102,8 +103,12 @@ def splits(case: Case, rng: Random) -> None:
 def names(case: Case, rng: Random) -> None:
     """Names that the model or the logs do not have."""
     text = yaml.safe_dump(case.mapping, sort_keys=False)
-    old = rng.choice(("hinge", "servo", "base", "gyro", "bob", "rotor", "goal", "run_*", "body_mass", "dof_armature", "volts"))
-    case.mapping = text.replace(old, rng.choice((f"{old}s", "", "ü", "a:b", "world", "weight", "imu", "root", "../x", "x y")))
+    old = rng.choice(
+        ("hinge", "servo", "base", "gyro", "bob", "rotor", "goal", "run_*", "body_mass", "dof_armature", "volts")
+    )
+    case.mapping = text.replace(
+        old, rng.choice((f"{old}s", "", "ü", "a:b", "world", "weight", "imu", "root", "../x", "x y"))
+    )
 
 
 def text_bytes(case: Case, rng: Random) -> None:
@@ -126,7 +131,9 @@ def text_lines(case: Case, rng: Random) -> None:
         elif how == 3:
             lines[i] = lines[i].lstrip()
         else:
-            lines[i] += rng.choice((": x", " #", " &a", " *a", " |", " >", '"', "'", "{", "]", ",", " !!int", " !!python/name:os.system"))
+            lines[i] += rng.choice(
+                (": x", " #", " &a", " *a", " |", " >", '"', "'", "{", "]", ",", " !!int", " !!python/name:os.system")
+            )
     case.mapping = "\n".join(lines)
 
 
@@ -137,11 +144,15 @@ def text_yaml(case: Case, rng: Random) -> None:
     keys = "? {}\n: 1\n".format(rng.choice(("[1, 2]", "{a: b}", "3.5", "null", "2001-01-01", "!!binary aGk=", "yes")))
     case.mapping = rng.choice(
         ("", "\n\n", "---\n---\n", "# nothing", "null", "42", "text", "[]", "- a\n- b", "{}", whole + "\n---\n" + whole,
-         bomb + whole, whole + bomb, "a: &a [*a]\n" + whole, "&a {b: *a}", whole.replace("segments:", "segments: &s\n  <<: *s"),
-         "<<: [1, 2]\n" + whole, "<<: {version: 2}\n" + whole, whole + keys, keys, "[" * 3000, "{" * 3000, "- " * 3000 + "a",
-         "a: " * 500 + "b", "'" * 9999, whole.replace(": ", ":\t"), whole.replace("\n", "\r\n"), whole.replace("\n", "\r"),
+         bomb + whole, whole + bomb, "a: &a [*a]\n" + whole, "&a {b: *a}", whole.replace("segments:",
+         "segments: &s\n  <<: *s"),
+         "<<: [1, 2]\n" + whole, "<<: {version: 2}\n" + whole, whole + keys, keys, "[" * 3000, "{" * 3000,
+         "- " * 3000 + "a",
+         "a: " * 500 + "b", "'" * 9999, whole.replace(": ", ":\t"), whole.replace("\n", "\r\n"), whole.replace("\n",
+         "\r"),
          "%YAML 9.9\n---\n" + whole, "!!python/object/apply:os.system ['true']", "!!set {a, b}", "!!omap [a: 1]",
-         "\ufeff" + whole, whole + "\0", whole + "\x07", whole + "\x85", "*unknown", "a: *unknown", whole + "x: 0o9\ny: 1_0e\n",
+         "\ufeff" + whole, whole + "\0", whole + "\x07", whole + "\x85", "*unknown", "a: *unknown",
+         whole + "x: 0o9\ny: 1_0e\n",
          whole + "d: 2001-99-99\n", whole + "d: 2001-02-30\n", whole + "b: !!binary '*'\n", whole + "i: !!int x\n",
          whole + "f: !!float ''\n", whole + "t: !!timestamp x\n", whole + "s: 190:20:30\n", whole + "n: 0x\n",
          whole.replace("version: 1", "version: 1_0:0"), whole + "i: 0b\n", whole + "i: +_\n", whole + "e: .\n",
@@ -151,5 +162,18 @@ def text_yaml(case: Case, rng: Random) -> None:
 
 MAPPINGS: dict[str, Kind] = {
     f"mapping: {f.__name__.replace('_', ' ')}": f
-    for f in (missing, value, several, extra, renamed, exchanged, numbers, splits, names, text_bytes, text_lines, text_yaml)
+    for f in (
+        missing,
+        value,
+        several,
+        extra,
+        renamed,
+        exchanged,
+        numbers,
+        splits,
+        names,
+        text_bytes,
+        text_lines,
+        text_yaml,
+    )
 }

@@ -5,8 +5,10 @@ from typing import Any
 
 ODD: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 2, 10**9, 10**30, -(10**30), 0.5, -0.5, 1e-300, 1e300, 1e-12, float("nan"),
-    float("inf"), float("-inf"), "", " ", "0", "nan", "true", "null", "x" * 5000, "ü", "日本語", "a\nb", "a\tb", "\u202e", "😀",
-    "../../etc/passwd", "/dev/null", "/", ".", "..", "~", "*", "**", "[", "(", "a[0]", "q[0]", "q[99]", "q[-1]", "t", "q",
+    float("inf"), float("-inf"), "", " ", "0", "nan", "true", "null", "x" * 5000, "ü", "日本語", "a\nb", "a\tb",
+    "\u202e", "😀",
+    "../../etc/passwd", "/dev/null", "/", ".", "..", "~", "*", "**", "[", "(", "a[0]", "q[0]", "q[99]", "q[-1]", "t",
+    "q",
     "deg", "m", "rad/s", "kg", "zero", "auto", "fit", "rotate", "time", "group", "xyzw", "body_mass", "opt.timestep",
     "geom_friction[7]", "body_mass[9]", "qpos0", "nq", "__class__", "servo_kv", "ctrl:servo", "joint:hinge:pos",
     "exo:supply", "body:world:pos", "body:base:pos", "sensor:gyro", "machine.xml", "jackal", "nfc_gym/AntFlat-v0",
@@ -50,9 +52,12 @@ def spliced(content: bytes, rng: Random) -> bytes:
 def garbage(content: bytes, rng: Random) -> bytes:
     """Nothing of it is left."""
     return rng.choice(
-        (b"", b"\0" * 64, b"\xff\xfe" + "t,q\n0,1\n".encode("utf-16-le"), b"PK\x03\x04" + bytes(30), b"PAR1" + bytes(20) + b"PAR1",
-         b"MATLAB 5.0 MAT-file" + bytes(200), b"\x89HDF\r\n\x1a\n" + bytes(200), b"\x93NUMPY\x01\x00", b"\x80\x04K\x01.",
-         b"t,q\n", b"\n\n\n", b"t\n0\n1\n", b"\x1f\x8b\x08\x00", b"<html>404</html>", bytes(range(256)) * 4, rng.randbytes(500))
+        (b"", b"\0" * 64, b"\xff\xfe" + "t,q\n0,1\n".encode("utf-16-le"), b"PK\x03\x04" + bytes(30),
+        b"PAR1" + bytes(20) + b"PAR1",
+         b"MATLAB 5.0 MAT-file" + bytes(200), b"\x89HDF\r\n\x1a\n" + bytes(200), b"\x93NUMPY\x01\x00",
+         b"\x80\x04K\x01.",
+         b"t,q\n", b"\n\n\n", b"t\n0\n1\n", b"\x1f\x8b\x08\x00", b"<html>404</html>", bytes(range(256)) * 4,
+         rng.randbytes(500))
     )  # fmt: skip
 
 

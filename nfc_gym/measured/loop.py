@@ -22,7 +22,7 @@ from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.details import details
-from nfc_gym.measured.export import corrected, effects_of, pack, unpack
+from nfc_gym.measured.export import corrected, effects_of, pack
 from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.kept import pack_state, unpack_state
 from nfc_gym.measured.metric import metric

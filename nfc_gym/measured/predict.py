@@ -105,7 +105,7 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None)
     dt = float(plant.model.opt.timestep)
     if restart is not None and not restart >= max(dt, log.interval):
         raise InputError(
-            f"--restart {restart:g}: log {log.name!r} has a sample every {log.interval:.3g} s and the model a step every "
+            f"--restart {restart:g}: log {log.name!r} has a sample every {log.interval:.3g} s, and the model's step is "
             f"{dt:g} s; give {max(dt, log.interval):.3g} or more"
         )
     length = min(restart, log.duration) if restart else log.duration

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core import InputError, NfcError
+from nfc_gym.measured.mat_tags import require_sound
 
 Table = dict[str, NDArray[Any]]
 Reader = Callable[[Path], Table]
@@ -141,12 +142,13 @@ def _read_npz(path: Path) -> Table:
 def _read_mat(path: Path) -> Table:
     import scipy.io
 
-    with path.open("rb") as file:
-        start = file.read(128)
-    if start.startswith(b"\x89HDF") or b"MATLAB 7.3" in start:
+    data = path.read_bytes()
+    if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
         raise InputError(f"{path}: a MATLAB v7.3 file; save it with `save('{path.name}', ..., '-v7')`")
     try:
-        content = scipy.io.loadmat(path, simplify_cells=True)
+        require_sound(data)
+        with warnings.catch_warnings(action="error", category=scipy.io.matlab.MatReadWarning):  # one name twice
+            content = scipy.io.loadmat(path, simplify_cells=True)
     except Exception as e:  # the parser trips over damaged files in every way there is
         raise _broken(path, e) from None
     return dict(_flat({k: v for k, v in content.items() if not k.startswith("__")}, ""))

@@ -48,7 +48,7 @@ class Stages:
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self.folder / "key", key)
 
-    def get(self, name: str) -> Any | None:
+    def get(self, name: str) -> Any:
         """Result of a finished stage, or None."""
         file = self.folder / f"{name}.json"
         return json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
@@ -83,8 +83,7 @@ def require_free(out: Path, key: str, overwrite: bool, own: Iterable[str] = ()) 
         )
     if begun and _key(out) not in ("", key):
         raise InputError(
-            f"{out} holds an unfinished run on other inputs or another seed: "
-            "choose another --out, or say --overwrite"
+            f"{out} holds an unfinished run on other inputs or another seed: choose another --out, or say --overwrite"
         )
 
 

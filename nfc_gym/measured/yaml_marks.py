@@ -78,7 +78,10 @@ def _build(path: Path, loader: yaml.SafeLoader, node: yaml.Node, place: Place, l
 
 def _scalar(path: Path, loader: yaml.SafeLoader, node: yaml.Node) -> Any:
     try:
-        return loader.construct_object(node, deep=True)
+        data = loader.construct_object(node, deep=True)
+        if isinstance(data, str):
+            data.encode()  # half a surrogate pair could be written to no report
+        return data
     except (yaml.YAMLError, RecursionError):
         raise
     except Exception as e:  # dates, numbers and binaries that are none, each in its own way

@@ -53,7 +53,7 @@ COMMAND = [sys.executable, "-c", "from nfc_gym.cli import main; main()", "close-
 
 
 def machine(folder: Path) -> Path:
-    """Three logs of 1.5 s of a joint with dry friction, a model without, and the mapping; returns the mapping's path."""
+    """Three logs of 1.5 s of a joint with dry friction, a model without, the mapping; returns the last one's path."""
     model = mujoco.MjModel.from_xml_string(MODEL.format(loss=' frictionloss="0.3"'))
     for seed in range(3):
         rng, data, rows = np.random.default_rng(seed), mujoco.MjData(model), []
@@ -106,7 +106,9 @@ def test_a_run_killed_at_any_moment_ends_as_one_that_was_not(whole: tuple[Path, 
         time.sleep(rng.uniform(0, 0.5 * seconds))
         run.send_signal(signal.SIGKILL)
         run.communicate()
-    print(f"killed three times in {time.monotonic() - begun:.1f} s; left: {sorted(p.name for p in out.rglob('*.json'))}")
+    print(
+        f"killed three times in {time.monotonic() - begun:.1f} s; left: {sorted(p.name for p in out.rglob('*.json'))}"
+    )
     if not (out / "report.json").exists():
         close_loop(mapping, out, jobs=2)  # resumed, and with other threads
     assert results(out) == results(reference)

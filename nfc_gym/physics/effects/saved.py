@@ -57,15 +57,21 @@ def _keys(row: Any) -> tuple[str, str | list[str], Mapping[str, Any]]:
         raise InputError(f"an effect is a mapping with the keys family, where, parameters, and not {_short(row)}")
     for key in ("family", "where", "parameters"):
         if key not in row:
-            raise InputError(f"an effect needs the keys family, where, parameters; {key!r} is missing in {_short(dict(row))}")
+            raise InputError(
+                f"an effect needs the keys family, where, parameters; {key!r} is missing in {_short(dict(row))}"
+            )
     family, where, parameters = row["family"], row["where"], row["parameters"]
     if not isinstance(family, str):
         raise InputError(f"an effect's family is a name, and not {_short(family)}")
     names = [where] if isinstance(where, str) else where
     if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):
-        raise InputError(f"effect {family!r}: `where` is a name of the model or a list of names, and not {_short(where)}")
+        raise InputError(
+            f"effect {family!r}: `where` is a name of the model or a list of names, and not {_short(where)}"
+        )
     if not isinstance(parameters, Mapping) or not all(isinstance(k, str) for k in parameters):
-        raise InputError(f"effect {family!r}: `parameters` is a mapping of names to values, and not {_short(parameters)}")
+        raise InputError(
+            f"effect {family!r}: `parameters` is a mapping of names to values, and not {_short(parameters)}"
+        )
     return family, where if isinstance(where, str) else list(names), parameters
 
 
