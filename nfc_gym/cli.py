@@ -4,7 +4,10 @@ Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the sa
 """
 
 import errno
+import io
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,6 +32,7 @@ _REFUSALS = {
     errno.EDQUOT: "your disk quota is used up: free some space and run the same command again",
     errno.EACCES: "permission denied: choose a place that you may write to, or change the permissions",
     errno.EPERM: "not permitted: choose a place that you may write to, or change the permissions",
+    errno.ENAMETOOLONG: "a name is too long for this file system: choose a shorter one",
     errno.EROFS: "the file system is read-only: choose another --out",
 }
 
@@ -59,7 +63,7 @@ class Stage(StrEnum):
 MappingFile = Annotated[
     Path, typer.Argument(metavar="MAPPING.yaml", help="Names the model, its parameters and the logs.")
 ]
-Seed = Annotated[int, typer.Option(min=0, help="The same inputs and seed give the same report.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**32 - 2, help="The same inputs and seed give the same report.")]
 
 
 def _say_version(wanted: bool) -> None:
@@ -97,7 +101,7 @@ def close_loop(
         Path, typer.Option(metavar="DIR", help="Folder for report.json, report.html, model.xml, effects.yaml.")
     ],
     seed: Seed = 0,
-    jobs: Annotated[int, typer.Option(min=0, help="Threads; 0 takes all cores.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 takes all cores.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left in DIR.")] = False,
     resume: Annotated[bool, typer.Option(help="Go on from the last finished stage of an interrupted run.")] = True,
     fold: Annotated[
@@ -201,7 +205,8 @@ def demo(
 def _outcome(ctx: typer.Context, resumes: bool = False) -> Iterator[None]:
     """Turn whatever a command raises into one clear message on stderr and the exit code that goes with it."""
     try:
-        yield
+        with _terminable():
+            yield
     except typer.Exit:
         raise
     except KeyboardInterrupt:
@@ -218,12 +223,34 @@ def _outcome(ctx: typer.Context, resumes: bool = False) -> Iterator[None]:
         _fault(ctx, e)
 
 
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """A request to terminate (SIGTERM, as job schedulers send it) interrupts like Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
+        yield
+        return
+
+    def interrupt(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def _fail(ctx: typer.Context, code: int, message: str) -> NoReturn:
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     if ctx.obj:
         console.print(traceback.format_exc(), markup=False)
-    console.print(f"nfc-gym {ctx.info_name}: {message}", markup=False)
+    console.print(f"nfc-gym {ctx.info_name}: {_printable(message)}", markup=False)
     raise typer.Exit(code)
+
+
+def _printable(text: str) -> str:
+    """File names may hold bytes that are no text: these are shown as escapes."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def _fault(ctx: typer.Context, error: Exception) -> NoReturn:
@@ -247,7 +274,8 @@ def _print_findings(findings: "list[Finding]") -> None:
     colours = {"error": "bold red", "warning": "yellow", "note": "cyan"}
     table = Table("", "where", "what", "what to do", show_lines=True)
     for f in findings:
-        table.add_row(Text(f.severity, colours[f.severity]), Text(f.where), Text(f.message), Text(f.advice))
+        cells = (Text(_printable(text)) for text in (f.where, f.message, f.advice))
+        table.add_row(Text(f.severity, colours[f.severity]), *cells)
     console.print(table)
     counts = [(s, sum(f.severity == s for f in findings)) for s in colours]
     console.print(", ".join(f"{n} {s}{'s' * (n != 1)}" for s, n in counts))
@@ -255,5 +283,8 @@ def _print_findings(findings: "list[Finding]") -> None:
 
 def main() -> None:
     """The entry point of `nfc-gym`; `--debug` may stand anywhere on the line."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show is no reason to fail
     args = [a for a in sys.argv[1:] if a != "--debug"]
     app(["--debug", *args] if len(args) < len(sys.argv) - 1 else args, prog_name="nfc-gym")

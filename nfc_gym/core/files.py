@@ -1,9 +1,15 @@
 """Files that are there whole or not at all."""
 
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from nfc_gym.core.errors import InputError
+
+_ROOM = 20_000_000  # bytes that must be free: results are a few megabytes
 
 
 @contextmanager
@@ -24,3 +30,28 @@ def write_whole(path: Path, text: str) -> None:
     """Write a text file so that it is either the old one or the whole new one, never half of it."""
     with replacing(path) as part, open(part, "w", encoding="utf-8") as handle:
         handle.write(text)
+
+
+def require_writable(path: Path) -> None:
+    """Find out, before any work is done, whether a file or folder could be written at `path`; nothing stays behind.
+
+    Raises:
+      InputError: a part of the path is a file, a folder cannot be written to, or the disk is full.
+    """
+    try:
+        folder = path
+        while not folder.exists():
+            folder = folder.parent
+        if not folder.is_dir():
+            if folder == path:
+                raise InputError(f"{path} exists and is not a folder: choose another --out")
+            raise InputError(f"{path}: {folder} is a file, not a folder: choose another --out")
+        tempfile.TemporaryFile(dir=folder).close()
+        free = shutil.disk_usage(folder).free
+    except OSError as e:
+        raise InputError(f"{path} cannot be written ({e.strerror or e}): choose another --out") from None
+    if free < _ROOM:
+        raise InputError(
+            f"{path}: only {free / 1e6:.0f} MB are free there, and {_ROOM / 1e6:.0f} MB are wanted: "
+            "free some space or choose another --out"
+        )

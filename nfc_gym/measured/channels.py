@@ -58,7 +58,7 @@ class ChannelName:
 def parse_channel(name: str) -> ChannelName:
     """Take a channel's name apart; one that does not follow the grammar raises `InputError` stating it."""
     for form in _FORMS:
-        match = form.match(name)
+        match = form.fullmatch(name)
         if match:
             parts = match.groupdict()
             return ChannelName(parts["kind"], parts["object"], parts.get("quantity") or "", bool(parts.get("own")))

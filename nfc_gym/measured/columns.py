@@ -75,6 +75,8 @@ class LogColumns:
     def _numbers(self, name: str, values: NDArray) -> Array:
         if values.dtype.kind in "biuf":
             return values.astype(np.float64)
+        if values.dtype.kind == "c":
+            raise InputError(f"column {name!r} holds complex numbers; save what is measured as real ones")
         try:
             return np.array([np.nan if v is None else v for v in values.ravel()], np.float64).reshape(values.shape)
         except (TypeError, ValueError):

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 LARGEST_GAP = 10.0  # sampling intervals; a longer pause makes two logs of one
+LARGEST = 1e20  # in any unit; nanoseconds since 1970 are 1.8e18
 UNIT_NORM = 0.05  # a quaternion's norm may differ so much from 1 (rounding, interpolation) and is then normalised
 ROUNDING = 1e-14  # a norm that differs so little from 1 is 1
 
@@ -186,6 +187,7 @@ def _time(mapping: Mapping, columns: LogColumns) -> Array:
     bad = np.flatnonzero(~np.isfinite(raw))
     if bad.size:
         raise InputError(f"column {name!r} is not a number at row {bad[0]}; remove such rows")
+    _plausible(raw, f"column {name!r}")
     time = units.to_si(raw - raw[0], mapping.time.unit)
     step = np.diff(time)
     back = np.flatnonzero(step <= 0)
@@ -217,6 +219,17 @@ def _finite(values: Array, what: str, needed: NDArray[np.bool_] | None = None) -
         raise InputError(
             f"{what}: {int(bad.sum())} of {len(bad)} rows are NaN or infinite, the first row {row}; cut the log there, "
             "or, for a measured channel, name a `mask` column that is false in those rows"
+        )
+    return _plausible(values, what)
+
+
+def _plausible(values: Array, what: str) -> Array:
+    wild = np.argwhere(np.abs(np.where(np.isfinite(values), values, 0.0)) > LARGEST)
+    if len(wild):
+        row = wild[0]
+        raise InputError(
+            f"{what}: {values[tuple(row)]:.3g} at row {row[0]} ({len(wild)} such values), which nothing measures; "
+            "correct the column or its unit, or leave out those rows"
         )
     return values
 

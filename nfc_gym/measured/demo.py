@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import require_writable
 from nfc_gym.measured import standin
 from nfc_gym.measured.hidden import Array
 from nfc_gym.measured.loop import close_loop
@@ -39,6 +40,7 @@ def demo(out: Path, *, seed: int = 0, console: Console | None = None, draw: int 
       InputError: the folder holds something else, or a finished demo.
     """
     screen = console or Console(quiet=True)
+    require_writable(out)
     _clear(out)
     envelope = _seal(out, secrets.randbits(32) if draw is None else draw)
     screen.print(

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.core.errors import InputError
 from nfc_gym.measured.fit import Fit
 from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.effects.saved import from_row, to_row
@@ -28,10 +29,20 @@ def pack(fitted: Fit) -> dict[str, Any]:
 
 
 def unpack(data: dict[str, Any], plant: Plant) -> tuple[Plant, Array]:
-    """The plant with its effects, and the full parameter vector (size,)."""
-    pairs = [from_row(row) for row in data["effects"]]
+    """The plant with its effects, and the full parameter vector (size,).
+
+    Raises:
+      InputError: the data are not what `pack` makes, or of another model.
+    """
+    psi, rows = (data.get(k) for k in ("psi", "effects")) if isinstance(data, dict) else (None, None)
+    if not isinstance(psi, dict) or not isinstance(rows, list):
+        raise InputError("a fitted model has the keys psi (a mapping of names to numbers) and effects (a list)")
+    for name, value in psi.items():
+        if not isinstance(value, int | float) or not np.isfinite(float(value)):
+            raise InputError(f"psi: {name} is {str(value)[:40]!r}; it must be a finite number")
+    pairs = [from_row(row) for row in rows]
     whole = plant.with_effects([e for e, _ in pairs])
-    return whole, np.concatenate([plant.space.vector(data["psi"]), *(theta for _, theta in pairs)])
+    return whole, np.concatenate([plant.space.vector(psi), *(theta for _, theta in pairs)])
 
 
 def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array) -> tuple[str, list[Effect]]:

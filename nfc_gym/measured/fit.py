@@ -130,6 +130,14 @@ def fit(
     return Fit(plant, x, base, found)
 
 
+def stand(problem: Problem, metric: Metric, plant: Plant, x: Array) -> Fit:
+    """A model as it stands at x (size,): its residual and slopes there, nothing moved."""
+    base = metric.whiten(problem.residual(plant, x[None]))[0]
+    limits = box(plant)
+    step = COARSE if problem.rough else FINE
+    return Fit(plant, x, base, jacobian(problem, metric, limits, x, base, np.arange(len(limits.scale)), step))
+
+
 def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed: int) -> Fit:
     """Go on without derivatives (CMA-ES, Hansen 2001) from a fit in which roughness may have stopped them.
 

@@ -2,8 +2,8 @@
 
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import require_writable
 from nfc_gym.core.log import Log
 from nfc_gym.measured import verdict as say
 from nfc_gym.measured.advice import advise
@@ -24,22 +25,23 @@ from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.details import details
-from nfc_gym.measured.export import corrected, effects_of, pack, unpack
+from nfc_gym.measured.export import corrected, effects_of, pack
 from nfc_gym.measured.fisher import Lens
-from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.identify import Stakes, table
+from nfc_gym.measured.kept import pack_state, unpack_state
 from nfc_gym.measured.maps import maps
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
+from nfc_gym.measured.numerics import fingerprint, one_blas_thread
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.questions import Present, blocks_for
 from nfc_gym.measured.remarks import on_parameters
 from nfc_gym.measured.report import render, render_summary
-from nfc_gym.measured.rounds import Round
-from nfc_gym.measured.search import Found, Options, Search
+from nfc_gym.measured.search import Found, Options, Search, State
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
-from nfc_gym.measured.stages import Stages, digest, write_whole
+from nfc_gym.measured.stages import Stages, digest, require_free, write_whole, written_by
 from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.physics.effects.base import Effect
 
@@ -78,7 +80,7 @@ def close_loop(
         fold beneath it, and a summary.
       seed: the same inputs and seed give the same report.
       jobs: threads of the roll-outs; 0 takes every core.
-      overwrite: replace an earlier run's results.
+      overwrite: replace an earlier run's results, once there are new ones.
       resume: go on from the last finished stage of an interrupted run.
       fold: only this fold.
       console: where progress goes; None is silent.
@@ -87,41 +89,72 @@ def close_loop(
       The report, as written to `report.json`.
 
     Raises:
-      InputError: the mapping, the model or the logs cannot be used; nothing is written then.
+      InputError: the mapping, the model, the logs or `out` cannot be used; nothing is written then.
     """
+    require_writable(out)
+    with one_blas_thread():
+        return _close_loop(mapping, out, seed, jobs, overwrite, resume, fold, console)
+
+
+def _close_loop(
+    mapping: Path,
+    out: Path,
+    seed: int,
+    jobs: int,
+    overwrite: bool,
+    resume: bool,
+    fold: str | None,
+    console: Console | None,
+) -> dict[str, Any]:
     # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
     mujoco.set_mju_user_warning(lambda message: None)
     dataset = require(mapping)[0]
     bench = make_bench(dataset, jobs)
     _require_stable(bench)
-    key = digest(
-        mapping,
-        model_path(dataset.mapping.model_file, dataset.folder),
-        *dataset.files,
-        extra=f"{seed} {version('nfc_gym')}",
-    )
+    key = _key(bench, mapping, seed)
     folds = [dataset.fold(fold)] if fold is not None else list(dataset.folds)
     if len(dataset.folds) == 1:
         return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)
-    if fold is None:  # single folds may be running side by side
-        Stages(out, key, overwrite, resume)
+    if fold is not None:  # other folds may be running beside this one; the summary is the whole run's
+        return _fold(bench, dataset, folds[0], out / fold, seed, digest(extra=key + fold), overwrite, resume, console)
+    require_free(out, key, overwrite, own=[f.name for f in folds])
+    keys = {f.name: digest(extra=key + f.name) for f in folds}
+
+    def finished(f: Fold, of: Container[str]) -> bool:
+        """By this run, or by a single fold's run beside it; what an earlier run left is no answer where it goes."""
+        known = resume and (f.name in of or not overwrite) and written_by(out / f.name, keys[f.name])
+        return known and (out / f.name / "report.json").exists()
+
+    for f in folds:
+        if not finished(f, ()):
+            require_free(out / f.name, keys[f.name], overwrite)
+    stages = Stages(out, key, overwrite, resume, own=[f.name for f in folds])
+    done: list[str] = stages.get("folds") or []
     reports = {}
     for f in folds:
         if console:
             console.print(f"[bold]fold {f.name}[/bold] ({len(reports) + 1} of {len(folds)})")
-        finished = out / f.name / "report.json"
-        if finished.exists() and resume and not overwrite:
-            reports[f.name] = json.loads(finished.read_text())
-            continue
-        reports[f.name] = _fold(
-            bench, dataset, f, out / f.name, seed, digest(extra=key + f.name), overwrite, resume, console
-        )
-    if fold is not None:  # other folds may be running beside this one; the summary is the whole run's
-        return reports[fold]
+        if finished(f, done):
+            reports[f.name] = json.loads((out / f.name / "report.json").read_text(encoding="utf-8"))
+        else:
+            reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, keys[f.name], overwrite, resume, console)
+        done = [*done, f.name]
+        stages.put("folds", done)
     summary = _summary(dataset, reports)
     write_whole(out / "report.html", render_summary(summary))
     write_whole(out / "report.json", json.dumps(summary, indent=1))
+    stages.finish()
     return summary
+
+
+def _key(bench: Bench, mapping: Path, seed: int) -> str:
+    """Digest of all that a report depends on: mapping, model with what it includes, logs, splits, seed, versions."""
+    dataset = bench.dataset
+    splits = [[f.name, dict(f.splits)] for f in dataset.folds]
+    versions = [version(p) for p in ("nfc_gym", "mujoco", "numpy", "scipy")]
+    model = model_path(dataset.mapping.model_file, dataset.folder)
+    extra = json.dumps([seed, versions, splits, fingerprint(bench.plant.model)])
+    return digest(mapping, model, *dataset.files, extra=extra)
 
 
 def _require_stable(bench: Bench) -> None:
@@ -198,6 +231,7 @@ def _fold(
     report["findings"] += advice.findings
     report["seconds"] = round(time.monotonic() - began, 1)
     _write(out, bench, final, report)
+    stages.finish()
     tell(
         f"[bold]{report['verdict']}[/bold]: "
         + ("; ".join(e["sentence"] for e in report["effects"]) or "no effect claimed")
@@ -211,59 +245,67 @@ def _fold(
     return report
 
 
-def _calibrate(run: _Run, problem: Problem) -> tuple[Fit, Array]:
-    """Psi alone, and the noise covariance there."""
+def _calibrate(run: _Run, problem: Problem) -> Array:
+    """(d,) psi, fitted alone."""
     plant = run.bench.plant
     tick = lambda turn: run.say(f"calibrating psi, pass {turn} of at most {TURNS}")  # noqa: E731
     sigma = problem.covariance(plant, plant.null)
-    fitted, _, _ = settle(problem, sigma, plant, plant.null, run.seed, tick=tick)
-    return fitted, problem.covariance(plant, fitted.x)
+    return settle(problem, sigma, plant, plant.null, run.seed, tick=tick)[0].x
 
 
 def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     """Calibrate, then search; a stage after calibration and after every round. A resumed run goes on from the last."""
     bench, plant = run.bench, run.bench.plant
     run.say(f"{len(work)} segments to fit, {len(select)} to select on")
-    done = run.stages.get("calibrated")
-    start = plant.space.vector(done["psi"]) if done else plant.null
-    if done:
-        sigma = work.covariance(plant, start)
-        calibrated = fit(work, metric(work, sigma, slack(work, sigma, plant, start)), plant, start, rounds=1)
-    else:
-        calibrated, sigma = _calibrate(run, work)
-        run.stages.put("calibrated", pack(calibrated))
+    # A stage is read back from what is kept of it, just now or by an earlier process: both go on from the same bits.
+    if run.stages.get("calibrated") is None:
+        run.stages.put("calibrated", {"x": _calibrate(run, work).tolist()})
+    x = np.array(run.stages.get("calibrated")["x"], float)
+    sigma = work.covariance(plant, x)
+    calibrated = stand(work, metric(work, sigma), plant, x)
     pool = candidates(bench, fitting)
-    data = Data(work, sigma)
-    search = Search(data, Data(select, select.covariance(plant, calibrated.x)), pool, Options(seed=run.seed), run.say)
+    data = Data(work, sigma), Data(select, select.covariance(plant, x))
+    search = Search(*data, pool, Options(seed=run.seed), run.say)
+    if run.stages.get("found") is None:
+        _keep_found(run.stages, _hunt(run, search, calibrated, pool))
+    kept = run.stages.get("found")
+    state = unpack_state(kept, plant, pool)
+    assert state is not None  # every effect that was found is one of the pool's
+    under = metric(work, sigma, np.array(kept["slack"], float))
+    extended = stand(work, under, state.plant, state.x)
+    names = {name: kept[name] for name in ("generic", "nearest", "dropped")}
+    found = Found(calibrated, extended, np.array(kept["slack"], float), list(state.rounds), **names)
+    found.rest = search.rest(found)
+    return found
+
+
+def _hunt(run: _Run, search: Search, calibrated: Fit, pool: list[Effect]) -> Found:
+    """The search, from where it was interrupted if it was."""
     saved = run.stages.get("search")
-    begun = None
-    if saved:
-        grown, x = unpack(saved["model"], plant)
-        rounds = [Round(**r) for r in saved["rounds"]]
-        begun = (Fit(grown, x, calibrated.white, calibrated.jacobian), rounds)
-        run.say(f"going on after {len(rounds)} rounds of the search")
-    return search.run(
-        calibrated,
-        begun,
-        lambda current, rounds: run.stages.put(
-            "search", {"model": pack(current), "rounds": [asdict(r) for r in rounds]}
-        ),
-    )
+    begun = unpack_state(saved, run.bench.plant, pool) if saved else None
+    if begun:
+        run.say(f"going on after {len(begun.rounds)} rounds of the search")
+    return search.run(calibrated, begun, lambda state: run.stages.put("search", pack_state(state)))
+
+
+def _keep_found(stages: Stages, found: Found) -> None:
+    state = State(found.extended.plant, found.extended.x, tuple(found.rounds))
+    names = {"generic": found.generic, "nearest": found.nearest, "dropped": found.dropped}
+    stages.put("found", pack_state(state) | {"slack": found.slack.tolist()} | names)
 
 
 def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
     """Calibrated and extended model refitted on every fit segment."""
-    done = run.stages.get("final")
     out = []
-    for name, start in (("calibrated", found.calibrated), ("extended", found.extended)):
-        plant, x = unpack(done[name], run.bench.plant) if done else (start.plant, start.x)
-        sigma = whole.covariance(plant, x)
-        run.say(f"fitting the {name} model on all {len(whole)} segments")
-        if done:
-            out.append(fit(whole, metric(whole, sigma, slack(whole, sigma, plant, x)), plant, x, rounds=1))
-        else:
-            out.append(settle(whole, sigma, plant, x)[0])
-    run.stages.put("final", {"calibrated": pack(out[0]), "extended": pack(out[1])})
+    assert found.rest is not None
+    for name, start in (("calibrated", found.calibrated), ("extended", found.rest.fitted)):
+        sigma = whole.covariance(start.plant, start.x)
+        if run.stages.get(f"final {name}") is None:
+            run.say(f"fitting the {name} model on all {len(whole)} segments")
+            fitted, _, extra = settle(whole, sigma, start.plant, start.x)
+            run.stages.put(f"final {name}", {"x": fitted.x.tolist(), "slack": extra.tolist()})
+        kept = {k: np.array(v, float) for k, v in run.stages.get(f"final {name}").items()}
+        out.append(stand(whole, metric(whole, sigma, kept["slack"]), start.plant, kept["x"]))
     return out[0], out[1]
 
 
@@ -284,13 +326,7 @@ def _identify(
 
 
 def _report(
-    run: _Run,
-    dataset: Dataset,
-    fold: Fold,
-    found: Found,
-    final: tuple[Fit, Fit],
-    problem: Problem,
-    whole: Problem,
+    run: _Run, dataset: Dataset, fold: Fold, found: Found, final: tuple[Fit, Fit], problem: Problem, whole: Problem
 ) -> dict[str, Any]:
     calibrated, extended = final
     rng = np.random.default_rng(run.seed)
@@ -304,8 +340,9 @@ def _report(
     claimed, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
     verdict = say.verdict(v, len(claimed), found.generic is not None or bool(proposed))
     left = verdict in ("unexplained", "partly explained")
-    splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
+    assert found.rest is not None
     parameters = say.parameter_rows(extended, nominal[1], whole)
+    splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
     return {
         "schema": 1,
         "model": dataset.mapping.model_file,
@@ -349,7 +386,10 @@ def _noise(bench: Bench, dataset: Dataset, fold: Fold) -> list[dict[str, Any]]:
 def _write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, Any]) -> None:
     """All outputs, each whole or not at all; `report.json` last, since it marks a finished run."""
     calibrated, extended = final
+    shown = report.pop("details")
+    page = render(report, shown)
     xml, outside = corrected(bench.spec, extended.plant, extended.x)
+    (out / "report.json").unlink(missing_ok=True)  # from here on what an earlier run left is replaced
     write_whole(out / "model.xml", xml)
     rows = {e["id"]: e for e in report["effects"]} | {e["id"]: {**e, "proposal": True} for e in report["proposals"]}
     listed = [rows[e.id] for e, _ in effects_of(extended.plant, extended.x, outside)]
@@ -362,6 +402,5 @@ def _write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, An
     write_whole(out / "effects.yaml", yaml.safe_dump(effects, sort_keys=False, allow_unicode=True))
     packed = {"nominal": {"psi": {}, "effects": []}, "calibrated": pack(calibrated), "extended": pack(extended)}
     write_whole(out / "fit.json", json.dumps({"fold": report["fold"], **packed}, indent=1))
-    shown = report.pop("details")
-    write_whole(out / "report.html", render(report, shown))
+    write_whole(out / "report.html", page)
     write_whole(out / "report.json", json.dumps(report, indent=1))

@@ -22,8 +22,11 @@ def model_path(name: str, folder: Path) -> Path:
     """
     robot = registered(name)
     path = assets.path(robot) if robot else folder / name
-    if path.is_file():
-        return path
+    try:
+        if path.is_file():
+            return path
+    except (OSError, ValueError) as e:  # too long for a name, or with a zero in it
+        raise InputError(f"model {name[:80]!r}: no name of a file ({getattr(e, 'strerror', None) or e})") from None
     there = sorted(p.name for p in path.parent.glob("*") if p.suffix in (".xml", ".urdf"))
     raise InputError(
         f"model {name!r}: no such file in {folder}, and no robot has that id; "

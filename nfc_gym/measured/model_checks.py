@@ -16,6 +16,7 @@ from nfc_gym.physics.fields import names_of
 from nfc_gym.physics.parameters import ParameterSpace, resolve, split_field
 
 _OBJ = mujoco.mjtObj
+MOST_STEPS = 100_000  # of a segment with its history; usual are a hundred
 
 
 def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
@@ -45,6 +46,7 @@ def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]
             if channel.axes and max(channel.axis_indices or ()) >= size:
                 yield Finding("error", where, f"axes {list(channel.axes)} where the sensor has {size} components")
     yield from _fields(mapping, model)
+    yield from _steps(mapping, model)
 
 
 def _controls(mapping: Mapping, names: dict[str, list[str]]) -> Iterator[Finding]:
@@ -95,6 +97,17 @@ def _fields(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
             resolve(model, entry.field, entry.of)
         except (InputError, IndexError) as e:
             yield Finding("error", f"known.{entry.field}", str(e), _field_advice(entry.field, model))
+
+
+def _steps(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
+    """Physics steps in a segment and its history: a step far too short would fill the memory."""
+    segments = mapping.segments
+    step = float(segments.timestep or model.opt.timestep)
+    count = (segments.length + segments.history) / step if step > 0 else float("inf")
+    if segments.mode == "rollout" and not count <= MOST_STEPS:
+        message = f"{segments.length:g} s and {segments.history:g} s of history are {count:.3g} steps of {step:g} s"
+        advice = f"want at most {MOST_STEPS}: lengthen segments.timestep or the model's, or shorten the segments"
+        yield Finding("error", "segments", message, advice)
 
 
 def _field_advice(field: str, model: mujoco.MjModel) -> str:

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import replacing, require_writable
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench, make_bench
-from nfc_gym.measured.dataset import Dataset, load
+from nfc_gym.measured.checks import require
+from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.export import unpack
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
@@ -36,9 +38,13 @@ def predict(
       restart: rollout only: start anew from the measured state every so many seconds.
 
     Raises:
-      InputError: the fit does not belong to the mapping, or a model is unstable on a log.
+      InputError: the mapping, the model or the logs cannot be used, the fit does not belong to the mapping, or a model
+        is unstable on a log.
     """
-    dataset = load(mapping)
+    if out.is_dir():
+        raise InputError(f"{out} is a folder: name the file to write in it, as --out {out / 'predicted.npz'}")
+    require_writable(out.parent)
+    dataset = require(mapping)[0]
     bench = make_bench(dataset)
     models = _models(bench, dataset, fit, stage)
     results: dict[str, Array] = {}
@@ -48,9 +54,9 @@ def predict(
             plant, x = models[fold.name]
             results |= _predict(bench, plant, x, logs, mode, restart)
     joined = _join(results)
-    part = out.with_name(f".{out.name}.part.npz")
-    np.savez_compressed(part, **joined)  # type: ignore[arg-type]
-    part.replace(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(out) as part, open(part, "wb") as handle:
+        np.savez_compressed(handle, **joined)  # type: ignore[arg-type]
     return joined
 
 
@@ -61,10 +67,24 @@ def _models(bench: Bench, dataset: Dataset, fit: Path | None, stage: str) -> dic
             out[fold.name] = (bench.plant, bench.plant.null)
             continue
         file = fit / fold.name / "fit.json" if len(dataset.folds) > 1 else fit / "fit.json"
-        if not file.exists():
+        if not file.is_file():
             raise InputError(f"{file} does not exist: run close-loop on this mapping with --out {fit} first")
-        out[fold.name] = unpack(json.loads(file.read_text())[stage], bench.plant)
+        out[fold.name] = _read_fit(file, stage, bench.plant)
     return out
+
+
+def _read_fit(file: Path, stage: str, plant: Plant) -> tuple[Plant, Array]:
+    again = "run close-loop on this mapping again, with --overwrite"
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as e:
+        raise InputError(f"{file}: not the JSON that close-loop writes ({e}); {again}") from None
+    if not isinstance(data, dict) or stage not in data:
+        raise InputError(f"{file}: has no model {stage!r}; {again}")
+    try:
+        return unpack(data[stage], plant)
+    except InputError as e:
+        raise InputError(f"{file}: {stage}: {e}; {again}") from None
 
 
 def _predict(
@@ -83,6 +103,11 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None)
     """One open-loop roll-out of a log, or pieces of `restart` seconds, at the log's own samples."""
     mapping = bench.dataset.mapping
     dt = float(plant.model.opt.timestep)
+    if restart is not None and not restart >= max(dt, log.interval):
+        raise InputError(
+            f"--restart {restart:g}: log {log.name!r} has a sample every {log.interval:.3g} s, and the model's step is "
+            f"{dt:g} s; give {max(dt, log.interval):.3g} or more"
+        )
     length = min(restart, log.duration) if restart else log.duration
     starts = np.searchsorted(log.time, np.arange(0.0, log.duration, length) - 1e-9) if restart else np.array([0])
     laws = servos(

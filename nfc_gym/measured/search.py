@@ -5,22 +5,26 @@ with secants for the screening; a moving-block bootstrap (Kuensch 1989) for what
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.lookout import Lookout
+from nfc_gym.measured.metric import metric
 from nfc_gym.measured.remainder import CLEARLY, SILENT, LawSearch, Remainder
 from nfc_gym.measured.rounds import Contest, Round
-from nfc_gym.measured.screen import Screen, Screened
+from nfc_gym.measured.screen import Screen
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.law import Law
+from nfc_gym.physics.rollout import Plant
 
+Array = NDArray[np.float64]
 Say = Callable[[str], None]
 
 
@@ -43,6 +47,22 @@ class Options:
     seed: int = 0
 
 
+@dataclass(frozen=True)
+class State:
+    """Where a search stands between two rounds: all that the rounds to come depend on, besides data and options.
+
+    Attributes:
+      plant, x: the model that the next round starts from, as the last round's contest left it.
+      rounds: so far.
+      hopeless: places that showed nothing (`Lookout.hopeless`).
+    """
+
+    plant: Plant
+    x: Array
+    rounds: tuple[Round, ...] = ()
+    hopeless: frozenset[str] = field(default_factory=frozenset)
+
+
 @dataclass
 class Found:
     """Outcome of a search.
@@ -50,18 +70,22 @@ class Found:
     Attributes:
       calibrated: psi alone, fitted.
       extended: psi and the accepted effects, fitted.
+      slack: (m,) that of the metric of the last round, under which `extended` was fitted.
       rounds: in order, the last one being the round that accepted nothing.
-      generic: a generic alternative that beat every named effect, or None.
-      screened: the last round's screening, from which the identifiability table is made.
-      rest: what the named effects left, and the laws that are proposed for it.
+      generic: id of a generic alternative that beat every named effect, or None.
+      nearest: id of the candidate that led the last round's screening, whatever it gained; None where there was none.
+      dropped: named effects that a generic alternative alone outdid.
+      rest: what the named effects left, and the laws that are proposed for it; None until it was looked for.
     """
 
     calibrated: Fit
     extended: Fit
+    slack: Array
     rounds: list[Round]
-    generic: Judged | None
-    screened: list[Screened]
-    rest: Remainder
+    generic: str | None
+    nearest: str | None
+    dropped: list[str] = field(default_factory=list)
+    rest: Remainder | None = None
 
 
 class Search:
@@ -76,28 +100,27 @@ class Search:
         self.rng = np.random.default_rng(options.seed)
         self.lookout = Lookout(fit_data.problem, self.rng, say)
 
-    def settle(self, current: Fit, polished: bool = False) -> Arena:
+    def settle(self, plant: Plant, x: Array, polished: bool = False) -> Arena:
         """The arena of the round that starts from a model, which is refitted first."""
         data, seed = self.fit_data, None if polished else self.options.seed
-        fitted, under, extra = settle(data.problem, data.sigma, current.plant, current.x, seed)
+        fitted, under, extra = settle(data.problem, data.sigma, plant, x, seed)
         return Arena(data, self.select, fitted, under, extra, self.rng, self.say)
 
     def run(
-        self,
-        calibrated: Fit,
-        begun: tuple[Fit, list[Round]] | None = None,
-        keep: Callable[[Fit, list[Round]], None] = lambda current, rounds: None,
+        self, calibrated: Fit, begun: State | None = None, keep: Callable[[State], None] = lambda state: None
     ) -> Found:
-        """Greedy rounds from a calibrated model until nothing more is believed; then the turn of what has no name.
+        """Greedy rounds from a calibrated model until nothing more is believed; then the generic alternatives' turn.
 
         Args:
           calibrated: psi alone, fitted.
-          begun: model and rounds of a search that was interrupted, to go on from.
-          keep: called with model and rounds after every round that accepted something.
+          begun: state of a search that was interrupted, to go on from; the outcome is that of one that was not.
+          keep: called with the state after every round that accepted something.
         """
-        current, rounds = begun or (calibrated, [])
-        arena = self.settle(current, polished=True)
+        state = begun or State(calibrated.plant, calibrated.x)
+        self.lookout.hopeless = set(state.hopeless)
+        rounds = list(state.rounds)
         while True:
+            arena = self._begin(state)
             screen = Screen(self.fit_data.problem, arena.under, arena.current)
             screened = self.lookout.closer(screen, self.lookout.screen(screen, self.named))
             outcome, best = Contest(arena, screen, screened, self.options.short, self.options.worth).hold()
@@ -106,22 +129,29 @@ class Search:
             better = best.fitted if best is not None and not full else self._exchange(arena, rounds)
             if better is None:
                 break
-            arena = self.settle(better)
-            current = self._prune(arena)
-            if current is not arena.current:
-                arena = self.settle(current, polished=True)
-            keep(arena.current, rounds)
+            state = State(better.plant, better.x, tuple(rounds), frozenset(self.lookout.hopeless))
+            keep(state)
         dropped: list[str] = []
         generic = self._generic(arena, screen, outcome) if arena.leftover > SILENT else None
+        label = None if generic is None else arena.label(generic)
         if generic is not None and arena.current.plant.effects and self._outdone(arena, generic, calibrated):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
             dropped = [e.id for e in arena.current.plant.effects]
             bare = fit(self.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6)
-            arena = self.settle(bare, polished=True)
-        laws = LawSearch(self.laws, self.options.worth, self.settle, self._prune)
-        rest = laws.run(arena, calibrated)
-        rest.dropped = rest.dropped or dropped
-        return Found(calibrated, rest.fitted, rounds, generic, screened, rest)
+            arena = self.settle(bare.plant, bare.x, polished=True)
+        nearest = screened[0].effect.id if screened else None
+        return Found(calibrated, arena.current, arena.extra, rounds, label, nearest, dropped)
+
+    def rest(self, found: Found) -> Remainder:
+        """What the named effects left, and the laws that are believed of it."""
+        data = self.fit_data
+        self.rng = self.lookout.rng = np.random.default_rng([self.options.seed, len(found.rounds), 1])
+        under = metric(data.problem, data.sigma, found.slack)
+        arena = Arena(data, self.select, found.extended, under, found.slack, self.rng, self.say)
+        laws = LawSearch(self.laws, self.options.worth, lambda f: self.settle(f.plant, f.x), self._prune)
+        out = laws.run(arena, found.calibrated)
+        out.dropped = out.dropped or found.dropped
+        return out
 
     def _exchange(self, arena: Arena, rounds: list[Round]) -> Fit | None:
         """A model in which another law took the place of an earlier one, if that is clearly better."""
@@ -137,6 +167,17 @@ class Search:
         place = ", ".join(gone)
         rounds.append(Round(come, 0.0, reason=f"in place of {place}, beside the others", exchanged=place))
         return found
+
+    def _begin(self, state: State) -> Arena:
+        """The arena of the round that follows a state.
+
+        Each round draws from a generator of its own: what it draws does not depend on which rounds ran before it in
+        this process, and a search that goes on after an interruption draws the same.
+        """
+        self.rng = self.lookout.rng = np.random.default_rng([self.options.seed, len(state.rounds)])
+        arena = self.settle(state.plant, state.x, polished=not state.rounds)
+        current = self._prune(arena) if state.rounds else arena.current
+        return arena if current is arena.current else self.settle(current.plant, current.x, polished=True)
 
     def _prune(self, arena: Arena) -> Fit:
         """Drop earlier effects that the later ones have made superfluous."""

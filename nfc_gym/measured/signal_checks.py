@@ -63,7 +63,8 @@ def _sampling(log: Log) -> Iterator[Suspicion]:
         yield Suspicion("warning", "time", "jitter", message, "use the sensor's own time stamps, if it has them")
     if not 1e-5 < median < 1.0:
         message = f"samples are {median:.3g} s apart"
-        yield Suspicion("warning", "time", "unit", message, "check `time.unit` (s, ms, us or ns)")
+        severity = "warning" if 1e-7 < median < 60.0 else "error"  # no robot is measured so
+        yield Suspicion(severity, "time", "unit", message, "check `time.unit` (s, ms, us or ns)")
 
 
 def _command(name: str, values: Array, model: mujoco.MjModel | None) -> Iterator[Suspicion]:
@@ -155,7 +156,7 @@ def _angle(name: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Suspic
     for command in _position_commands(joint, log, model):
         ratio = _ratio(command, values)
         for factor, what in ((DEGREES, "the angle is in degrees"), (1 / DEGREES, "the command is in degrees")):
-            if ratio is not None and abs(np.log(ratio / factor)) < 0.35:
+            if ratio is not None and ratio > 0 and abs(np.log(ratio / factor)) < 0.35:
                 message = f"moves {ratio:.3g} times as far as it is commanded: {what} where radians are declared"
                 yield Suspicion("error", where, "degrees", message, "say `unit: deg`")
                 return
@@ -195,6 +196,8 @@ def _position_commands(joint: str, log: Log, model: mujoco.MjModel | None) -> It
 
 def _ratio(x: Array, y: Array) -> float | None:
     """Slope of y over x, of either sign, where the two follow each other (correlation above 0.8); else None."""
+    if not len(x):
+        return None
     x, y = x - x.mean(), y - y.mean()
     spread = float(np.linalg.norm(x) * np.linalg.norm(y))
     if spread == 0 or abs(float(x @ y)) < 0.8 * spread:

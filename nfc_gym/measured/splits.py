@@ -2,6 +2,7 @@
 
 import json
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Mapping as Dict
 from collections.abc import Sequence
@@ -73,6 +74,11 @@ def find_logs(mapping: Mapping, folder: Path) -> list[Source]:
         labels = [label for parts in inside.values() for label in parts.values()]
         assigned = _read_splits(folder / entry.splits, labels) if entry.splits else {}
         for path in paths:
+            if any(
+                unicodedata.category(c) in ("Cc", "Cs") for c in str(path)
+            ):  # control characters, bytes that are no text
+                name = str(path).encode(errors="backslashreplace").decode()
+                raise InputError(f"logs: {name!r} has characters in its name that cannot be printed; rename it")
             if path in found:
                 raise InputError(
                     f"logs: {path.name} is matched by {found[path][0].path!r} and by {entry.path!r}; list it once"

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ _FOLDER = ".stages"
 OUTPUTS = ("report.json", "report.html", "model.xml", "effects.yaml", "fit.json")
 
 
-def digest(*files: Path, extra: str = "") -> str:
-    """SHA-256 of files' contents and a text."""
-    sha = hashlib.sha256(extra.encode())
+def digest(*files: Path, extra: str | bytes = "") -> str:
+    """SHA-256 of files' contents and a text or bytes."""
+    sha = hashlib.sha256(extra.encode() if isinstance(extra, str) else extra)
     for file in files:
         sha.update(file.read_bytes())
     return sha.hexdigest()
@@ -24,57 +25,73 @@ def digest(*files: Path, extra: str = "") -> str:
 class Stages:
     """Finished stages of one run.
 
+    A finished run leaves its key behind and no stage; stages therefore mark an unfinished run, which the same command
+    continues, with `overwrite` too. What an earlier run left is replaced when the new run writes its results, and not
+    before: a run that fails or is given up loses nothing.
+
     Args:
       out: the output folder; made here.
       key: digest of everything that the results depend on; stages of another key are not used.
-      overwrite: remove what an earlier run left.
+      overwrite: the results of an earlier run may be replaced.
       resume: use finished stages of an interrupted run with the same key.
+      own: names in the folder that belong to this run besides its outputs.
 
     Raises:
       InputError: the folder holds a finished run, or anything that this command did not write.
     """
 
-    def __init__(self, out: Path, key: str, overwrite: bool, resume: bool) -> None:
+    def __init__(self, out: Path, key: str, overwrite: bool, resume: bool, own: Iterable[str] = ()) -> None:
+        require_free(out, key, overwrite, own)
         self.folder = out / _FOLDER
-        if out.exists() and not out.is_dir():
-            raise InputError(f"{out} exists and is not a folder: choose another --out")
-        if out.exists() and not overwrite:
-            self._refuse(out, key)
-        if self.folder.exists() and (overwrite or not resume or self._key() != key):
+        if self.folder.exists() and not (resume and written_by(out, key)):
             shutil.rmtree(self.folder)
-        if overwrite:
-            for name in OUTPUTS:
-                (out / name).unlink(missing_ok=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self.folder / "key", key)
 
-    def _key(self) -> str:
-        file = self.folder / "key"
-        return file.read_text() if file.exists() else ""
-
-    def _refuse(self, out: Path, key: str) -> None:
-        foreign = sorted(
-            p.name for p in out.iterdir() if p.name not in (*OUTPUTS, _FOLDER) and not p.name.startswith(".")
-        )
-        if (out / "report.json").exists():
-            raise InputError(
-                f"{out} holds the report of a finished run: choose another --out, or say --overwrite to replace it"
-            )
-        if foreign and not self.folder.exists():
-            raise InputError(
-                f"{out} exists and holds {foreign[0]!r}, which is not a run's: choose another --out, or say --overwrite"
-            )
-        if self.folder.exists() and self._key() not in ("", key):
-            raise InputError(
-                f"{out} holds an unfinished run on other inputs or another seed: "
-                "choose another --out, or say --overwrite"
-            )
-
-    def get(self, name: str) -> Any | None:
+    def get(self, name: str) -> Any:
         """Result of a finished stage, or None."""
         file = self.folder / f"{name}.json"
-        return json.loads(file.read_text()) if file.exists() else None
+        return json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
 
     def put(self, name: str, result: Any) -> None:
         """Keep a finished stage."""
         write_whole(self.folder / f"{name}.json", json.dumps(result))
+
+    def finish(self) -> None:
+        """The results are written: forget the stages, and remember whose they are."""
+        for file in self.folder.iterdir():
+            if file.name != "key":
+                file.unlink()
+
+
+def require_free(out: Path, key: str, overwrite: bool, own: Iterable[str] = ()) -> None:
+    """Whether a run may write to a folder; the arguments and what is raised are those of `Stages`."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} exists and is not a folder: choose another --out")
+    if not out.exists() or overwrite:
+        return
+    known = {*own, *OUTPUTS, _FOLDER}
+    foreign = sorted(p.name for p in out.iterdir() if p.name not in known and not p.name.startswith("."))
+    begun = (out / _FOLDER).exists()
+    if (out / "report.json").exists():
+        raise InputError(
+            f"{out} holds the report of a finished run: choose another --out, or say --overwrite to replace it"
+        )
+    if foreign and not begun:
+        raise InputError(
+            f"{out} exists and holds {foreign[0]!r}, which is not a run's: choose another --out, or say --overwrite"
+        )
+    if begun and _key(out) not in ("", key):
+        raise InputError(
+            f"{out} holds an unfinished run on other inputs or another seed: choose another --out, or say --overwrite"
+        )
+
+
+def written_by(out: Path, key: str) -> bool:
+    """Whether what lies in a folder, finished or not, is of a run with this key."""
+    return _key(out) == key
+
+
+def _key(out: Path) -> str:
+    file = out / _FOLDER / "key"
+    return file.read_text(encoding="utf-8") if file.exists() else ""

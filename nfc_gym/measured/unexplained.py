@@ -28,6 +28,7 @@ def unexplained(v: Verified, found: Found, plant: Plant, rows: list[dict[str, An
     nearest, share = _nearest(found)
     out: dict[str, Any] = {"nearest": nearest, "nearest_share": share, "proposed": [r["id"] for r in rows]}
     near = f"; the nearest named effect, {nearest}, explains {share:.0%}" if nearest else "; no named effect comes near"
+    assert found.rest is not None
     scanned = found.rest.scanned
     reason = found.rounds[-1].reason or "no effect of the library explains it"
     if laws:
@@ -72,12 +73,13 @@ def _nearest(found: Found) -> tuple[str | None, float]:
 
     Where a law outdid all named effects together, that is the best of the first round.
     """
-    rows = [r for r in found.rounds[0 if found.rest.dropped else -1].ranking if not r["generic"]]
+    outdone = found.rest is not None and bool(found.rest.dropped)
+    rows = [r for r in found.rounds[0 if outdone else -1].ranking if not r["generic"]]
     best = max(rows, key=lambda r: r["share"], default=None)
     if best is not None:
         return best["id"], float(np.clip(best["share"], 0, 1))
     # Screening saw none that gains anything; it leads with the one that comes nearest all the same.
-    return (found.screened[0].effect.id if found.screened else None), 0.0
+    return found.nearest, 0.0
 
 
 def _worst(v: Verified) -> tuple[str, str, float]:

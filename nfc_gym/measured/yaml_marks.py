@@ -9,6 +9,7 @@ import yaml
 from nfc_gym.core import InputError
 
 Place = tuple[str | int, ...]
+_LARGEST = 5_000_000  # bytes
 _MOST_NODES = 100_000  # aliases of aliases can make a small file explode; no mapping comes near this
 
 
@@ -26,11 +27,17 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
       InputError: the file is missing, not text, not YAML, or holds a key twice; with the line where there is one.
     """
     try:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder: name the mapping file in it")
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: not an ordinary file; a mapping is one, beside its model and logs")
+        if path.stat().st_size > _LARGEST:
+            raise InputError(f"{path}: larger than {_LARGEST / 1e6:g} MB; a mapping is a small YAML file")
         text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a folder: name the mapping file in it") from None
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read ({e.strerror or e})") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; a mapping is YAML in UTF-8") from None
     try:
@@ -55,11 +62,11 @@ def _build(path: Path, loader: yaml.SafeLoader, node: yaml.Node, place: Place, l
             lines[(*place, i)] = item.start_mark.line + 1
         return [_build(path, loader, item, (*place, i), lines) for i, item in enumerate(node.value)]
     if not isinstance(node, yaml.MappingNode):
-        return loader.construct_object(node)
+        return _scalar(path, loader, node)
     result: dict[str, Any] = {}
     for key_node, value_node in node.value:
         line = key_node.start_mark.line + 1
-        key = loader.construct_object(key_node)
+        key = _scalar(path, loader, key_node)
         if not isinstance(key, str):
             raise InputError(f"{path}:{line}: key {key!r} is not text: put it in quotes")
         if key in result:
@@ -67,6 +74,19 @@ def _build(path: Path, loader: yaml.SafeLoader, node: yaml.Node, place: Place, l
         lines[(*place, key)] = line
         result[key] = _build(path, loader, value_node, (*place, key), lines)
     return result
+
+
+def _scalar(path: Path, loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+    try:
+        data = loader.construct_object(node, deep=True)
+        if isinstance(data, str):
+            data.encode()  # half a surrogate pair could be written to no report
+        return data
+    except (yaml.YAMLError, RecursionError):
+        raise
+    except Exception as e:  # dates, numbers and binaries that are none, each in its own way
+        text, kind = str(node.value)[:40], node.tag.rpartition(":")[2]
+        raise InputError(f"{path}:{node.start_mark.line + 1}: {text!r} is no {kind} ({e})") from None
 
 
 def line_of(lines: dict[Place, int], place: Place) -> int:

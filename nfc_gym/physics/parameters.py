@@ -138,6 +138,17 @@ def write_field(fields: ModelFields, bound: _Bound, value: Array) -> None:
         fields[bound.name][..., bound.rows, bound.component] = value[..., None]
 
 
+def _require_mass(model: mujoco.MjModel, p: Parameter, bound: _Bound) -> None:
+    if p.low <= 0:
+        raise InputError(f"parameter {p.name!r}: low is {p.low:g} {p.unit}; a mass must be positive")
+    for body in np.arange(model.nbody)[bound.rows]:
+        if model.body_mass[body] <= 0:
+            raise InputError(
+                f"parameter {p.name!r}: body {model.body(body).name!r} has no mass in the model, and so no "
+                "inertia that could grow with it; name a body with a mass"
+            )
+
+
 class ParameterSpace:
     """An ordered box of parameters bound to one model.
 
@@ -146,7 +157,8 @@ class ParameterSpace:
       parameters: in the order of the psi vector.
 
     Raises:
-      InputError: a field, an object or a component does not exist; bounds are not ordered; the nominal lies outside.
+      InputError: a field, an object or a component does not exist; bounds are not ordered; the nominal lies outside; a
+        mass may become zero, or is that of a body without any.
     """
 
     def __init__(self, model: mujoco.MjModel, parameters: Sequence[Parameter]) -> None:
@@ -166,7 +178,9 @@ class ParameterSpace:
             ],
             float,
         )
-        for p, value in zip(parameters, self.nominal, strict=True):
+        for p, value, bound in zip(parameters, self.nominal, self._bound, strict=True):
+            if bound.name == "body_mass":
+                _require_mass(model, p, bound)
             if not p.low < p.high:
                 raise InputError(f"parameter {p.name!r}: low {p.low:g} must be below high {p.high:g}")
             if not p.low <= value <= p.high:

@@ -45,8 +45,13 @@ def bound(effects: Given, model: mujoco.MjModel, condition: str | None = None) -
     Raises:
       InputError: a row, a family, a place or a parameter that does not exist, or values of another number.
     """
-    given = read_effects(effects)["effects"] if isinstance(effects, str | os.PathLike) else effects
-    pairs = [copy.deepcopy(e) if isinstance(e, tuple) else from_row(e) for e in given]
+    if isinstance(effects, str | os.PathLike):
+        try:
+            return bound(read_effects(effects)["effects"], model, condition)
+        except InputError as e:
+            file = os.fspath(effects)
+            raise InputError(str(e) if str(e).startswith(file) else f"{file}: {e}") from None
+    pairs = [copy.deepcopy(e) if isinstance(e, tuple) else from_row(e) for e in effects]
     pairs = [_in_condition(*pair, condition) for pair in pairs]
     for effect, theta in pairs:
         if np.shape(theta) != (len(effect.params),) or not np.isfinite(theta).all():

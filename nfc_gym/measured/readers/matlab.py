@@ -1,5 +1,6 @@
 """MATLAB files up to version 7."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core import InputError
+from nfc_gym.measured.mat_tags import require_sound
 from nfc_gym.measured.readers.registry import Table, broken
 
 
@@ -14,12 +16,13 @@ def read_mat(path: Path) -> Table:
     """Variables by name; fields of structs as `struct.field`."""
     import scipy.io
 
-    with path.open("rb") as file:
-        start = file.read(128)
-    if start.startswith(b"\x89HDF") or b"MATLAB 7.3" in start:
+    data = path.read_bytes()
+    if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
         raise InputError(f"{path}: a MATLAB v7.3 file; save it with `save('{path.name}', ..., '-v7')`")
     try:
-        content = scipy.io.loadmat(path, simplify_cells=True)
+        require_sound(data)
+        with warnings.catch_warnings(action="error", category=scipy.io.matlab.MatReadWarning):  # one name twice
+            content = scipy.io.loadmat(path, simplify_cells=True)
     except Exception as e:  # the parser trips over damaged files in every way there is
         raise broken(path, e) from None
     return dict(_flat({k: v for k, v in content.items() if not k.startswith("__")}, ""))

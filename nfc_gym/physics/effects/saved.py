@@ -34,39 +34,74 @@ def from_row(row: Mapping[str, Any]) -> tuple[Effect, Array]:
     Raises:
       InputError: a key is missing, or the family, a parameter or a value is none.
     """
-    missing = [k for k in ("family", "where", "parameters") if k not in row]
-    if missing:
-        raise InputError(
-            f"an effect needs the keys family, where, parameters; {missing[0]!r} is missing in {dict(row)}"
-        )
+    family, where, parameters = _keys(row)
     try:
         if row.get("conditions"):
-            return _conditioned(row)
+            return _conditioned(family, where, parameters, row)
         if not (row.get("each") or row.get("own_values")):
-            return build(row["family"], row["where"], row["parameters"])
+            return _finite(*build(family, where, parameters))
         members, thetas = [], []
-        places = [row["where"]] if isinstance(row["where"], str) else row["where"]
-        for place in places:
-            own = {k.rpartition("@")[0]: v for k, v in row["parameters"].items() if k.rpartition("@")[2] == place}
-            member, theta = build(row["family"], [place], own)
+        for place in [where] if isinstance(where, str) else where:
+            own = {k.rpartition("@")[0]: v for k, v in parameters.items() if k.rpartition("@")[2] == place}
+            member, theta = _finite(*build(family, [place], own))
             members.append(member)
             thetas.append(theta)
-    except (TypeError, KeyError, ValueError) as e:
+    except (TypeError, KeyError, ValueError, OverflowError) as e:
         if isinstance(e, InputError):
             raise
         raise InputError(
-            f"effect {row['family']!r} of {row['where']!r}: a parameter's value is no number ({e})"
+            f"effect {family!r} of {where!r}: a parameter is a number, or a mapping with a number as `value`, and not "
+            f"as it is here ({e})"
         ) from None
     return each(members), np.concatenate(thetas)
 
 
-def _conditioned(row: Mapping[str, Any]) -> tuple[Effect, Array]:
+def _conditioned(family: str, where: str | list[str], given: Mapping[str, Any], row: Mapping) -> tuple[Effect, Array]:
     """An effect with values of its own in each condition."""
-    labels, given = [str(c) for c in row["conditions"]], row["parameters"]
+    labels = row["conditions"]
+    if not isinstance(labels, list | tuple) or not labels:
+        raise InputError(f"effect {family!r}: `conditions` is a list of labels, and not {_short(labels)}")
+    labels = [str(c) for c in labels]
     first = {k.rpartition("@")[0] or k: v for k, v in given.items() if "@" not in k or k.endswith(f"@{labels[0]}")}
-    effect = Conditioned(build(row["family"], row["where"], first)[0], labels)
+    effect = Conditioned(build(family, where, first)[0], labels)
     missing = [p.name for p in effect.params if p.name not in given]
     if missing:
         raise InputError(f"{effect.id}: the value of {missing[0]!r} is missing; there are: {', '.join(given)}")
     values = [given[p.name] for p in effect.params]
-    return effect, np.array([float(v["value"] if isinstance(v, Mapping) else v) for v in values])
+    return _finite(effect, np.array([float(v["value"] if isinstance(v, Mapping) else v) for v in values]))
+
+
+def _keys(row: Any) -> tuple[str, str | list[str], Mapping[str, Any]]:
+    """Family, places and parameters of a row; what is missing, or of another kind than they are, raises."""
+    if not isinstance(row, Mapping):
+        raise InputError(f"an effect is a mapping with the keys family, where, parameters, and not {_short(row)}")
+    for key in ("family", "where", "parameters"):
+        if key not in row:
+            raise InputError(
+                f"an effect needs the keys family, where, parameters; {key!r} is missing in {_short(dict(row))}"
+            )
+    family, where, parameters = row["family"], row["where"], row["parameters"]
+    if not isinstance(family, str):
+        raise InputError(f"an effect's family is a name, and not {_short(family)}")
+    names = [where] if isinstance(where, str) else where
+    if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):
+        raise InputError(
+            f"effect {family!r}: `where` is a name of the model or a list of names, and not {_short(where)}"
+        )
+    if not isinstance(parameters, Mapping) or not all(isinstance(k, str) for k in parameters):
+        raise InputError(
+            f"effect {family!r}: `parameters` is a mapping of names to values, and not {_short(parameters)}"
+        )
+    return family, where if isinstance(where, str) else list(names), parameters
+
+
+def _finite(effect: Effect, theta: Array) -> tuple[Effect, Array]:
+    for p, value in zip(effect.params, theta, strict=True):
+        if not np.isfinite(value):
+            raise InputError(f"effect {effect.id!r}: {p.name} is {value:g}; it must be a finite number")
+    return effect, theta
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,0 +1,95 @@
+"""Where results go is looked at before any work is done: files in the way, read-only folders, full disks."""
+
+import errno
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from nfc_gym.cli import app
+from nfc_gym.core import InputError
+from nfc_gym.core.files import require_writable
+
+COMMANDS = (["close-loop", "m.yaml"], ["predict", "m.yaml", "--stage", "nominal"], ["demo"])
+
+
+def call(line: list[str], out: Path) -> Result:
+    result = CliRunner().invoke(app, [*line, "--out", str(out)])
+    assert "Traceback" not in result.output
+    return result
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_a_file_in_the_way(tmp_path: Path, line: list[str]) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    result = call(line, file / "below" / "it")
+    assert result.exit_code == 2
+    assert f"{file} is a file, not a folder: choose another --out" in result.stderr
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize("line", [COMMANDS[0], COMMANDS[2]])
+def test_a_file_instead_of_a_folder(tmp_path: Path, line: list[str]) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    result = call(line, file)
+    assert result.exit_code == 2
+    assert f"{file} exists and is not a folder: choose another --out" in result.stderr
+    assert file.read_text() == "mine"
+
+
+def test_a_folder_instead_of_a_file(tmp_path: Path) -> None:
+    result = call(COMMANDS[1], tmp_path)
+    assert result.exit_code == 2
+    assert f"{tmp_path} is a folder: name the file to write in it" in result.stderr
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EROFS, errno.ENOSPC])
+def test_a_folder_that_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: list[str], code: int
+) -> None:
+    def refuse(dir: Path) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    result = call(line, tmp_path / "new" / "out")
+    assert result.exit_code == 2
+    assert "cannot be written" in result.stderr
+    assert os.strerror(code) in result.stderr
+    assert str(tmp_path / "new") in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is forbidden to root")
+def test_a_read_only_folder(tmp_path: Path) -> None:
+    tmp_path.chmod(0o555)
+    try:
+        with pytest.raises(InputError, match="Permission denied"):
+            require_writable(tmp_path / "out")
+    finally:
+        tmp_path.chmod(0o755)
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_a_disk_that_is_nearly_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: list[str]) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=3_000_000))
+    result = call(line, tmp_path / "out")
+    assert result.exit_code == 2
+    assert "only 3 MB are free there, and 20 MB are wanted" in result.stderr
+
+
+def test_a_name_that_is_too_long(tmp_path: Path) -> None:
+    result = call(COMMANDS[0], tmp_path / ("x" * 300))
+    assert result.exit_code == 2
+    assert "File name too long" in result.stderr
+
+
+def test_looking_leaves_nothing_behind(tmp_path: Path) -> None:
+    require_writable(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
