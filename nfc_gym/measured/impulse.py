@@ -36,6 +36,11 @@ class _Push(Effect):
         super().__init__(("all",), [Param(n, "N", -np.inf, np.inf) for n in names])
         self.dofs, self.timed = list(dofs), timed
 
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The clock, where the push begins and ends."""
+        return (CLOCK,) if self.timed else ()
+
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         """See `Effect`."""
         size = theta[..., : len(self.dofs)]
