@@ -136,7 +136,7 @@ def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
             values, report = _bring(clocks[owner.name], parts, grid[rows], use)
             table |= dict(zip(use.columns, values, strict=True))
             if use.measured and any(not np.isfinite(v).all() for v in values):
-                rates |= dict.fromkeys(use.columns, report["rate"])
+                rates.update((name, float(report["rate"])) for name in use.columns)
             told = Resampled(owner.name, owner.clock if kind == "stamps" else "receive time", use.how, **report)
             done[owner.name, use.how] = max(done.get((owner.name, use.how), told), told, key=lambda r: r.missing)
     clock = base.clock if kind == "stamps" else "receive time"

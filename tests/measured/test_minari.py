@@ -18,6 +18,8 @@ minari = pytest.importorskip("minari", reason="needs minari: pip install 'nfc_gy
 pytest.importorskip("h5py", reason="needs h5py: pip install 'nfc_gym[minari]'")
 from minari.data_collector import EpisodeBuffer  # noqa: E402
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*is set to None")  # of what minari would like to be told besides
+
 
 def collect(
     folder: Path, monkeypatch: pytest.MonkeyPatch, lengths: tuple[int, ...], infos: bool = True, **kwargs: Any
