@@ -9,6 +9,8 @@ from machines import make, plant_of, run, zoo
 from test_slip import WHEEL
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects import Scales
+from nfc_gym.physics.effects.ground import FrictionPatch
 from nfc_gym.physics.fields import ModelFields
 
 G = 9.81
@@ -62,6 +64,26 @@ def test_only_the_geoms_inside_feel_the_patch() -> None:
     assert abs(straight) < 0.01
     with pytest.raises(InputError, match=r"no geom 'floor' touches the ground; there are: a, b, c"):
         make("friction_patch", "floor", {"lost": 0.9} | HERE)[0].bind(model)
+
+
+def test_patches_are_looked_for_where_the_machine_was() -> None:
+    """A free base, and one on slides along x and y that begins elsewhere; not one that cannot move in both."""
+    slides = SLED.replace(
+        "<freejoint/>", '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>'
+    ).replace('pos="0 0 .049"', 'pos="3 -2 .049"')
+    for text, start in ((SLED, [0.0, 0.0]), (slides, [3.0, -2.0])):
+        model = mujoco.MjModel.from_xml_string(text.format(0.6, 0.2, 0))
+        one = np.ones(model.nv)
+        low, high = model.qpos0.copy(), model.qpos0.copy()
+        low[:2], high[:2] = [-1.0, 0.5], [4.0, 1.5]
+        (effect,) = FrictionPatch.propose(model, Scales(one, one, np.ones(0), np.ones(0), 0.01, low=low, high=high))
+        x, y = (next(p for p in effect.params if p.name == n) for n in "xy")
+        assert x.probes[0] == pytest.approx(start[0] + 1.5)
+        assert y.probes[0] == pytest.approx(start[1] + 1.0)
+        assert FrictionPatch.propose(model, Scales(one, one, np.ones(0), np.ones(0), 0.01)) == []
+    fixed = mujoco.MjModel.from_xml_string(BALL.format("", "", 1.0))
+    here = fixed.qpos0
+    assert FrictionPatch.propose(fixed, Scales(np.ones(1), np.ones(1), here, here, 0.01, low=here, high=here)) == []
 
 
 BALL = """<mujoco><option timestep=".001"/><worldbody><geom name="floor" type="plane" size="5 5 1" {0}/>

@@ -102,7 +102,7 @@ class FrictionPatch(OnGround):
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
-        box = _roamed(model, scales)
+        box = roamed(model, scales)
         if not super().propose(model, scales) or box is None:
             return []
         low, high = box
@@ -125,15 +125,26 @@ class FrictionPatch(OnGround):
         return [cls(("ground",), sized(cls.PARAMS, **changes))]
 
 
-def _roamed(model: mujoco.MjModel, scales: Scales) -> tuple[Array, Array] | None:
-    """Least and largest x and y, (2,) each, of the free base that has most geoms to stand on."""
-    free = [j for j in range(model.njnt) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)]
-    if not free or scales.low is None or scales.high is None:
-        return None
+def roamed(model: mujoco.MjModel, scales: Scales) -> tuple[Array, Array] | None:
+    """Least and largest x and y in the world, (2,) each, of the base that has most geoms to stand on.
+
+    None where no base moves freely in x and y, on a free joint or on two slides, or where its motion is unknown.
+    """
     standing = np.asarray(model.body_rootid)[model.geom_bodyid[touching_geoms(model, ground_geoms(model))]].tolist()
-    base = max(free, key=lambda j: standing.count(int(model.body_rootid[model.jnt_bodyid[j]])))
-    at = int(model.jnt_qposadr[base])
-    return np.asarray(scales.low[at : at + 2], float), np.asarray(scales.high[at : at + 2], float)
+    if not standing or scales.low is None or scales.high is None:
+        return None
+    root = max(set(standing), key=standing.count)
+    found: list[tuple[int, float]] = []  # coordinate, and what is to be added to it
+    for j in np.flatnonzero(np.asarray(model.body_rootid)[model.jnt_bodyid] == root):
+        at, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
+        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+            found = [(at, 0.0), (at + 1, 0.0)]
+        elif kind == int(mujoco.mjtJoint.mjJNT_SLIDE) and len(found) < 2 and model.jnt_axis[j][len(found)] > 0.99:
+            found.append((at, float(model.body_pos[root][len(found)])))
+    if len(found) < 2:
+        return None
+    low, high = ([float(end[at]) + offset for at, offset in found] for end in (scales.low, scales.high))
+    return np.array(low), np.array(high)
 
 
 class Compliance(OnGround):
