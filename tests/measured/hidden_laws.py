@@ -85,7 +85,7 @@ def nothing(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """A machine whose model lacks nothing."""
 
 
-def record(machine: Machine, seed: int, seconds: float = 3.0) -> Log:
+def record(machine: Machine, seed: int, seconds: float = 2.5) -> Log:
     """One noisy log of a machine."""
     rng = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(machine.text.format(known=machine.true))
