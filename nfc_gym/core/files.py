@@ -3,7 +3,7 @@
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -26,9 +26,31 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
+def write_together(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write several text files of one folder so that old and new ones are never mixed.
+
+    All are written beside the old ones first, so that a full disk changes nothing. The last one marks that the others
+    are there: it is gone while they are replaced.
+    """
+    parts = {name: folder / f".{name}.part" for name in texts}
+    try:
+        for name, text in texts.items():
+            with open(parts[name], "w", encoding="utf-8", newline="\n") as handle:
+                handle.write(text)
+                handle.flush()
+                os.fsync(handle.fileno())
+        (folder / list(texts)[-1]).unlink(missing_ok=True)
+        for name, part in parts.items():
+            os.replace(part, folder / name)
+    except BaseException:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
+        raise
+
+
 def write_whole(path: Path, text: str) -> None:
     """Write a text file so that it is either the old one or the whole new one, never half of it."""
-    with replacing(path) as part, open(part, "w", encoding="utf-8") as handle:
+    with replacing(path) as part, open(part, "w", encoding="utf-8", newline="\n") as handle:
         handle.write(text)
 
 

@@ -92,6 +92,6 @@ class LogColumns:
         values = self._numbers(name, self._find(name))
         if values.size == 1:
             return np.full(self.rows, values.item())
-        if values.ndim not in (1, 2) or len(values) != self.rows:
+        if values.ndim not in (1, 2) or len(values) != self.rows or values.size == 0:
             raise InputError(f"column {name!r} has shape {values.shape} where time has {self.rows} rows")
         return values

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.core.files import require_writable
+from nfc_gym.core.files import require_writable, write_together
 from nfc_gym.core.log import Log
 from nfc_gym.measured import verdict as say
 from nfc_gym.measured.advice import advise
@@ -41,7 +41,7 @@ from nfc_gym.measured.report import render, render_summary
 from nfc_gym.measured.search import Found, Options, Search, State
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
-from nfc_gym.measured.stages import Stages, digest, require_free, write_whole, written_by
+from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.physics.effects.base import Effect
 
@@ -141,8 +141,7 @@ def _close_loop(
         done = [*done, f.name]
         stages.put("folds", done)
     summary = _summary(dataset, reports)
-    write_whole(out / "report.html", render_summary(summary))
-    write_whole(out / "report.json", json.dumps(summary, indent=1))
+    write_together(out, {"report.html": render_summary(summary), "report.json": json.dumps(summary, indent=1)})
     stages.finish()
     return summary
 
@@ -384,23 +383,24 @@ def _noise(bench: Bench, dataset: Dataset, fold: Fold) -> list[dict[str, Any]]:
 
 
 def _write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, Any]) -> None:
-    """All outputs, each whole or not at all; `report.json` last, since it marks a finished run."""
+    """All outputs or none; `report.json` last, since it marks a finished run."""
     calibrated, extended = final
-    shown = report.pop("details")
-    page = render(report, shown)
     xml, outside = corrected(bench.spec, extended.plant, extended.x)
-    (out / "report.json").unlink(missing_ok=True)  # from here on what an earlier run left is replaced
-    write_whole(out / "model.xml", xml)
     rows = {e["id"]: e for e in report["effects"]} | {e["id"]: {**e, "proposal": True} for e in report["proposals"]}
     listed = [rows[e.id] for e, _ in effects_of(extended.plant, extended.x, outside)]
     effects = {
         "version": 1,
-        "model_sha256": digest(out / "model.xml"),
+        "model_sha256": digest(extra=xml),
         "effects": listed,
         "carried_by_model": [i for i in rows if i not in {e["id"] for e in listed}],
     }
-    write_whole(out / "effects.yaml", yaml.safe_dump(effects, sort_keys=False, allow_unicode=True))
     packed = {"nominal": {"psi": {}, "effects": []}, "calibrated": pack(calibrated), "extended": pack(extended)}
-    write_whole(out / "fit.json", json.dumps({"fold": report["fold"], **packed}, indent=1))
-    write_whole(out / "report.html", page)
-    write_whole(out / "report.json", json.dumps(report, indent=1))
+    shown = report.pop("details")
+    texts = {
+        "model.xml": xml,
+        "effects.yaml": yaml.safe_dump(effects, sort_keys=False, allow_unicode=True),
+        "fit.json": json.dumps({"fold": report["fold"], **packed}, indent=1),
+        "report.html": render(report, shown),
+        "report.json": json.dumps(report, indent=1),
+    }
+    write_together(out, texts)

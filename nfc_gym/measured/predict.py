@@ -82,9 +82,16 @@ def _read_fit(file: Path, stage: str, plant: Plant) -> tuple[Plant, Array]:
     if not isinstance(data, dict) or stage not in data:
         raise InputError(f"{file}: has no model {stage!r}; {again}")
     try:
-        return unpack(data[stage], plant)
+        whole, x = unpack(data[stage], plant)
     except InputError as e:
         raise InputError(f"{file}: {stage}: {e}; {again}") from None
+    for p, value in zip(plant.space.parameters, x, strict=False):
+        if not p.low <= value <= p.high:
+            raise InputError(
+                f"{file}: {stage}: {p.name} is {value:g} {p.unit}, outside the mapping's [{p.low:g}, {p.high:g}]; "
+                f"{again}"
+            )
+    return whole, x
 
 
 def _predict(

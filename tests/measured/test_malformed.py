@@ -136,6 +136,11 @@ def test_samples_years_apart(tmp_path: Path) -> None:
     assert "time.unit" in text
 
 
+def test_columns_without_a_value(tmp_path: Path) -> None:
+    text = said(tmp_path, lambda c: c.logs["run_0"].update(volts=np.zeros((60, 0))))
+    assert "column 'volts' has shape (60, 0) where time has 60 rows" in text
+
+
 def test_complex_columns(tmp_path: Path) -> None:
     assert "'q' holds complex numbers" in said(tmp_path, lambda c: c.logs["run_0"].update(q=np.full(60, 1j)))
 
@@ -227,8 +232,14 @@ def test_options_beyond_their_range(tmp_path: Path, options: tuple[str, str]) ->
     assert options[0] in said(tmp_path, lambda c: None, "close-loop", "--out", str(tmp_path / "out"), *options)
 
 
-def test_a_fit_of_another_model_is_named(tmp_path: Path) -> None:
-    fit = {"extended": {"psi": {"girth": 1.0}, "effects": []}}
-    (tmp_path / "fit.json").write_text(json.dumps(fit))
+@pytest.mark.parametrize(
+    ("psi", "words"),
+    [
+        ({"girth": 1.0}, "no parameter named 'girth'; there are: mass, damping"),
+        ({"mass": 0.0}, "mass is 0 kg, outside the mapping's [0.05, 0.2]"),
+    ],
+)
+def test_a_fit_of_another_mapping_is_named(tmp_path: Path, psi: dict[str, float], words: str) -> None:
+    (tmp_path / "fit.json").write_text(json.dumps({"extended": {"psi": psi, "effects": []}}))
     text = said(tmp_path, lambda c: None, "predict", "--fit", str(tmp_path), "--out", str(tmp_path / "p.npz"))
-    assert "fit.json: extended: no parameter named 'girth'; there are: mass, damping" in text
+    assert f"fit.json: extended: {words}" in text

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from nfc_gym.cli import app
 from nfc_gym.core import InputError
-from nfc_gym.core.files import require_writable
+from nfc_gym.core.files import require_writable, write_together
 
 COMMANDS = (["close-loop", "m.yaml"], ["predict", "m.yaml", "--stage", "nominal"], ["demo"])
 
@@ -93,3 +93,40 @@ def test_a_name_that_is_too_long(tmp_path: Path) -> None:
 def test_looking_leaves_nothing_behind(tmp_path: Path) -> None:
     require_writable(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("fails", [1, 2, 3])
+def test_files_that_belong_together_are_never_mixed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: int
+) -> None:
+    """The disk fills up while one of them is written: all stay as they were."""
+    old, new = ({n: f"{age} {n}" for n in ("model.xml", "fit.json", "report.json")} for age in ("old", "new"))
+    write_together(tmp_path, old)
+    seen, sync = [], os.fsync
+
+    def full(handle: int) -> None:
+        seen.append(handle)
+        if len(seen) == fails:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            write_together(tmp_path, new)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == old
+    write_together(tmp_path, new)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == new
+
+
+def test_the_mark_is_gone_while_files_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_together(tmp_path, {"model.xml": "old", "report.json": "old"})
+    seen, replace = [], os.replace
+
+    def watch(part: Path, target: Path) -> None:
+        seen.append((Path(target).name, (tmp_path / "report.json").exists()))
+        replace(part, target)
+
+    monkeypatch.setattr(os, "replace", watch)
+    write_together(tmp_path, {"model.xml": "new", "report.json": "new"})
+    assert seen == [("model.xml", False), ("report.json", False)]
