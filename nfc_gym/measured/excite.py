@@ -183,7 +183,7 @@ def _result(task: _Task, best: Tried, done: int, report: dict[str, Any]) -> dict
 def _pair_rows(task: _Task, best: Tried) -> list[dict[str, Any]]:
     rows = []
     for i, (claim, rival) in enumerate(task.pairs):
-        before, after = (float(a[2 * i : 2 * i + 2].min()) for a in (task.design.distances.before, best.answers))
+        before, after = float(task.design.distances.before[i]), float(best.answers[i])
         row = {"claim": claim, "rival": rival, "sigma_before": before, "sigma_after": after}
         rows.append(row | {"told_apart": after > TOLD})
     return rows
@@ -236,7 +236,7 @@ def _verify(task: _Task, best: Tried, result: dict[str, Any], rng: np.random.Gen
     new = task.design.stage.data(best.w[None]).synthetic(plant, x, rng)
     under = metric(new, new.covariance(plant, x))
     for i, row in enumerate(result["pairs"]):
-        other = task.design.distances.asks[2 * i].rival
+        other = task.design.distances.asks[i].rival
         say(f"refitting {row['rival']} to a simulated recording")
         rival = fit(new, under, other.plant, other.x, _ROUNDS)
         own = fit(new, under, plant, x, _ROUNDS)
