@@ -50,7 +50,7 @@ def advise(
     if not asks:
         return Advice(rows, [])
     say("how far the claims lie from their rivals")
-    before = Distances(asks, present.lens, present.repeats).before.reshape(-1, 2).min(1)
+    before = Distances(asks, present.lens, present.repeats).before
     for row in rows:
         own = [(s, rival) for s, (claim, rival) in zip(before, pairs, strict=True) if claim == row["id"]]
         if own:
@@ -59,7 +59,7 @@ def advise(
     near = [i for i, s in enumerate(before) if s <= TOLD]
     if not near:
         return Advice(rows, [])
-    open_asks = [a for i in near for a in asks[2 * i : 2 * i + 2]]
+    open_asks = [asks[i] for i in near]
     told = _best_motion(bench, logs, present, open_asks, say, seed)
     findings = []
     for k, i in enumerate(near):
@@ -86,7 +86,7 @@ def _best_motion(
     command = "`nfc-gym excite MAPPING.yaml --fit DIR` writes such commands."
 
     def told(k: int) -> str:
-        sigma = float(best.answers[2 * k : 2 * k + 2].min())
+        sigma = float(best.answers[k])
         size = f"{number(100 * best.amplitude, 2)} % of the commands' range"
         if sigma <= TOLD:
             return (

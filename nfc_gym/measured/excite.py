@@ -20,12 +20,12 @@ from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import losses
 from nfc_gym.measured.design import Design, Tried
 from nfc_gym.measured.distances import Distances
+from nfc_gym.measured.expected import pair_rows, pair_sentence, size_rows, size_sentence
 from nfc_gym.measured.experiment import Stage
 from nfc_gym.measured.fit import fit
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.proposal_page import render
-from nfc_gym.measured.questions import TOLD, Present, Visible
-from nfc_gym.measured.wording import number
+from nfc_gym.measured.questions import Present, Visible
 
 Array = NDArray[np.float64]
 _ROUNDS = 8  # iterations of a rival's refit to the simulated recording
@@ -158,8 +158,9 @@ def _result(task: _Task, best: Tried, done: int, report: dict[str, Any]) -> dict
     """What is expected of the commands, and the sentences that say so."""
     stage = task.design.stage
     kind = "commands" if stage.open_loop else "feed-forward"
-    rows = _pair_rows(task, best) if task.pairs else _size_rows(task, best)
-    sentences = [_pair_sentence(r) for r in rows] if task.pairs else [_size_sentence(rows)]
+    told = (task.design.distances.before, best.answers)
+    rows = pair_rows(task.pairs, *told) if task.pairs else size_rows(task.effects, *told)
+    sentences = [pair_sentence(r) for r in rows] if task.pairs else [size_sentence(rows)]
     if not stage.open_loop:
         sentences.append(
             "These are no commands by themselves: add them to the controller's own. The machine was followed segment "
@@ -180,51 +181,6 @@ def _result(task: _Task, best: Tried, done: int, report: dict[str, Any]) -> dict
     }
 
 
-def _pair_rows(task: _Task, best: Tried) -> list[dict[str, Any]]:
-    rows = []
-    for i, (claim, rival) in enumerate(task.pairs):
-        before, after = (float(a[2 * i : 2 * i + 2].min()) for a in (task.design.distances.before, best.answers))
-        row = {"claim": claim, "rival": rival, "sigma_before": before, "sigma_after": after}
-        rows.append(row | {"told_apart": after > TOLD})
-    return rows
-
-
-def _pair_sentence(row: dict[str, Any]) -> str:
-    """Before and after, and whether that is enough."""
-    enough = "enough to tell them apart" if row["told_apart"] else f"still less than the {TOLD:g} that tells them apart"
-    return (
-        f"{row['claim']} and {row['rival']} lie {number(row['sigma_before'], 2)} sigma apart in the present logs, and "
-        f"would lie {number(row['sigma_after'], 2)} apart with this motion: {enough}."
-    )
-
-
-def _size_rows(task: _Task, best: Tried) -> list[dict[str, Any]]:
-    rows = []
-    for seen, before, after in zip(task.effects, task.design.distances.before, best.answers, strict=True):
-        i = next(i for i, p in enumerate(seen.effect.params) if not p.shape)
-        size, needed = abs(float(seen.theta[i] - seen.effect.params[i].null)), seen.ask.needed
-        smallest = [size * needed / v if v > 1e-3 * needed else None for v in map(float, (before, after))]
-        keys = ("smallest_detectable_before", "smallest_detectable_after")
-        rows.append({"id": seen.effect.id, "unit": seen.effect.params[i].unit} | dict(zip(keys, smallest, strict=True)))
-    return rows
-
-
-def _size_sentence(rows: list[dict[str, Any]]) -> str:
-    ratios = [
-        r["smallest_detectable_before"] / r["smallest_detectable_after"]
-        for r in rows
-        if r["smallest_detectable_before"] and r["smallest_detectable_after"]
-    ]
-    new = sum(r["smallest_detectable_before"] is None and r["smallest_detectable_after"] is not None for r in rows)
-    text = (
-        f"With this motion {len(rows)} effects would show at sizes {number(float(np.median(ratios)), 2)} times smaller"
-        if ratios
-        else ""
-    )
-    shown = f"{new} that the present logs do not show at all would show" if new else ""
-    return "; ".join(t for t in (text, shown) if t) + " (median)." if text or shown else "No motion shows more."
-
-
 def _verify(task: _Task, best: Tried, result: dict[str, Any], rng: np.random.Generator, say: Any) -> None:
     """Simulate the recording, noise included, and refit each rival to it without straight lines: how far it stays off.
 
@@ -236,7 +192,7 @@ def _verify(task: _Task, best: Tried, result: dict[str, Any], rng: np.random.Gen
     new = task.design.stage.data(best.w[None]).synthetic(plant, x, rng)
     under = metric(new, new.covariance(plant, x))
     for i, row in enumerate(result["pairs"]):
-        other = task.design.distances.asks[2 * i].rival
+        other = task.design.distances.asks[i].rival
         say(f"refitting {row['rival']} to a simulated recording")
         rival = fit(new, under, other.plant, other.x, _ROUNDS)
         own = fit(new, under, plant, x, _ROUNDS)

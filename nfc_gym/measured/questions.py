@@ -116,10 +116,10 @@ def find(bench: Bench, pool: Sequence[Effect], label: str) -> Effect | None:
 def rivalries(
     bench: Bench, logs: Sequence[Log], report: dict[str, Any], present: Present
 ) -> tuple[list[Ask], list[tuple[str, str]], list[str]]:
-    """Each claim against what explains the logs as well, or else against its worst mimic; asked both ways.
+    """Each claim against what explains the logs as well, or else against its worst mimic.
 
     Returns:
-      Questions, in pairs (the claim is true, the rival is true); the ids of each pair; labels that were passed over.
+      The questions; the ids of claim and rival of each; labels that were passed over.
     """
     rows = {r["id"]: r for r in report.get("identifiability") or []}
     asks, pairs, skipped = [], [], []
@@ -132,13 +132,16 @@ def rivalries(
             if rival is None:
                 skipped.append(label)
                 continue
-            asks += pair(present, effect, rival)
+            asks.append(challenge(present, effect, rival))
             pairs.append((effect.id, rival.id))
     return asks, pairs, skipped
 
 
-def pair(present: Present, effect: Effect, rival: Effect) -> list[Ask]:
-    """Two questions: if the effect is at work, would the rival pass for it; and the other way round."""
+def challenge(present: Present, effect: Effect, rival: Effect) -> Ask:
+    """If an accepted effect is at work, would the rival, fitted in its place, pass for it?
+
+    Not the other way round: a rival that the logs leave next to nothing of is passed for by everything.
+    """
     lens = present.lens
     psi, thetas = lens.plant.split(lens.x)
     others = [(e, t) for e, t in zip(lens.plant.effects, thetas, strict=True) if e is not effect]
@@ -148,8 +151,7 @@ def pair(present: Present, effect: Effect, rival: Effect) -> list[Ask]:
     starts = np.array([np.concatenate([psi, *(t for _, t in others), theta]) for theta in tried])
     white = lens.under.whiten(lens.problem.residual(plant, starts))
     fitted = fit(lens.problem, lens.under, plant, starts[int(loss(white).sum(-1).argmin())], _ROUNDS)
-    one, other = Model(lens.plant, lens.x), Model(plant, fitted.x)
-    return [Ask(one, other, TOLD), Ask(other, one, TOLD)]
+    return Ask(Model(lens.plant, lens.x), Model(plant, fitted.x), TOLD)
 
 
 @dataclass(frozen=True)
