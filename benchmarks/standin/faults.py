@@ -309,6 +309,8 @@ class Slip(Hidden):
 
     def push(self, data: mujoco.MjData) -> None:
         for body, joint, grip in zip(self.bodies, self.joints, self.grip, strict=True):
+            if not data.xaxis[joint].any():
+                continue  # before the first step nothing is known of where the wheels are
             axle = data.xaxis[joint] - (data.xaxis[joint] @ self.up) * self.up
             axle /= np.linalg.norm(axle)
             ahead = np.cross(axle, self.up)

@@ -163,7 +163,7 @@ def _parameters(out: Summary, rows: Sequence[Row]) -> None:
         few = 0.99 ** len(found) > 0.05  # all of so few covered cannot be told from 99 %
         out.value(
             f"effects' parameters in their 95 % interval ({covered} of {len(found)})", share, "1", right,
-            goal="0.85 to 0.99", holds=0.85 <= share and (share <= 0.99 or few), interval=wilson(covered, len(found)),
+            goal="0.85 to 0.99", holds=share >= 0.85 and (share <= 0.99 or few), interval=wilson(covered, len(found)),
         )  # fmt: skip
     out.share("effects' parameters within 5 %", *share_within(found, 0.05), right)
     psi = [e for r in rows if r.outcome == "right" for e in r.psi]
