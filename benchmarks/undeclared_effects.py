@@ -38,7 +38,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"seed {seed} (drawn at run time unless given); {len(tasks)} trials, {args.jobs} at a time", flush=True)
     threads = args.threads if args.threads is not None else (0 if args.jobs == 1 else 1)
     began = time.monotonic()
-    rows = list(shown(plan.run(tasks, args.jobs, threads, plan.Kept(args.out))))
+    rows: list[Row] = []
+    try:
+        rows += shown(plan.run(tasks, args.jobs, threads, plan.Kept(args.out)))
+    except KeyboardInterrupt:
+        sys.exit("stopped" + (f"; the same command with --out {args.out} goes on from here" if args.out else ""))
     results = summarise(rows, seed)
     print(table(results))
     print(f"{len(rows)} of {len(tasks)} trials, {time.monotonic() - began:.0f} s; seed {seed}")

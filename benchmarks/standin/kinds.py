@@ -14,20 +14,16 @@ from .faults import (
     ComShift,
     Damping,
     DeadZone,
-    Drag,
     Gain,
     Offset,
-    Push,
     Rotor,
-    RotorDrag,
     Sag,
     Saturation,
-    Slip,
     Spring,
     Stribeck,
     Weak,
-    Wind,
 )
+from .pushes import Drag, Push, RotorDrag, Slip, Wind
 
 Rng = np.random.Generator
 Make = Callable[[Rng, float], Hidden]

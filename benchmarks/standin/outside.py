@@ -7,7 +7,8 @@ import numpy as np
 
 from nfc_gym.measured.hidden import Array, Hidden
 
-from .faults import OnBody, OnJoint
+from .faults import OnJoint
+from .pushes import OnBody
 
 
 class Both(Hidden):

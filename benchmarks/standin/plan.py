@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import combinations
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -138,14 +139,17 @@ def _each(tasks: Sequence[Task], jobs: int, threads: int) -> Iterator[tuple[Task
                 _failed(task, error)
                 yield task, None
         return
-    # Forked workers keep no threads of MuJoCo's of an earlier trial, and a worker that dies takes only its trial along.
-    with ProcessPoolExecutor(jobs, max_tasks_per_child=None) as pool:
-        running = {pool.submit(one, task, threads): task for task in tasks}
+    # A process a trial: what one leaves behind (threads, memory, MuJoCo's warning hook) is gone before the next.
+    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), max_tasks_per_child=1)
+    running = {pool.submit(one, task, threads): task for task in tasks}
+    try:
         for done in as_completed(running):
             task, error = running[done], done.exception()
             if error is not None:
                 _failed(task, error)
             yield task, None if error is not None else done.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _failed(task: Task, error: BaseException) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -94,19 +93,28 @@ def _baselines(
     row: Row, bench: Bench, fitting: list, selecting: list, calibrated: Model, hidden: Hidden
 ) -> dict[str, Model]:
     """Other tools' models from the same logs; a baseline that fails is noted, and no reason to lose the trial."""
-    from . import network, sparse, sysid
-
     found: dict[str, Model] = {}
 
-    def attempt(name: str, run: Callable[[], None]) -> None:
-        try:
-            run()
-        except Exception as error:
-            row.note += f" {name}: {type(error).__name__}: {str(error)[:120]};"
+    def sysid() -> None:
+        from .sysid import identify
 
-    attempt("mujoco.sysid", lambda: found.update(sysid=(bench.plant, sysid.identify(bench, fitting))))
-    attempt("network", lambda: found.update(network=network.learn(bench, fitting, selecting, *calibrated, row.seed)))
-    attempt("pysindy", lambda: row.sindy.update(sparse.regress(bench, fitting, selecting, *calibrated).judged(hidden)))
+        found["sysid"] = bench.plant, identify(bench, fitting)
+
+    def network() -> None:
+        from .network import learn
+
+        found["network"] = learn(bench, fitting, selecting, *calibrated, row.seed)
+
+    def sparse() -> None:
+        from .sparse import regress
+
+        row.sindy = regress(bench, fitting, selecting, *calibrated).judged(hidden)
+
+    for tool in (sysid, network, sparse):
+        try:
+            tool()
+        except Exception as error:
+            row.note += f" {tool.__name__}: {type(error).__name__}: {str(error)[:120]};"
     return found
 
 

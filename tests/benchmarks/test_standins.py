@@ -117,7 +117,7 @@ def test_lift_grows_with_height_from_three_metres() -> None:
     np.testing.assert_allclose(lift.pull(data, np.zeros(3), np.zeros(3)), [0, 0, 0.6])
 
 
-@pytest.mark.parametrize("name", ["faults", "outside", "legged", "quadruped", "ant", "quadcopter"])
+@pytest.mark.parametrize("name", ["faults", "pushes", "outside", "legged", "quadruped", "ant", "quadcopter"])
 def test_the_stand_ins_share_no_physics_with_the_package(name: str) -> None:
     text = Path(import_module(f"standin.{name}").__file__).read_text()
     assert "nfc_gym.physics" not in "".join(line for line in text.splitlines(True) if "import" in line)

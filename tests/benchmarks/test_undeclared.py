@@ -12,7 +12,7 @@ import pytest
 
 
 def modules() -> SimpleNamespace:
-    names = ("outside", "plan", "row", "score", "summary", "kinds", "robots", "faults")
+    names = ("outside", "plan", "row", "score", "summary", "kinds", "robots", "faults", "pushes")
     return SimpleNamespace(
         **{n: import_module(f"standin.{n}") for n in names}, main=import_module("undeclared_effects")
     )
@@ -126,7 +126,7 @@ def test_a_folder_keeps_its_seed(tmp_path: Path) -> None:
 
 def test_outcomes_of_one_and_two_effects() -> None:
     m = modules()
-    loss, push = m.kinds.Loss("front_left", 0.3), m.faults.Push("base", np.array([1.0, 0.0, 0.0]))
+    loss, push = m.kinds.Loss("front_left", 0.3), m.pushes.Push("base", np.array([1.0, 0.0, 0.0]))
     both = m.outside.Both([loss, push])
     right, other = claim("loss", "front_left"), claim("external_force", "base")
     assert outcome(report(right), loss).outcome == "right"
