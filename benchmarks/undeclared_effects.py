@@ -58,7 +58,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     families = sorted({f for r in ROBOTS.values() for f in r.kinds})
     add = parser.add_argument
     add("--quick", action="store_true", help="one tiny trial a robot, with one or two families in the contest")
-    add("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
+    add("--robots", nargs="+", choices=list(ROBOTS), help="default all; with --quick the two that do not walk")
     add("--trials", "--seeds", type=int, default=1, help="machines of each single effect, a robot (default 1)")
     add("--effects", nargs="+", choices=families, metavar="FAMILY", help="only these single effects")
     add("--pairs", type=int, default=0, help="machines with two effects, a robot")
@@ -89,9 +89,9 @@ def master_seed(args: argparse.Namespace) -> int:
 def planned(args: argparse.Namespace, seed: int) -> list[Task]:
     """Every trial, robots in turn: those of a run that is stopped early are then of all kinds."""
     if args.quick:
-        return plan.quick(args.robots, seed)
+        return plan.quick(args.robots or ("quadcopter", "jackal"), seed)
     lanes = []
-    for robot in args.robots:
+    for robot in args.robots or ROBOTS:
         tasks = list(plan.singles(robot, args.effects or (), args.trials, seed))
         tasks += plan.pairs(robot, args.pairs, seed)
         tasks += plan.others(robot, args.outside, args.nulls, seed)

@@ -21,8 +21,6 @@ from nfc_gym.physics.rollout import Plant
 from .outside import parts
 from .robots import Robot
 
-_TRIES = 8  # sizes that are tried for a wanted X / X_null
-
 
 def write_case(
     folder: Path,
@@ -52,7 +50,7 @@ def chi2(problem: Problem, plant: Plant, x: Array) -> float:
 
 
 def sized(
-    kit: Robot, psi: dict[str, float], kind: Kind, place: int, wanted: float, folder: Path
+    kit: Robot, psi: dict[str, float], kind: Kind, place: int, wanted: float, folder: Path, tries: int = 8
 ) -> tuple[Hidden, float]:
     """The effect at a size that makes X / X_null about `wanted`, and the ratio reached (sizes have a range).
 
@@ -61,6 +59,7 @@ def sized(
     Args:
       place: seed of all that is drawn of the effect but its size.
       folder: for those logs.
+      tries: sizes that are tried.
     """
 
     def ratio_of(hidden: Hidden) -> float:
@@ -69,7 +68,7 @@ def sized(
 
     floor = ratio_of(Hidden())
     size, found = float(np.sqrt(kind.low * kind.high)), []
-    for _ in range(_TRIES):
+    for _ in range(tries):
         hidden = kind.make(np.random.default_rng(place), size)
         ratio = ratio_of(hidden) / floor
         found.append((abs(np.log(max(ratio, 1.0) / wanted)), hidden, ratio))

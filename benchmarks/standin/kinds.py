@@ -140,7 +140,7 @@ JACKAL: dict[str, Kind] = {
     "coulomb": Kind(_one(_TURNING, Coulomb), 0.02, 5.0, "N m"),
     "slope": Kind(_leaning, 0.001, 0.2, "rad"),
     "damping_poly": Kind(_one(_TURNING, lambda j, s: Damping((j,), s)), 1e-3, 3.0, "N m s/rad"),
-    "armature": Kind(_one(_TURNING, lambda j, s: Rotor((j,), s)), 1e-3, 0.45, "kg m^2"),
+    "armature": Kind(_one(_TURNING, lambda j, s: Rotor((j,), s)), 1e-3, 0.07, "kg m^2"),
     "stribeck": Kind(_stribeck(_TURNING, 1.0), 0.02, 4.0, "N m"),
     "dead_zone": Kind(lambda rng, s: DeadZone(_W, s), 0.02, 4.0, "rad/s"),
     "sensor_bias": Kind(_gyro("base"), 0.001, 0.5, "rad/s"),

@@ -12,11 +12,12 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Size:
-    """How long a trial is: logs, seconds of each, and which effects compete (empty: all)."""
+    """How long a trial is: logs, seconds of each, which effects compete (empty: all), and tries to size an effect."""
 
     logs: int = 8
     seconds: float = 5.0
     only: tuple[str, ...] = ()
+    tries: int = 8
 
 
 @dataclass(frozen=True)

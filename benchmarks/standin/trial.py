@@ -56,7 +56,7 @@ def _hide(
     found, ratios = [], []
     for family in task.families:
         place, wanted = int(rng.integers(2**31)), float(np.exp(rng.uniform(np.log(LEAST), np.log(MOST))))
-        hidden, ratio = sized(kit, psi, table[family], place, wanted, folder)
+        hidden, ratio = sized(kit, psi, table[family], place, wanted, folder, task.size.tries)
         found.append(hidden)
         ratios.append(ratio)
     row.ratio = min(ratios, default=float("nan"))
