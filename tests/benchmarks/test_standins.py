@@ -134,3 +134,15 @@ def test_legged_machines_move_and_stay_upright(robot: str) -> None:
         assert np.std(log["z"]) > 0.01
         speeds = [v for k, v in log.items() if k.endswith("_speed")]
         assert np.median([np.std(v) for v in speeds]) > 0.3
+
+
+@pytest.mark.parametrize("robot", ["quadcopter", "jackal", "quadruped", "ant"])
+def test_what_lies_outside_the_library_changes_the_motion(robot: str) -> None:
+    """With the same commands and noise; at their largest sizes machines still run."""
+    kit, standin = import_module("standin.robots").ROBOTS[robot], import_module("nfc_gym.measured.standin")
+    bare = kit.log(standin.Machine(kit.psi), 0.6, 1)
+    for family, kind in kit.outside.items():
+        hidden = kind.make(np.random.default_rng(3), kind.high)
+        log = kit.log(standin.Machine(kit.psi, hidden), 0.6, 1)
+        assert np.isfinite(np.stack(list(log.values()))).all(), family
+        assert any(np.abs(log[k] - bare[k]).max() > 1e-6 for k in bare), family
