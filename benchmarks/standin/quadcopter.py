@@ -4,88 +4,20 @@ import mujoco
 import numpy as np
 
 from nfc_gym import assets
-from nfc_gym.measured.hidden import STEP, Array, Delay, Hidden, Kind, Loss, Payload
+from nfc_gym.measured.hidden import STEP, Array
 from nfc_gym.measured.standin import SAMPLE, Machine, body_columns, excitation
+
+from .faults import VOLTS, Sag
+from .outside import parts
 
 ROTORS = ("front_left", "front_right", "rear_left", "rear_right")
 NOISE = {"pos": 0.0005, "quat": 0.0005, "linvel": 0.01, "angvel": 0.01, "mount": 0.001}  # m, rad, m/s, rad/s, rad
 PSI = {"base_mass": 0.6, "arm_mass": 0.1, "mount_stiffness": 4.0}
-VOLTS = 11.9  # of the battery at which the rotors make the thrust that the model says
 _AT = 0.12  # m, a rotor's x and y
 _YAW = 0.016  # N m for each N, the rotors' reaction torque
 _MAX = 4.905  # N
 _X, _Y = _AT * np.array([1, 1, -1, -1]), _AT * np.array([1, -1, 1, -1])
 _SPIN = _YAW * np.array([-1, 1, 1, -1])
-
-
-class Wind(Hidden):
-    """Steady wind of (3,) m/s against a linear drag: F = drag (wind - velocity) at the chassis' centre."""
-
-    family = "wind"
-
-    def __init__(self, wind: Array, drag: float) -> None:
-        values = {f"push_{axis}": float(drag * w) for axis, w in zip("xyz", wind, strict=True)} | {"drag": drag}
-        super().__init__(("base",), values, f"wind of {np.linalg.norm(wind):.2f} m/s on a drag of {drag:.3g} N s/m")
-        self.wind, self.drag = wind, drag
-
-    def begin(self, model: mujoco.MjModel) -> None:
-        self.body = model.body("base").id
-
-    def push(self, data: mujoco.MjData) -> None:
-        data.xfrc_applied[self.body, :3] += self.drag * (self.wind - data.qvel[:3])
-
-
-class AirDrag(Hidden):
-    """Air drag by the square of the speed, the same along all axes."""
-
-    family = "drag_quadratic"
-
-    def __init__(self, factor: float) -> None:
-        super().__init__(("base",), dict.fromkeys("xyz", factor), f"air drag of {factor:.3g} N s^2/m^2")
-        self.factor = factor
-
-    def begin(self, model: mujoco.MjModel) -> None:
-        self.body = model.body("base").id
-
-    def push(self, data: mujoco.MjData) -> None:
-        velocity = data.qvel[:3]
-        data.xfrc_applied[self.body, :3] -= self.factor * np.sqrt(velocity @ velocity) * velocity
-
-
-class Sag(Hidden):
-    """Thrust commands are worth (volts / 11.9) ** exponent."""
-
-    family = "supply_sag"
-
-    def __init__(self, exponent: float) -> None:
-        values = {"exponent": exponent, "reference": VOLTS}
-        super().__init__(ROTORS, values, f"thrust goes with the supply to the power {exponent:.3g}")
-        self.exponent = exponent
-
-    def command(self, u: Array) -> Array:
-        return u * (self.volts / VOLTS) ** self.exponent
-
-    volts = VOLTS
-
-
-def _sling(rng: np.random.Generator, mass: float) -> Payload:
-    angle = rng.uniform(0, 2 * np.pi)
-    return Payload("base", mass, np.array([0.06 * np.cos(angle), 0.06 * np.sin(angle), -0.05]))
-
-
-def _breeze(rng: np.random.Generator, speed: float) -> Wind:
-    heading = rng.uniform(0, 2 * np.pi)
-    return Wind(speed * np.array([np.cos(heading), np.sin(heading), 0.0]), 0.12)
-
-
-KINDS: dict[str, Kind] = {
-    "loss": Kind(lambda rng, s: Loss(str(rng.choice(ROTORS)), s), 0.002, 0.3, "1"),
-    "payload": Kind(_sling, 0.002, 0.25, "kg"),
-    "wind": Kind(_breeze, 0.02, 8.0, "m/s"),
-    "drag_quadratic": Kind(lambda rng, s: AirDrag(s), 0.005, 1.0, "N s^2/m^2"),
-    "delay": Kind(lambda rng, s: Delay(ROTORS, s), 0.001, 0.02, "s"),
-    "supply_sag": Kind(lambda rng, s: Sag(s), 0.02, 3.0, "1"),
-}
 
 
 def build(machine: Machine) -> mujoco.MjModel:
@@ -138,6 +70,7 @@ def fly(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
     data.qpos[2] = 3.0
     hidden = machine.hidden
     hidden.begin(model)
+    sags = [p for p in parts(hidden) if isinstance(p, Sag)]
     time = np.arange(0, seconds, SAMPLE)
     pilot = Pilot(rng, time)
     volts = VOLTS + 0.6 * (1 - 2 * time / seconds) + 0.15 * excitation(rng, time, 1.0)
@@ -146,8 +79,8 @@ def fly(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
         u = pilot.fly(k, data.qpos, data.qvel)
         if k >= 0:
             qpos[k], qvel[k], sent[k] = data.qpos, data.qvel, u
-        if isinstance(hidden, Sag):
-            hidden.volts = volts[max(k, 0)]
+        for sag in sags:
+            sag.volts = volts[max(k, 0)]
         for _ in range(round(SAMPLE / STEP)):
             data.ctrl[:] = hidden.command(u)
             data.xfrc_applied[:] = 0
@@ -160,4 +93,4 @@ def fly(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
         for axis in "xy"
     }
     thrusts = {f"{r}_thrust": sent[:, i] for i, r in enumerate(ROTORS)}
-    return {"time": time, **thrusts, "volts": volts, **body_columns(qpos, qvel, NOISE, rng), **angles}
+    return hidden.read({"time": time, **thrusts, "volts": volts, **body_columns(qpos, qvel, NOISE, rng), **angles})

@@ -14,6 +14,8 @@ from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.hidden import Array
 from nfc_gym.physics.parameters import Parameter
 
+from .residual import activations
+
 _WRITE: dict[str, Callable[[mujoco.MjSpec, str, float], None]] = {}
 
 
@@ -38,6 +40,12 @@ def _mass(spec: mujoco.MjSpec, name: str, value: float) -> None:
 def _servo(spec: mujoco.MjSpec, name: str, value: float) -> None:
     actuator = spec.actuator(name)
     actuator.gainprm[0], actuator.biasprm[2] = value, -value
+
+
+@_writes("servo_kp")
+def _position_servo(spec: mujoco.MjSpec, name: str, value: float) -> None:
+    actuator = spec.actuator(name)
+    actuator.gainprm[0], actuator.biasprm[1] = value, -value
 
 
 @_writes("geom_friction[0]")
@@ -104,16 +112,17 @@ def identify(bench: Bench, logs: Sequence[Log], iterations: int = 20) -> Array:
 def _pieces(bench: Bench, logs: Sequence[Log]) -> tuple[list[Array], list[sysid.TimeSeries], list[sysid.TimeSeries]]:
     model = bench.plant.model
     joints = [c.split(":")[1:] for c in logs[0].channels if c.startswith("joint:")]
-    names = ["base_qpos", "base_qvel", *(f"{name}_q{what}" for name, what in joints)]
+    body = model.body(int(model.jnt_bodyid[0])).name  # the free base's
+    names = [f"{body}_qpos", f"{body}_qvel", *(f"{name}_q{what}" for name, what in joints)]
     starts, controls, measured = [], [], []
     for log in logs:
         states = bench.states[log.name]
         sent = np.stack([log.controls[f"ctrl:{model.actuator(a).name}"] for a in range(model.nu)], 1)
-        channels = [f"body:base:{c}" for c in ("pos", "quat", "linvel", "angvel@body")] + [
+        channels = [f"body:{body}:{c}" for c in ("pos", "quat", "linvel", "angvel@body")] + [
             f"joint:{name}:{what}" for name, what in joints
         ]
         seen = np.concatenate([log.channels[c].values.reshape(len(log), -1) for c in channels], 1)
-        act = _filtered(model, sent, log.interval)
+        act = activations(model, sent, log.interval)
         length = round(bench.dataset.mapping.segments.length / log.interval)
         for s in range(0, len(log) - length, length):
             part, clock = slice(s, s + length + 1), np.arange(length + 1) * log.interval
@@ -123,15 +132,3 @@ def _pieces(bench: Bench, logs: Sequence[Log]) -> tuple[list[Array], list[sysid.
             controls.append(sysid.TimeSeries.from_control_names(clock, sent[part], model))
             measured.append(sysid.TimeSeries.from_names(clock, seen[part], model, names))
     return starts, controls, measured
-
-
-def _filtered(model: mujoco.MjModel, sent: Array, interval: float) -> Array:
-    """Activations (T, na) of actuators with a first-order filter, from the commands before."""
-    act = np.zeros((len(sent), model.na))
-    if not model.na:
-        return act
-    keep = np.exp(-interval / model.actuator_dynprm[:, 0])
-    act[0] = sent[0]
-    for k in range(1, len(sent)):
-        act[k] = sent[k - 1] + keep * (act[k - 1] - sent[k - 1])
-    return act

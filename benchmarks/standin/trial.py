@@ -1,166 +1,121 @@
-"""One trial: draw a machine, size its effect, write logs, run the loop blind, compare with oracle and baselines."""
+"""One trial: draw a machine, size its effects, write logs, run the loop blind, compare with oracle and baselines."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import time
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from nfc_gym.core.log import Log
-from nfc_gym.measured.bench import Bench, candidates, make_bench
+from nfc_gym.measured.bench import Bench, make_bench
 from nfc_gym.measured.dataset import load
-from nfc_gym.measured.demo import judge, write_log
 from nfc_gym.measured.export import unpack
 from nfc_gym.measured.hidden import Array, Hidden
 from nfc_gym.measured.loop import close_loop
-from nfc_gym.measured.metric import metric
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.standin import Machine, draw_psi
-from nfc_gym.measured.verdict import mean_square
 from nfc_gym.physics.rollout import Plant
 
+from .case import chi2, oracle, sized, true_effects, write_case
+from .kinds import Outside
+from .outside import Both
 from .robots import ROBOTS, Robot
-from .sysid import identify
+from .row import Row, Task
+from .score import estimates, foretold, psi_estimates, score
+
+LEAST, MOST = 1.3, 30.0  # X / X_null of what is hidden, log-uniform
+Model = tuple[Plant, Array]
 
 
-@dataclass(frozen=True)
-class Size:
-    """How long a trial is: logs, seconds of each, and which effects compete (empty: all)."""
-
-    logs: int = 8
-    seconds: float = 5.0
-    only: tuple[str, ...] = ()
-
-
-@dataclass
-class Row:
-    """Outcome of a trial.
-
-    Attributes:
-      ratio: X / X_null of the effect under the true psi without it; nan for nulls.
-      outcome: right, wrong or missed.
-      false_claims: effects claimed that are not there (an equivalent of a right claim is none).
-      errors: error over the oracle's by stage (nominal, psi only, sysid, after), at the longest horizon, geometric mean
-        over the groups of quantities.
-      oracle_x: X of the oracle over X_null on the verification logs, about 1 if both codes mean the same effect.
-    """
-
-    robot: str
-    family: str
-    hidden: str
-    seed: int
-    ratio: float
-    outcome: str = ""
-    false_claims: int = 0
-    claims: list[str] = field(default_factory=list)
-    verdict: str = ""
-    errors: dict[str, float] = field(default_factory=dict)
-    oracle_x: float = float("nan")
-    seconds: float = float("nan")
-    note: str = ""
-
-
-def trial(robot: str, family: str, seed: int, folder: Path, size: Size, jobs: int = 1) -> Row:
-    """Run one trial in an empty folder. `family` is one of the robot's kinds, or `none`."""
-    rng = np.random.default_rng(seed)
-    kit = ROBOTS[robot]
+def trial(task: Task, folder: Path, threads: int = 1) -> Row:
+    """Run one trial in an empty folder."""
+    began = time.process_time()
+    rng = np.random.default_rng(task.seed)
+    kit = ROBOTS[task.robot]
     psi = draw_psi(kit.psi, rng)
-    place, wanted = int(rng.integers(2**31)), float(np.exp(rng.uniform(np.log(1.3), np.log(30))))
-    (folder / "logs").mkdir(parents=True)
-    hidden, ratio = Hidden(), float("nan")
-    if family != "none":
-        hidden, ratio = sized(kit, psi, family, place, wanted, folder / "sizing")
+    row = Row(task.robot, task.group, list(task.families), task.seed)
+    hidden, outside = _hide(row, task, kit, psi, rng, folder / "sizing")
     machine = Machine(psi, hidden)
-    for i in range(size.logs):
-        write_log(folder / "logs" / f"run_{i:02d}.csv", kit.log(machine, size.seconds, int(rng.integers(2**31))))
-    _write_mapping(folder, kit, psi, size.only)
-    report = close_loop(folder / "mapping.yaml", folder / "report", seed=seed % 2**31, jobs=jobs)
-    row = Row(robot, family, hidden.text, seed, ratio, verdict=report["verdict"], seconds=report["seconds"])
-    row.claims = [" = ".join([e["id"], *e["equivalents"]]) for e in report["effects"]]
-    row.outcome = judge(report, hidden.family, hidden.where)
-    alone = [judge(report | {"effects": [e]}, hidden.family, hidden.where) for e in report["effects"]]
-    row.false_claims = sum(a != "right" for a in alone)
-    _compare(row, folder, report, machine)
+    seeds = [int(s) for s in rng.integers(2**31, size=task.size.logs)]
+    exclude = outside.exclude if outside else ()
+    mapping = write_case(folder, kit, machine, task.size.seconds, seeds, task.size.only, exclude)
+    report = close_loop(mapping, folder / "report", seed=task.seed % 2**31, jobs=threads)
+    row.hidden, row.seconds = hidden.text, report["seconds"]
+    score(row, report, hidden, outside)
+    row.effect, row.psi = estimates(report, hidden), psi_estimates(report, psi, kit.weighed)
+    if outside is None:
+        _compare(row, task, folder, report, machine)
+    row.cpu = time.process_time() - began
     return row
 
 
-def _write_mapping(folder: Path, kit: Robot, psi: dict[str, float], only: Sequence[str] = ()) -> None:
-    mapping = yaml.safe_load(kit.mapping(psi["base_mass"]))
-    if only:
-        mapping["effects"] = {"only": list(only)}
-    (folder / "mapping.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False))
+def _hide(
+    row: Row, task: Task, kit: Robot, psi: dict[str, float], rng: np.random.Generator, folder: Path
+) -> tuple[Hidden, Outside | None]:
+    """What the machine hides, each effect sized alone; and how it is judged if the library has no law for it."""
+    table = kit.outside if task.group == "outside" else kit.kinds
+    found, ratios = [], []
+    for family in task.families:
+        place, wanted = int(rng.integers(2**31)), float(np.exp(rng.uniform(np.log(LEAST), np.log(MOST))))
+        hidden, ratio = sized(kit, psi, table[family], place, wanted, folder, task.size.tries)
+        found.append(hidden)
+        ratios.append(ratio)
+    row.ratio = min(ratios, default=float("nan"))
+    kind = table[task.families[0]] if task.group == "outside" else None
+    hidden = found[0] if len(found) == 1 else Both(found) if found else Hidden()
+    return hidden, kind if isinstance(kind, Outside) else None
 
 
-def sized(
-    kit: Robot, psi: dict[str, float], family: str, place: int, wanted: float, folder: Path
-) -> tuple[Hidden, float]:
-    """The effect at a size that makes X / X_null about `wanted`, and the ratio reached (sizes have a range)."""
-    kind = kit.kinds[family]
-    floor = _chi2(kit, psi, Hidden(), folder)
-    size = float(np.sqrt(kind.low * kind.high))
-    best: tuple[float, Hidden, float] | None = None
-    for _ in range(8):
-        hidden = kind.make(np.random.default_rng(place), size)
-        ratio = _chi2(kit, psi, hidden, folder) / floor
-        miss = abs(np.log(max(ratio, 1.0) / wanted))
-        if best is None or miss < best[0]:
-            best = (miss, hidden, ratio)
-        if miss < 0.1:
-            break
-        # The excess grows about as the square of the size; where not, a step goes at most to a tenth or tenfold.
-        step = np.sqrt((wanted - 1) / max(ratio - 1, 1e-2))
-        size = float(np.clip(size * np.clip(step, 0.1, 10.0), kind.low, kind.high))
-    assert best is not None
-    return best[1], best[2]
-
-
-def _chi2(kit: Robot, psi: dict[str, float], hidden: Hidden, folder: Path) -> float:
-    """X of the model without effects at the true psi, on four short logs of always the same commands."""
-    (folder / "logs").mkdir(parents=True, exist_ok=True)
-    for i in range(4):
-        write_log(folder / "logs" / f"{i}.csv", kit.log(Machine(psi, hidden), 2.1, i))
-    _write_mapping(folder, kit, psi)
-    bench = make_bench(load(folder / "mapping.yaml"), 1)
-    problem = bench.problem(list(bench.dataset.logs))
-    x = bench.plant.space.vector(psi)
-    return mean_square(problem, _white(problem, bench.plant, x, problem.covariance(bench.plant, x)))
-
-
-def _white(problem: Problem, plant: Plant, x: Array, sigma: Array) -> Array:
-    return metric(problem, sigma).whiten(problem.residual(plant, x[None]))[0]
-
-
-def _compare(row: Row, folder: Path, report: dict, machine: Machine) -> None:
-    """Errors on the verification logs of all models over the oracle's: true effect, true psi, the package's model."""
+def _compare(row: Row, task: Task, folder: Path, report: dict, machine: Machine) -> None:
+    """Errors on the verification logs of all models over the oracle's: true effects, true psi, the package's model."""
     bench = make_bench(load(folder / "mapping.yaml"), 1)
     logs = {log.name: log for log in bench.dataset.logs}
-    fitting = [logs[n] for n in report["logs"]["fit"]]
+    fitting, selecting = ([logs[n] for n in report["logs"][s]] for s in ("fit", "select"))
     problem = bench.problem([logs[n] for n in report["logs"]["verify"]])
-    oracle = _oracle(bench, fitting, machine)
-    sigma = problem.covariance(*oracle)
-    row.oracle_x = mean_square(problem, _white(problem, *oracle, sigma)) / report["chi2"]["null"]
+    known = true_effects(bench, fitting, machine.hidden)
+    best = oracle(bench, fitting, machine)
+    if known is None or best is None:
+        raise ValueError(f"{machine.hidden.text}: the library proposes no such effect for this model")
+    if task.group == "single" and row.outcome != "right":
+        row.foretold = foretold(report, *known[0])
+    row.oracle_x = chi2(problem, *best) / report["chi2"]["null"]
     fits = json.loads((folder / "report" / "fit.json").read_text())
-    models = {"nominal": (bench.plant, bench.plant.null), "psi only": unpack(fits["calibrated"], bench.plant)}
+    calibrated = unpack(fits["calibrated"], bench.plant)
+    models = {"nominal": (bench.plant, bench.plant.null), "psi only": calibrated}
     models["after"] = unpack(fits["extended"], bench.plant)
-    try:
-        models["sysid"] = (bench.plant, identify(bench, fitting))
-    except Exception as error:  # the baseline's own limits are a result, and no reason to lose the trial
-        row.note = f"mujoco.sysid: {type(error).__name__}: {error}"
-    best = group_errors(problem, *oracle)
-    for name, (plant, x) in models.items():
-        row.errors[name] = float(np.exp(np.mean(np.log(group_errors(problem, plant, x) / best))))
+    if task.baselines:
+        models |= _baselines(row, bench, fitting, selecting, calibrated, machine.hidden)
+    floor = group_errors(problem, *best)
+    for name, model in models.items():
+        row.errors[name] = float(np.exp(np.mean(np.log(group_errors(problem, *model) / floor))))
 
 
-def _oracle(bench: Bench, logs: Sequence[Log], machine: Machine) -> tuple[Plant, Array]:
-    psi = bench.plant.space.vector(dict(machine.psi))
-    hidden = machine.hidden
-    if hidden.family == "none":
-        return bench.plant, psi
-    of = [e for e in candidates(bench, logs) if e.family == hidden.family and set(e.where) == set(hidden.where)]
-    theta = np.array([hidden.parameters[p.name] for p in of[0].params])
-    return bench.plant.with_effects([of[0]]), np.concatenate([psi, theta])
+def _baselines(
+    row: Row, bench: Bench, fitting: list, selecting: list, calibrated: Model, hidden: Hidden
+) -> dict[str, Model]:
+    """Other tools' models from the same logs; a baseline that fails is noted, and no reason to lose the trial."""
+    found: dict[str, Model] = {}
+
+    def sysid() -> None:
+        from .sysid import identify
+
+        found["sysid"] = bench.plant, identify(bench, fitting)
+
+    def network() -> None:
+        from .network import learn
+
+        found["network"] = learn(bench, fitting, selecting, *calibrated, row.seed)
+
+    def sparse() -> None:
+        from .sparse import regress
+
+        row.sindy = regress(bench, fitting, selecting, *calibrated).judged(hidden)
+
+    for tool in (sysid, network, sparse):
+        try:
+            tool()
+        except Exception as error:
+            row.note += f" {tool.__name__}: {type(error).__name__}: {str(error)[:120]};"
+    return found
 
 
 def group_errors(problem: Problem, plant: Plant, x: Array) -> Array:

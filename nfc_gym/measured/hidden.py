@@ -42,6 +42,10 @@ class Hidden:
     def push(self, data: mujoco.MjData) -> None:
         """Add forces to `qfrc_applied` and `xfrc_applied`, both zero before."""
 
+    def read(self, columns: dict[str, Array]) -> dict[str, Array]:
+        """What the sensors report of a log's columns (T,) each."""
+        return columns
+
 
 class Loss(Hidden):
     """One actuator makes only a share of its force."""
@@ -86,10 +90,11 @@ class Delay(Hidden):
 
     def begin(self, model: mujoco.MjModel) -> None:
         self.past: list[Array] = []
+        self.step = float(model.opt.timestep)
 
     def command(self, u: Array) -> Array:
         self.past.append(u)
-        whole, part = divmod(self.parameters["delay"] / STEP, 1.0)
+        whole, part = divmod(self.parameters["delay"] / self.step, 1.0)
         newest = len(self.past) - 1 - int(whole)
         return (1 - part) * self.past[max(newest, 0)] + part * self.past[max(newest - 1, 0)]
 
@@ -104,10 +109,11 @@ class Lag(Hidden):
 
     def begin(self, model: mujoco.MjModel) -> None:
         self.reached: Array | None = None
+        self.step = float(model.opt.timestep)
 
     def command(self, u: Array) -> Array:
         before = u if self.reached is None else self.reached
-        made = before + (1 - np.exp(-STEP / self.parameters["time_constant"])) * (u - before)
+        made = before + (1 - np.exp(-self.step / self.parameters["time_constant"])) * (u - before)
         self.reached = made
         return made
 

@@ -130,7 +130,7 @@ def drive_jackal(machine: Machine, seconds: float, seed: int) -> dict[str, Array
     for i, wheel in enumerate(WHEELS):
         noisy[f"{wheel}_speed"] = qvel[:, 6 + i] + JACKAL_NOISE["wheel"] * rng.normal(size=len(time))
     sent = {f"{wheel}_command": commands[:, i] for i, wheel in enumerate(WHEELS)}
-    return {"time": time, **sent, **noisy}
+    return machine.hidden.read({"time": time, **sent, **noisy})
 
 
 def run(

@@ -1,124 +1,255 @@
-"""The benchmark of undeclared effects: two separate codes must mean the same by an effect, and the sums must add up."""
+"""The benchmark of undeclared effects: what is planned, how reports are scored, and whether the sums add up."""
 
-import importlib.util
 import json
 import math
-import sys
+from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+
+def modules() -> SimpleNamespace:
+    names = ("outside", "plan", "row", "score", "summary", "kinds", "robots", "faults", "pushes")
+    return SimpleNamespace(
+        **{n: import_module(f"standin.{n}") for n in names}, main=import_module("undeclared_effects")
+    )
 
 
-@pytest.fixture(scope="module")
-def benchmark() -> ModuleType:
-    """`undeclared_effects` with its own folder on the path, as when it is run as a script."""
-    pytest.importorskip("mujoco.sysid._src.parameter", reason="needs mujoco[sysid]")
-    sys.path.insert(0, str(FOLDER))
-    try:
-        spec = importlib.util.spec_from_file_location("undeclared_effects", FOLDER / "undeclared_effects.py")
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    finally:
-        sys.path.remove(str(FOLDER))
-    return module
-
-
-@pytest.mark.parametrize(
-    ("robot", "family"),
-    [
-        ("quadcopter", "loss"),
-        ("quadcopter", "payload"),
-        ("quadcopter", "wind"),
-        ("quadcopter", "drag_quadratic"),
-        ("quadcopter", "delay"),
-        ("quadcopter", "supply_sag"),
-        ("jackal", "loss"),
-        ("jackal", "payload"),
-        ("jackal", "delay"),
-        ("jackal", "lag"),
-        ("jackal", "coulomb"),
-        ("jackal", "slope"),
-    ],
-)
-def test_the_package_explains_the_stand_in_to_its_noise_floor(
-    benchmark: ModuleType, tmp_path: Path, robot: str, family: str
-) -> None:
-    """True effect and true psi in the package's model: X is about 1, while without the effect it is far from it."""
-    trial = sys.modules["standin.trial"]
-    kit = benchmark.ROBOTS[robot]
-    rng = np.random.default_rng(7)
-    psi = trial.draw_psi(kit.psi, rng)
-    kind = kit.kinds[family]
-    hidden = kind.make(rng, kind.low ** (1 / 3) * kind.high ** (2 / 3))
-    machine = trial.Machine(psi, hidden)
-    (tmp_path / "logs").mkdir()
-    for i in range(4):
-        trial.write_log(tmp_path / "logs" / f"{i}.csv", kit.log(machine, 2.5, i))
-    trial._write_mapping(tmp_path, kit, psi)
-    bench = trial.make_bench(trial.load(tmp_path / "mapping.yaml"), 1)
-    logs = list(bench.dataset.logs)
-    problem = bench.problem(logs)
-    plant, x = trial._oracle(bench, logs, machine)
-    sigma = problem.covariance(plant, x)
-    with_effect = trial.mean_square(problem, trial._white(problem, plant, x, sigma))
-    bare = bench.plant.space.vector(psi)
-    without = trial.mean_square(problem, trial._white(problem, bench.plant, bare, sigma))
-    assert with_effect < 1.4
-    assert without > 1.5 * with_effect
-
-
-def row(benchmark: ModuleType, robot: str, family: str, outcome: str, ratio: float = 5.0, after: float = 1.0) -> object:
-    errors = {"after": after, "psi only": 2.0, "nominal": 3.0, "sysid": 2.5}
-    false = int(family == "none" and outcome == "wrong")
-    return benchmark.Row(robot, family, family, 1, ratio, outcome, false, errors=errors)
-
-
-def test_summary_counts_and_compares_with_the_goals(benchmark: ModuleType) -> None:
-    rows = [row(benchmark, "jackal", "lag", "right", 2.0) for _ in range(9)]
-    rows += [row(benchmark, "jackal", "lag", "missed", 20.0) for _ in range(3)]
-    rows += [row(benchmark, "quadcopter", "wind", "right", after=1.2)]
-    rows += [row(benchmark, "jackal", "none", "right", math.nan), row(benchmark, "jackal", "none", "wrong", math.nan)]
-    by_name = {r["name"]: r for r in benchmark.summary(rows, 11)}
-    assert by_name["jackal: named right"]["value"] == 0.75
-    assert by_name["jackal: named right"]["holds"] is True
-    assert by_name["jackal: named right, X/X_null 10 to inf (3 trials)"]["value"] == 0.0
-    assert by_name["quadcopter: error after / oracle's, worst right case"]["holds"] is False
-    assert by_name["false claims in 2 nulls"] | {"seeds": 0} == {
-        "name": "false claims in 2 nulls",
-        "value": 1,
-        "unit": "trials",
-        "baseline": None,
-        "goal": "<= 1",
-        "holds": True,
-        "seeds": 0,
+def claim(family: str, where: Any, equivalents: tuple[str, ...] = (), **parameters: tuple[float, float, float]) -> dict:
+    place = where if isinstance(where, str) else "+".join(where)
+    values = {n: {"value": v, "low": a, "high": b, "unit": "1"} for n, (v, a, b) in parameters.items()}
+    return {"id": f"{family}:{place}", "family": family, "where": where, "equivalents": list(equivalents)} | {
+        "parameters": values
     }
-    json.dumps(benchmark.summary(rows, 11), allow_nan=False)
 
 
-def test_the_plan_takes_turns_and_repeats_with_its_seed(benchmark: ModuleType) -> None:
-    args = benchmark.parse(["--trials", "12", "--nulls", "3", "--robots", "jackal"])
-    plans = [benchmark.planned(args, np.random.default_rng(5)) for _ in range(2)]
-    assert plans[0] == plans[1]
-    families = [p[1] for p in plans[0]]
-    assert sorted(families.count(f) for f in benchmark.ROBOTS["jackal"].kinds) == [2] * 6
-    assert families.count("none") == 3
+def report(*claims: dict, verdict: str = "explained", coordinate: str | None = None) -> dict:
+    rest = None if coordinate is None else {"coordinate": coordinate}
+    return {"effects": list(claims), "verdict": verdict, "unexplained": rest, "identifiability": []}
 
 
-def test_sysid_finds_the_true_psi_of_a_machine_without_effect(benchmark: ModuleType, tmp_path: Path) -> None:
+def outcome(said: dict, hidden: Any, outside: Any = None) -> Any:
+    m = modules()
+    row = m.row.Row("jackal", "single", [], 1)
+    m.score.score(row, said, hidden, outside)
+    return row
+
+
+# ---- plans ----------------------------------------------------------------------------------------------------------
+
+
+def tasks(*argv: str) -> list:
+    main = modules().main
+    return main.planned(main.parse(["--robots", "jackal", "ant", *argv]), 5)
+
+
+def test_a_trial_has_the_same_seed_whatever_else_is_asked_for() -> None:
+    few, many = tasks("--trials", "1", "--nulls", "2"), tasks("--trials", "2", "--nulls", "3", "--pairs", "4")
+    assert {t.name for t in few} <= {t.name for t in many}
+    assert len({t.seed for t in many}) == len(many)
+
+
+def test_every_robot_has_at_least_twelve_effects_and_each_is_tried_as_often() -> None:
+    robots = modules().robots.ROBOTS
+    assert all(len(r.kinds) >= 12 for r in robots.values())
+    families = [t.families for t in tasks("--trials", "3") if t.robot == "ant"]
+    assert sorted(families) == sorted([(f,) for f in robots["ant"].kinds] * 3)
+
+
+def test_pairs_are_of_two_kinds_and_repeat_with_the_seed() -> None:
+    plan = modules().plan
+    drawn = [t.families for t in plan.pairs("jackal", 30, 3)]
+    assert drawn == [t.families for t in plan.pairs("jackal", 30, 3)]
+    assert all(plan._KIND[a] != plan._KIND[b] for a, b in drawn)
+    assert len(set(drawn)) == 30
+
+
+def test_the_baselines_run_in_a_share_of_single_effects() -> None:
+    singles = [t for t in tasks("--trials", "5", "--nulls", "9", "--baselines", "0.2") if t.robot == "ant"]
+    assert sum(t.baselines for t in singles) == len([t for t in singles if t.group == "single"]) // 5
+    assert not any(t.baselines for t in singles if t.group == "null")
+
+
+def test_excluded_families_are_those_that_a_mapping_knows() -> None:
+    known = set(import_module("nfc_gym.measured.entries").FAMILIES)
+    for robot in modules().robots.ROBOTS.values():
+        assert set(robot.kinds) <= known
+        assert all(set(k.exclude) | set(k.near) <= known for k in robot.outside.values())
+
+
+# ---- resuming -------------------------------------------------------------------------------------------------------
+
+
+def test_finished_trials_are_kept_and_failed_ones_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    m = modules()
+    plan, ran = m.plan, []
+    todo = [m.row.Task("jackal", "null", (), s) for s in range(4)]
+
+    def fake(task: Any, folder: Path, threads: int) -> Any:
+        ran.append(task.seed)
+        if task.seed == 2 and len(ran) < 5:
+            raise RuntimeError("once")
+        return m.row.Row("jackal", "null", [], task.seed, oracle_x=math.nan, errors={"after": 1.0})
+
+    monkeypatch.setattr(plan, "trial", fake)
+    first = [r.seed for r, _ in plan.run(todo, 1, 1, plan.Kept(tmp_path))]
+    assert first == [0, 1, 3]
+    second = {r.seed: r for r, _ in plan.run(todo, 1, 1, plan.Kept(tmp_path))}
+    assert sorted(second) == [0, 1, 2, 3]
+    assert ran == [0, 1, 2, 3, 2]
+    assert second[0].errors == {"after": 1.0}
+    assert math.isnan(second[0].oracle_x)
+
+
+def test_a_trial_without_baselines_is_not_finished_for_one_with(tmp_path: Path) -> None:
+    m = modules()
+    kept = m.plan.Kept(tmp_path)
+    bare, full = (m.row.Task("ant", "single", ("lag",), 1, baselines=b) for b in (False, True))
+    kept.put(bare, m.row.Row("ant", "single", ["lag"], 1))
+    assert kept.get(bare) is not None
+    assert kept.get(full) is None
+
+
+def test_a_folder_keeps_its_seed(tmp_path: Path) -> None:
+    main = modules().main
+    seed = main.master_seed(main.parse(["--out", str(tmp_path / "o")]))
+    assert main.master_seed(main.parse(["--out", str(tmp_path / "o")])) == seed
+    with pytest.raises(SystemExit, match="begun with seed"):
+        main.master_seed(main.parse(["--out", str(tmp_path / "o"), "--seed", str(seed + 1)]))
+
+
+# ---- scores ---------------------------------------------------------------------------------------------------------
+
+
+def test_outcomes_of_one_and_two_effects() -> None:
+    m = modules()
+    loss, push = m.kinds.Loss("front_left", 0.3), m.pushes.Push("base", np.array([1.0, 0.0, 0.0]))
+    both = m.outside.Both([loss, push])
+    right, other = claim("loss", "front_left"), claim("external_force", "base")
+    assert outcome(report(right), loss).outcome == "right"
+    assert outcome(report(claim("gain", "front_left", ("loss:front_left",))), loss).class_size == 2
+    assert outcome(report(claim("loss", "rear_left")), loss).outcome == "wrong"
+    assert outcome(report(verdict="nothing missing"), loss).outcome == "missed"
+    assert outcome(report(right, other), loss).false_claims == 1
+    assert outcome(report(right, other), both).outcome == "right"
+    assert outcome(report(right), both).outcome == "half"
+    assert outcome(report(right, other, claim("lag", "front_left")), both).outcome == "wrong"
+    assert outcome(report(right), m.kinds.Hidden()).false_claims == 1
+    assert outcome(report(verdict="nothing missing"), m.kinds.Hidden()).outcome == "right"
+
+
+def test_outcomes_outside_the_library() -> None:
+    m = modules()
+    cogs = m.outside.Cogging("front_left_wheel", 1.0, 3, 0.0)
+    kind = m.robots.ROBOTS["jackal"].outside["cogging"]
+    said = report(verdict="unexplained", coordinate="joint:front_left_wheel (joint speed)")
+    assert outcome(said, cogs, kind).outcome == "right"
+    assert outcome(report(verdict="unexplained", coordinate="body:base (velocity)"), cogs, kind).outcome == "elsewhere"
+    assert outcome(report(verdict="nothing missing"), cogs, kind).outcome == "silent"
+    assert outcome(report(claim("coulomb", "front_left_wheel")), cogs, kind).outcome == "wrong"
+    load, near = m.outside.LooseLoad("base", 1.0, 0.1, 0.0), m.robots.ROBOTS["jackal"].outside["loose_load"]
+    partly = report(claim("payload", "base"), verdict="partly explained", coordinate="body:base (velocity)")
+    assert outcome(partly, load, near).outcome == "right"
+    assert outcome(report(claim("payload", "base")), load, near).outcome == "silent"
+
+
+def test_parameters_are_compared_where_the_effect_is_claimed_by_its_own_name() -> None:
+    m = modules()
+    gain = m.faults.Gain(("a", "b"), 1.2)
+    found = m.score.estimates(report(claim("gain", ["b", "a"], gain=(1.23, 1.15, 1.31))), gain)
+    assert [(e.name, e.true, e.covered) for e in found] == [("gain.gain", 1.2, True)]
+    assert found[0].off == pytest.approx(0.025)
+    assert m.score.share_within(found, 0.05) == (1, 1)
+    assert m.score.estimates(report(claim("gain", "a", gain=(1.2, 1.1, 1.3))), gain) == []
+
+
+def test_a_miss_is_foretold_by_its_size_or_by_its_mimic() -> None:
+    m = modules()
+    slope = import_module("nfc_gym.physics.effects").FAMILIES["slope"](("world",))
+    theta = np.array([0.03, 0.04])  # 0.05 rad
+
+    def told(least: float, mimic: str, *claims: dict) -> bool:
+        row = {"id": "slope:world", "smallest_detectable": least, "worst_mimic": mimic}
+        return m.score.foretold(report(*claims) | {"identifiability": [row]}, slope, theta)
+
+    assert told(0.06, "payload:base")
+    assert not told(0.04, "payload:base")
+    assert told(0.04, "payload:base", claim("payload", "base"))
+    assert not m.score.foretold(report(), slope, theta)
+
+
+def test_what_sparse_regression_names_is_read_generously_but_at_its_place() -> None:
+    pytest.importorskip("pysindy")
+    sparse, m = import_module("standin.sparse"), modules()
+    found = sparse.Found("sign v", "joint:rear_left_wheel", sparse.ON_JOINT["sign v"], 0.4)
+    assert found.judged(m.kinds.Coulomb("rear_left_wheel", 1.0))["right"]
+    assert not found.judged(m.kinds.Coulomb("rear_right_wheel", 1.0))["right"]
+    assert sparse.Found("u", "joint:rear_left_wheel", ("loss",), 0.4).judged(m.kinds.Loss("rear_left", 0.1))["right"]
+    assert not found.judged(m.kinds.Hidden())["right"]
+
+
+# ---- sums -----------------------------------------------------------------------------------------------------------
+
+
+def row(robot: str, family: str, outcome: str, ratio: float = 5.0, after: float = 1.0, group: str = "single") -> Any:
+    m = modules()
+    errors = {"after": after, "psi only": 2.0, "nominal": 3.0, "sysid": 2.5}
+    families = [] if group == "null" else [family]
+    false = int(group == "null" and outcome == "wrong")
+    verdict = "explained" if outcome == "wrong" else "nothing missing"
+    return m.row.Row(
+        robot, group, families, 1, family, ratio, outcome, false, class_size=1, errors=errors, verdict=verdict
+    )  # fmt: skip
+
+
+def test_wilson_is_the_interval_at_whose_ends_the_share_is_1_96_deviations_off() -> None:
+    summary = modules().summary
+    for hits, of in ((9, 12), (0, 31), (124, 124), (1, 2)):
+        for end in summary.wilson(hits, of):
+            sd = math.sqrt(end * (1 - end) / of)
+            assert hits / of == pytest.approx(end, abs=1e-9) or abs(hits / of - end) == pytest.approx(1.959964 * sd)
+
+
+def test_summary_counts_and_compares_with_the_goals() -> None:
+    m = modules()
+    rows = [row("jackal", "lag", "right", 2.0) for _ in range(9)]
+    rows += [row("jackal", "lag", "missed", 20.0) for _ in range(3)]
+    rows += [row("quadcopter", "wind", "right", after=1.2)]
+    rows += [row("jackal", "", "right", math.nan, group="null"), row("jackal", "", "wrong", math.nan, group="null")]
+    rows += [row("ant", "cogging", o, group="outside") for o in ("right", "right", "right", "silent")]
+    rows[9].foretold = rows[10].foretold = True
+    rows[11].foretold = False
+    estimate = m.row.Estimate("lag.time_constant", "s", 0.02, 0.0205, 0.019, 0.022)
+    rows[0].effect = [estimate, m.row.Estimate("lag.time_constant", "s", 0.02, 0.03, 0.028, 0.032)]
+    figures = m.summary.summarise(rows, 11)
+    by_name = {r["name"]: r for r in figures}
+
+    def of(start: str) -> dict:
+        return next(v for k, v in by_name.items() if k.startswith(start))
+
+    assert (of("jackal: named right (9 of 12)")["value"], of("jackal: named right (")["holds"]) == (0.75, False)
+    assert of("jackal: named right, X/X_null 10 to inf (0 of 3)")["value"] == 0.0
+    assert of("quadcopter: error after / oracle's at most 1.10")["holds"] is False
+    assert (of("false claims in 2 nulls")["value"], of("false claims in 2 nulls")["holds"]) == (1, True)
+    assert of("effects' parameters in their 95 % interval (1 of 2)")["holds"] is False
+    assert of("effects' parameters within 5 % (1 of 2)")["value"] == 0.5
+    assert of("misses that the identifiability table foretold (2 of 3)")["holds"] is False
+    assert of("outside the library: silent (1 of 4)")["holds"] is False
+    assert of("outside the library: said so, coordinate right (3 of 4)")["value"] == 0.75
+    assert of("jackal: named right (")["seeds"] == [11] + [1] * 12
+    json.dumps(figures, allow_nan=False)
+
+
+def test_sysid_finds_the_true_psi_of_a_machine_without_effect(tmp_path: Path) -> None:
     """A baseline that were badly set up would be no baseline."""
-    trial = sys.modules["standin.trial"]
-    kit = benchmark.ROBOTS["quadcopter"]
+    pytest.importorskip("mujoco.sysid._src.parameter", reason="needs mujoco[sysid]")
+    case, sysid = import_module("standin.case"), import_module("standin.sysid")
+    kit = modules().robots.ROBOTS["quadcopter"]
     psi = {"base_mass": 0.63, "arm_mass": 0.09, "mount_stiffness": 4.5}
-    (tmp_path / "logs").mkdir()
-    for i in range(4):
-        trial.write_log(tmp_path / "logs" / f"{i}.csv", kit.log(trial.Machine(psi), 2.0, i))
-    trial._write_mapping(tmp_path, kit, psi)
-    bench = trial.make_bench(trial.load(tmp_path / "mapping.yaml"), 1)
-    found = trial.identify(bench, list(bench.dataset.logs))
+    mapping = case.write_case(tmp_path, kit, case.Machine(psi), 1.6, range(3))
+    bench = case.make_bench(case.load(mapping), 1)
+    found = sysid.identify(bench, list(bench.dataset.logs))
     np.testing.assert_allclose(found, [psi[p] for p in bench.plant.space.names], rtol=0.03)
