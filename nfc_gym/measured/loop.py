@@ -27,7 +27,7 @@ from nfc_gym.measured.details import details
 from nfc_gym.measured.export import corrected, effects_of, pack, unpack
 from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, fit
-from nfc_gym.measured.identify import Stakes, table
+from nfc_gym.measured.identify import table
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.problem import Problem
@@ -39,6 +39,7 @@ from nfc_gym.measured.search import Found, Options, Search
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, write_whole
+from nfc_gym.measured.stakes import Stakes
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
