@@ -1,9 +1,7 @@
 """What the logs at hand could have shown: for each effect its smallest detectable size and its worst mimic.
 
-Detection is the search's own: the gain that a candidate brings must exceed the price that the contest charges it
-(`Stakes`), and it must do so in 99.5 % of repetitions. A gain of expectation g scatters by 2 sqrt(g), so the size at
-which an effect is sure to be found follows from its column (`fisher`) by scaling. Currie (1968), Analytical Chemistry
-40, 586, calls this the detection limit, as against the decision limit that a lucky draw may pass.
+What it takes to be found is the search's own price (`stakes`); the size at which it is paid follows from the effect's
+column (`fisher`) by scaling, and is confirmed by a column at that size.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import contains
-from nfc_gym.measured.contest import price
 from nfc_gym.measured.fisher import Lens, flat, free_names, realistic, sized, span, without
+from nfc_gym.measured.stakes import Stakes
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
-_SURE = 2.576  # standard deviations: 99.5 %, one-sided
 _TOLD = 3.92  # the contest's 2.5 % level (1.96) on a difference of gains d, which scatters by 2 sqrt(d)
 _SAME = 0.95  # share of the gain beyond which the contest lists a rival as equivalent
 _NUDGE = 0.1  # of an accepted effect's size, that is taken away to see what it does
@@ -28,31 +25,6 @@ _GONE = 0.03  # share of a column left below which the fitted parameters can imi
 _LEADING = 12  # effects whose sizes are confirmed
 _TRIES = 4  # columns with which a size is confirmed, at most
 _STRAIGHT = 1.25  # column over expected column, either way, up to which sizes scale
-
-
-@dataclass(frozen=True)
-class Stakes:
-    """What the search charges a candidate.
-
-    Attributes:
-      count: numbers that it compares, on fit and selection logs.
-      dispersion: loss per number of the model to beat.
-      worth: share of the whole loss that an effect must explain to be named.
-      repeats: how many times the blocks looked at here the search's own blocks are.
-    """
-
-    count: int
-    dispersion: float
-    worth: float
-    repeats: float = 1.0
-
-    def needed(self, extra: int) -> float:
-        """Length of a column, on the blocks looked at, from which an effect of `extra` parameters is sure to be found.
-
-        The gain's 0.5 % quantile, g - 2 z sqrt(g), must reach the price.
-        """
-        least = price(self.count, extra, self.dispersion) + self.worth * self.count * self.dispersion
-        return float((_SURE + np.sqrt(_SURE**2 + least)) / np.sqrt(self.repeats))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from nfc_gym.measured.details import details
 from nfc_gym.measured.export import corrected, effects_of, pack
 from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, stand
-from nfc_gym.measured.identify import Stakes, table
+from nfc_gym.measured.identify import table
 from nfc_gym.measured.kept import pack_state, unpack_state
 from nfc_gym.measured.maps import maps
 from nfc_gym.measured.metric import metric
@@ -42,6 +42,7 @@ from nfc_gym.measured.search import Found, Options, Search, State
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, require_free, written_by
+from nfc_gym.measured.stakes import Stakes
 from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.physics.effects.base import Effect
 

@@ -17,10 +17,10 @@ from nfc_gym.measured.distances import Ask, Model
 from nfc_gym.measured.export import unpack
 from nfc_gym.measured.fisher import Lens, flat, realistic, sized, without
 from nfc_gym.measured.fit import Fit, fit
-from nfc_gym.measured.identify import Stakes
 from nfc_gym.measured.metric import loss, metric
 from nfc_gym.measured.search import Options
 from nfc_gym.measured.settle import settle, slack
+from nfc_gym.measured.stakes import Stakes
 from nfc_gym.measured.story import rivals_of
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import split

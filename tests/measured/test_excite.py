@@ -26,9 +26,10 @@ from nfc_gym.measured.dataset import load
 from nfc_gym.measured.excite import excite
 from nfc_gym.measured.fisher import Lens, left_over, span, without
 from nfc_gym.measured.fit import fit
-from nfc_gym.measured.identify import Stakes, table
+from nfc_gym.measured.identify import table
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.questions import look, reported
+from nfc_gym.measured.stakes import Stakes
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.saved import to_row
 
