@@ -96,7 +96,7 @@ def command(line: list[str], limit: float = LIMIT) -> Ending:
             code = e.code if isinstance(e.code, int) else int(e.code is not None)
         except Hung:
             code, _ = -1, out.write(f"hung for {limit:g} s")
-        except BaseException as e:
+        except Exception as e:
             code, _ = -2, out.write(f"{type(e).__name__}: {e}")
         finally:
             sys.argv = before
@@ -212,6 +212,8 @@ class Bench:
             shutil.rmtree(self.folder, ignore_errors=True)
             self.folder.mkdir(parents=True)
             turns[kind](number, kind, rng)
+            if number % 500 == 499:
+                print(f"{number + 1} cases, {len(self.faults)} faults", flush=True)
 
 
 INPUTS_WORDS = (

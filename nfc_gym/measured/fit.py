@@ -54,6 +54,8 @@ def jacobian(
       which: of the free coordinates.
       size: step in scaled coordinates.
     """
+    if not len(which):
+        return np.zeros((*base.shape, 0))
     z = limits.at(x)
     step = np.where(z[which] + size > limits.roof[which], -size, size)
     rows = np.repeat(z[None], len(which), 0)

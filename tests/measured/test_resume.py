@@ -192,3 +192,13 @@ def test_a_run_that_replaces_another_loses_nothing_until_it_has_something_better
     run.kill()
     run.communicate()
     assert results(out) == before
+
+
+def test_a_mapping_without_parameters_is_fitted_too(tmp_path: Path) -> None:
+    mapping = machine(tmp_path)
+    text = mapping.read_text()
+    a, b = text.index("parameters:"), text.index("logs:")
+    mapping.write_text(text[:a] + text[b:])
+    report = close_loop(mapping, tmp_path / "out", jobs=1, fold="run_0")
+    assert [e["id"] for e in report["effects"]] == ["coulomb:hinge"]
+    assert report["parameters"] == []
