@@ -19,6 +19,7 @@ AGREE = 0.8  # correlation from which on two signals are taken for the same moti
 SURE = 4.0  # standard deviations, with which an offset is not zero
 SHARE = 0.25  # of a sampling interval: a smaller offset is none to speak of
 MOST = 2.0  # s, or a fifth of the log where that is less
+FEWEST = 16  # samples of a channel from which motion can be told
 LONGEST = 10_000  # samples of a channel that are compared
 
 
@@ -28,6 +29,8 @@ def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log]) -> Iterator
     for log in logs:
         for position, speed, time, travel in _pairs(model, log):
             other, rate = _samples(log, log.channels[speed])
+            if len(other) < FEWEST:
+                continue
             rate = rate.reshape(len(rate), -1)
             offset = clock_offset(time, travel, other, rate, min(MOST, 0.2 * log.duration))
             if offset is not None and offset.correlation > AGREE and offset.sd > 0:
@@ -63,6 +66,8 @@ def _pairs(model: mujoco.MjModel | None, log: Log) -> Iterator[tuple[str, str, A
         if parsed.quantity not in ("pos", "quat") or parsed.own_frame:
             continue
         time, values = _samples(log, channel)
+        if len(time) < FEWEST:
+            continue
         if parsed.quantity == "pos":
             speed = f"joint:{parsed.object}:vel" if parsed.kind == "joint" else f"body:{parsed.object}:linvel"
             if speed in log.channels:

@@ -12,8 +12,8 @@ CASES = [
     ("quadcopter", f, 0.75) for f in ("supply_sag", "gain", "offset", "com_shift", "sensor_bias", "payload", "wind")
 ]
 CASES += [("quadcopter", f, 0.9) for f in ("drag_linear", "drag_quadratic", "rotor_drag")]
-CASES += [("jackal", f, 0.75) for f in ("delay", "lag", "coulomb", "stribeck", "slip", "dead_zone", "armature", "loss")]
-CASES += [("jackal", f, 0.85) for f in ("slope", "external_force")]
+CASES += [("jackal", f, 0.75) for f in ("delay", "lag", "coulomb", "stribeck", "slip", "dead_zone", "loss")]
+CASES += [("jackal", "slope", 0.85), ("jackal", "external_force", 0.85), ("jackal", "armature", 0.95)]
 CASES += [("quadruped", "saturation", 0.75), ("quadruped", "damping_poly", 0.75), ("ant", "spring_offset", 0.75)]
 
 
