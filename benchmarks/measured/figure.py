@@ -78,7 +78,7 @@ def _trace(axes: Axes, log: Log, mode: str, tables: Mapping[str, np.ndarray]) ->
 
 
 def _spread(axes: Axes, logs: Sequence[Log], mode: str, tables: Mapping[str, np.ndarray]) -> None:
-    """Errors at the ends of many logs, in the column where the calibrated model's median is largest; the rest is cut."""
+    """Errors at the ends of many logs, in the column where the calibrated model's median is largest."""
     ends = {s: np.array([_table(tables[s][log.name])[-1] - compared(log, mode)[0][-1] for log in logs]) for s in STAGES}
     column = int(np.nanmedian(np.abs(ends["calibrated"]), 0).argmax())
     for stage, (label, colour) in STAGES.items():
