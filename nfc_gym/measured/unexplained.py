@@ -9,6 +9,7 @@ from nfc_gym.measured.laws import Proposal
 from nfc_gym.measured.search import Found
 from nfc_gym.measured.verdict import Verified
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.generic import GenericMemory
 from nfc_gym.physics.effects.law import Law, degrees
 from nfc_gym.physics.rollout import Plant
 
@@ -35,6 +36,10 @@ def unexplained(v: Verified, found: Found, plant: Plant, rows: list[dict[str, An
         parts = [f"{law.what}: {_inner(r['sentence'])}" for law, r in zip(laws, rows, strict=True)]
         text = f"looks like {', and '.join(parts)}{near}"
         return _place(plant.model, laws[0]) | out | {"description": f"{text}; {reason}" if "alike" in reason else text}
+    family, _, joint = (found.generic or "").partition(":")
+    if family == GenericMemory.family:
+        text = f"looks like a force with memory in {joint}, of no law of the library{near}"
+        return {"coordinate": f"joint:{joint}:pos", "where": f"joint:{joint}"} | out | {"description": text}
     if scanned is not None and scanned.nearest is not None:
         law = scanned.nearest.law
         law.bind(plant.model)

@@ -1,0 +1,42 @@
+"""The rest in words, where no law was believed."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from nfc_gym.measured.remainder import Remainder
+from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.unexplained import unexplained
+from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.physics.rollout import Plant
+
+MODEL = """<mujoco><worldbody><body><joint name="knee"/><geom size="0.1"/></body></worldbody></mujoco>"""
+RANKED = {"id": "coulomb:knee", "generic": False, "share": 0.3}
+
+
+def said(generic: str | None) -> dict[str, Any]:
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    rest = Remainder(fitted=None)  # type: ignore[arg-type]
+    found: Any = SimpleNamespace(generic=generic, rest=rest, rounds=[Round([], 0.0, [RANKED])], nearest=None)
+    columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
+    problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
+    v: Any = SimpleNamespace(problem=problem, white={"extended": np.array([[1.0, 3.0]])})
+    return unexplained(v, found, plant, [])
+
+
+def test_memory_in_a_joint_is_said_as_such() -> None:
+    found = said("generic_memory:knee")
+    assert (found["coordinate"], found["where"]) == ("joint:knee:pos", "joint:knee")
+    assert found["description"].startswith("looks like a force with memory in knee, of no law of the library")
+    assert (found["nearest"], found["nearest_share"]) == ("coulomb:knee", pytest.approx(0.3))
+
+
+@pytest.mark.parametrize("generic", [None, "generic_velocity:knee"])
+def test_without_a_law_the_columns_with_most_misfit_are_named(generic: str | None) -> None:
+    found = said(generic)
+    assert found["where"] == "joint:knee"
+    assert found["description"].startswith("largest share of the remaining misfit: 90%")
