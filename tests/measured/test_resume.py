@@ -91,7 +91,14 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, float]:
 
 def start(mapping: Path, out: Path, *options: str) -> subprocess.Popen[str]:
     arguments = [str(mapping), "--out", str(out), "--jobs", "1", *options]
-    return subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=heard
+    )
+
+
+def heard() -> None:
+    """A test run in the background of a shell ignores SIGINT, and its children would too."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def test_a_run_killed_at_any_moment_ends_as_one_that_was_not(whole: tuple[Path, Path, float], tmp_path: Path) -> None:
