@@ -1,7 +1,7 @@
 """Screening: which candidate effects could explain the residual, judged at realistic sizes with psi projected out.
 
-A secant instead of a derivative: delay, dry friction and saturation have no useful derivative at zero (LOOP.md's score
-test).
+A score test with secants: delay, dry friction and saturation have no useful derivative at zero, and are tried at
+realistic sizes.
 """
 
 from collections.abc import Callable, Sequence
