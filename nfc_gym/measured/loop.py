@@ -10,45 +10,38 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together
 from nfc_gym.core.log import Log
-from nfc_gym.measured import verdict as say
 from nfc_gym.measured.advice import advise
 from nfc_gym.measured.arena import Data
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
-from nfc_gym.measured.details import details
-from nfc_gym.measured.export import corrected, effects_of, pack
 from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.identify import table
 from nfc_gym.measured.kept import pack_state, unpack_state
-from nfc_gym.measured.maps import maps
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.numerics import fingerprint, one_blas_thread
+from nfc_gym.measured.outcome import report, summary, write
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.questions import Present, blocks_for
-from nfc_gym.measured.remarks import on_parameters
-from nfc_gym.measured.report import render, render_summary
+from nfc_gym.measured.report import render_summary
 from nfc_gym.measured.search import Found, Options, Search, State
 from nfc_gym.measured.settle import TURNS, settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
-from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
-_REPLICAS = 6
 _SOME_LOGS = 6  # that the identifiability table of an instant problem is made from
 
 
@@ -141,10 +134,10 @@ def _close_loop(
             reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, keys[f.name], overwrite, resume, console)
         done = [*done, f.name]
         stages.put("folds", done)
-    summary = _summary(dataset, reports)
-    write_together(out, {"report.html": render_summary(summary), "report.json": json.dumps(summary, indent=1)})
+    whole = summary(reports)
+    write_together(out, {"report.html": render_summary(whole), "report.json": json.dumps(whole, indent=1)})
     stages.finish()
-    return summary
+    return whole
 
 
 def _key(bench: Bench, mapping: Path, seed: int) -> str:
@@ -166,31 +159,6 @@ def _require_stable(bench: Bench) -> None:
             f"model {bench.dataset.mapping.model_file}: the simulation is unstable on every segment that was tried, at "
             f"a step of {bench.plant.model.opt.timestep:g} s; shorten segments.timestep, or check gains and units"
         )
-
-
-def _summary(dataset: Dataset, reports: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """One report over the folds: the effects that each found; the first fold's own report carries the rest."""
-    first = next(iter(reports.values()))
-    counts: dict[str, int] = {}
-    for r in reports.values():
-        for e in r["effects"]:
-            counts[e["id"]] = counts.get(e["id"], 0) + 1
-    keys = ("schema", "model", "seed", "versions")
-    return {k: first[k] for k in keys} | {
-        "folds": {
-            name: {
-                "verdict": r["verdict"],
-                "effects": [e["id"] for e in r["effects"]],
-                "chi2": r["chi2"],
-                "error": r["error"],
-            }
-            for name, r in reports.items()
-        },
-        "effects_found_in": {
-            k: f"{n} of {len(reports)} folds" for k, n in sorted(counts.items(), key=lambda kv: -kv[1])
-        },
-        "seconds": sum(r["seconds"] for r in reports.values()),
-    }
 
 
 def _fold(
@@ -224,25 +192,24 @@ def _fold(
     final = _final(run, found, whole)
     pool = candidates(bench, [*fitting, *selecting])
     known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
-    report = _report(run, dataset, fold, found, final, bench.problem(verifying), whole)
-    report["identifiability"] = table(known.lens, pool, known.stakes)
-    advice = advise(bench, [*fitting, *selecting], report, known, tell, seed)
-    report["identifiability"] = advice.rows
-    report["findings"] += advice.findings
-    report["seconds"] = round(time.monotonic() - began, 1)
-    _write(out, bench, final, report)
+    outcome = report(bench, fold, found, final, bench.problem(verifying), whole, seed, tell)
+    outcome["identifiability"] = table(known.lens, pool, known.stakes)
+    advice = advise(bench, [*fitting, *selecting], outcome, known, tell, seed)
+    outcome["identifiability"] = advice.rows
+    outcome["findings"] += advice.findings
+    outcome["seconds"] = round(time.monotonic() - began, 1)
+    write(out, bench, final, outcome)
     stages.finish()
     tell(
-        f"[bold]{report['verdict']}[/bold]: "
-        + ("; ".join(e["sentence"] for e in report["effects"]) or "no effect claimed")
+        f"[bold]{outcome['verdict']}[/bold]: "
+        + ("; ".join(e["sentence"] for e in outcome["effects"]) or "no effect claimed")
     )
-    if report["unexplained"]:
-        tell(
-            f"[bold]UNEXPLAINED[/bold] at {report['unexplained']['coordinate']}: {report['unexplained']['description']}"
-        )
-    for finding in report["findings"]:
+    if outcome["unexplained"]:
+        left = outcome["unexplained"]
+        tell(f"[bold]UNEXPLAINED[/bold] at {left['coordinate']}: {left['description']}")
+    for finding in outcome["findings"]:
         tell(finding["text"])
-    return report
+    return outcome
 
 
 def _calibrate(run: _Run, problem: Problem) -> Array:
@@ -323,85 +290,3 @@ def _identify(
     count = sum(int(p.mask.sum()) for p in searched)
     repeats = sum(map(len, searched)) / len(problem)
     return Present(lens, repeats, Stakes(count, dispersion(fitted), Options().worth, repeats))
-
-
-def _report(
-    run: _Run, dataset: Dataset, fold: Fold, found: Found, final: tuple[Fit, Fit], problem: Problem, whole: Problem
-) -> dict[str, Any]:
-    calibrated, extended = final
-    rng = np.random.default_rng(run.seed)
-    nominal = (run.bench.plant, run.bench.plant.null)
-    models = say.Models(nominal, (calibrated.plant, calibrated.x), (extended.plant, extended.x))
-    run.say(f"verifying on {len(problem)} segments")
-    v = say.verify(problem, models, _REPLICAS, rng)
-    shares = say.excess_shares(v, problem, extended, models.calibrated)
-    rows = say.effect_rows(extended, found.rounds, whole, shares)
-    laws = {e.id for e in extended.plant.effects if e.generic}
-    claimed, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
-    verdict = say.verdict(v, len(claimed), found.generic is not None or bool(proposed))
-    left = verdict in ("unexplained", "partly explained")
-    assert found.rest is not None
-    parameters = say.parameter_rows(extended, nominal[1], whole)
-    splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
-    return {
-        "schema": 1,
-        "model": dataset.mapping.model_file,
-        "fold": fold.name,
-        "logs": splits,
-        "independent_splits": dataset.independent_splits,
-        "parameters": parameters,
-        "effects": claimed,
-        "proposals": proposed,
-        "verdict": verdict,
-        "unexplained": unexplained(v, found, extended.plant, proposed) if left else None,
-        "error": say.errors(v),
-        "chi2": {stage: v.chi2(stage) for stage in v.residual}
-        | {
-            "null": float(v.null.mean()),
-            "null_95": say.null_bound(v),
-            "extended_over_calibrated_95": say.gain_interval(v, rng),
-        },
-        "identifiability": [],
-        "findings": on_parameters(extended, parameters),
-        "rounds": [r.__dict__ for r in (*found.rounds, *found.rest.rounds)],
-        "noise": _noise(run.bench, dataset, fold),
-        "details": details(run.bench, v, models, dataset.of("verify", fold))
-        | ({"maps": maps(v, extended.plant.model, found.rest.scanned, ("calibrated", "extended"))} if left else {}),
-        "seed": run.seed,
-        "versions": {"nfc_gym": version("nfc_gym"), "mujoco": mujoco.__version__},
-    }
-
-
-def _noise(bench: Bench, dataset: Dataset, fold: Fold) -> list[dict[str, Any]]:
-    """Noise of each channel and whether it was declared or estimated."""
-    from nfc_gym.measured.states import channel_noise
-
-    log = dataset.of("fit", fold)[0]
-    return [
-        {"channel": k, "noise": channel_noise(log, k), "unit": c.unit, "estimated": c.noise is None}
-        for k, c in log.channels.items()
-    ]
-
-
-def _write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, Any]) -> None:
-    """All outputs or none; `report.json` last, since it marks a finished run."""
-    calibrated, extended = final
-    xml, outside = corrected(bench.spec, extended.plant, extended.x)
-    rows = {e["id"]: e for e in report["effects"]} | {e["id"]: {**e, "proposal": True} for e in report["proposals"]}
-    listed = [rows[e.id] for e, _ in effects_of(extended.plant, extended.x, outside)]
-    effects = {
-        "version": 1,
-        "model_sha256": digest(extra=xml),
-        "effects": listed,
-        "carried_by_model": [i for i in rows if i not in {e["id"] for e in listed}],
-    }
-    packed = {"nominal": {"psi": {}, "effects": []}, "calibrated": pack(calibrated), "extended": pack(extended)}
-    shown = report.pop("details")
-    texts = {
-        "model.xml": xml,
-        "effects.yaml": yaml.safe_dump(effects, sort_keys=False, allow_unicode=True),
-        "fit.json": json.dumps({"fold": report["fold"], **packed}, indent=1),
-        "report.html": render(report, shown),
-        "report.json": json.dumps(report, indent=1),
-    }
-    write_together(out, texts)

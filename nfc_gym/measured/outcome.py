@@ -1,0 +1,152 @@
+"""What a run gives out: the report, the summary over folds, and the files."""
+
+import json
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import yaml
+
+from nfc_gym.core.files import write_together
+from nfc_gym.measured import verdict as say
+from nfc_gym.measured.bench import Bench
+from nfc_gym.measured.details import details
+from nfc_gym.measured.export import corrected, effects_of, pack
+from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.maps import maps
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.remarks import on_parameters
+from nfc_gym.measured.report import render
+from nfc_gym.measured.search import Found
+from nfc_gym.measured.splits import Fold
+from nfc_gym.measured.stages import digest
+from nfc_gym.measured.unexplained import unexplained
+
+_REPLICAS = 6  # of a machine that is exactly the extended model
+
+
+def report(
+    bench: Bench,
+    fold: Fold,
+    found: Found,
+    final: tuple[Fit, Fit],
+    verifying: Problem,
+    fitting: Problem,
+    seed: int,
+    tell: Callable[[str], None],
+) -> dict[str, Any]:
+    """The report of a fold, without identifiability and advice, and with `details` for its pictures.
+
+    Args:
+      bench: the mapping made ready.
+      found: what the search found.
+      final: calibrated and extended model.
+      verifying, fitting: the logs that nobody saw, and those that the final models were fitted to.
+      seed: of the draws.
+      tell: progress.
+    """
+    dataset, (calibrated, extended) = bench.dataset, final
+    rng = np.random.default_rng(seed)
+    nominal = (bench.plant, bench.plant.null)
+    models = say.Models(nominal, (calibrated.plant, calibrated.x), (extended.plant, extended.x))
+    tell(f"verifying on {len(verifying)} segments")
+    v = say.verify(verifying, models, _REPLICAS, rng)
+    shares = say.excess_shares(v, verifying, extended, models.calibrated)
+    rows = say.effect_rows(extended, found.rounds, fitting, shares)
+    laws = {e.id for e in extended.plant.effects if e.generic}
+    claimed, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
+    verdict = say.verdict(v, len(claimed), found.generic is not None or bool(proposed))
+    left = verdict in ("unexplained", "partly explained")
+    assert found.rest is not None
+    parameters = say.parameter_rows(extended, nominal[1], fitting)
+    splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
+    return {
+        "schema": 1,
+        "model": dataset.mapping.model_file,
+        "fold": fold.name,
+        "logs": splits,
+        "independent_splits": dataset.independent_splits,
+        "parameters": parameters,
+        "effects": claimed,
+        "proposals": proposed,
+        "verdict": verdict,
+        "unexplained": unexplained(v, found, extended.plant, proposed) if left else None,
+        "error": say.errors(v),
+        "chi2": {stage: v.chi2(stage) for stage in v.residual}
+        | {
+            "null": float(v.null.mean()),
+            "null_95": say.null_bound(v),
+            "extended_over_calibrated_95": say.gain_interval(v, rng),
+        },
+        "identifiability": [],
+        "findings": on_parameters(extended, parameters),
+        "rounds": [r.__dict__ for r in (*found.rounds, *found.rest.rounds)],
+        "noise": _noise(bench, fold),
+        "details": details(bench, v, models, dataset.of("verify", fold))
+        | ({"maps": maps(v, extended.plant.model, found.rest.scanned, ("calibrated", "extended"))} if left else {}),
+        "seed": seed,
+        "versions": {"nfc_gym": version("nfc_gym"), "mujoco": mujoco.__version__},
+    }
+
+
+def _noise(bench: Bench, fold: Fold) -> list[dict[str, Any]]:
+    """Noise of each channel and whether it was declared or estimated."""
+    from nfc_gym.measured.states import channel_noise
+
+    log = bench.dataset.of("fit", fold)[0]
+    return [
+        {"channel": k, "noise": channel_noise(log, k), "unit": c.unit, "estimated": c.noise is None}
+        for k, c in log.channels.items()
+    ]
+
+
+def write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, Any]) -> None:
+    """All outputs or none; `report.json` last, since it marks a finished run."""
+    calibrated, extended = final
+    xml, outside = corrected(bench.spec, extended.plant, extended.x)
+    rows = {e["id"]: e for e in report["effects"]} | {e["id"]: {**e, "proposal": True} for e in report["proposals"]}
+    listed = [rows[e.id] for e, _ in effects_of(extended.plant, extended.x, outside)]
+    effects = {
+        "version": 1,
+        "model_sha256": digest(extra=xml),
+        "effects": listed,
+        "carried_by_model": [i for i in rows if i not in {e["id"] for e in listed}],
+    }
+    packed = {"nominal": {"psi": {}, "effects": []}, "calibrated": pack(calibrated), "extended": pack(extended)}
+    shown = report.pop("details")
+    texts = {
+        "model.xml": xml,
+        "effects.yaml": yaml.safe_dump(effects, sort_keys=False, allow_unicode=True),
+        "fit.json": json.dumps({"fold": report["fold"], **packed}, indent=1),
+        "report.html": render(report, shown),
+        "report.json": json.dumps(report, indent=1),
+    }
+    write_together(out, texts)
+
+
+def summary(reports: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """One report over the folds: the effects that each found; the first fold's own report carries the rest."""
+    first = next(iter(reports.values()))
+    counts: dict[str, int] = {}
+    for r in reports.values():
+        for e in r["effects"]:
+            counts[e["id"]] = counts.get(e["id"], 0) + 1
+    keys = ("schema", "model", "seed", "versions")
+    return {k: first[k] for k in keys} | {
+        "folds": {
+            name: {
+                "verdict": r["verdict"],
+                "effects": [e["id"] for e in r["effects"]],
+                "chi2": r["chi2"],
+                "error": r["error"],
+            }
+            for name, r in reports.items()
+        },
+        "effects_found_in": {
+            k: f"{n} of {len(reports)} folds" for k, n in sorted(counts.items(), key=lambda kv: -kv[1])
+        },
+        "seconds": sum(r["seconds"] for r in reports.values()),
+    }
