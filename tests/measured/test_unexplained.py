@@ -1,4 +1,4 @@
-"""The rest in words, where no law was believed."""
+"""A force with memory is said as such, where no law was believed."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -33,10 +33,3 @@ def test_memory_in_a_joint_is_said_as_such() -> None:
     assert (found["coordinate"], found["where"]) == ("joint:knee:pos", "joint:knee")
     assert found["description"].startswith("looks like a force with memory in knee, of no law of the library")
     assert (found["nearest"], found["nearest_share"]) == ("coulomb:knee", pytest.approx(0.3))
-
-
-@pytest.mark.parametrize("generic", [None, "generic_velocity:knee"])
-def test_without_a_law_the_columns_with_most_misfit_are_named(generic: str | None) -> None:
-    found = said(generic)
-    assert found["where"] == "joint:knee"
-    assert found["description"].startswith("largest share of the remaining misfit: 90%")
