@@ -9,11 +9,6 @@ from nfc_gym.measured.demo import body_channels
 
 from . import ant, legged, quadcopter, quadruped
 
-# At the MJCF's own 5 ms a touch-down's error is no straight line in the step, as whitening takes it for: X of the
-# true model is then 3.7 (Quadruped) and 2.1 (Ant), and 1.7 and 1.3 with half the step, at twice the time.
-_FINE = 0.0025  # s
-
-
 def quadcopter_mapping(weighed: float) -> str:
     """The chassis was weighed; four arms and four mounts of one make.
 
@@ -53,7 +48,6 @@ def quadruped_mapping(weighed: float) -> str:
         ],
         {f"ctrl:{j}": {"column": f"{j}_command", "unit": "rad"} for j in quadruped.JOINTS},
         _legged_channels(quadruped.JOINTS, "base"),
-        step=_FINE,
     )
 
 
@@ -73,7 +67,6 @@ def ant_mapping(weighed: float) -> str:
         ],
         {f"ctrl:{j}": {"column": f"{j}_command", "unit": "1"} for j in ant.JOINTS},
         _legged_channels(ant.JOINTS, "torso"),
-        step=_FINE,
     )
 
 
@@ -83,11 +76,8 @@ def _text(
     controls: dict[str, Any],
     channels: dict[str, Any],
     more: Mapping[str, Any] | None = None,
-    step: float | None = None,
 ) -> str:
     segments: dict[str, Any] = {"length": 0.4, "history": 0.5, "horizons": [0.05, 0.1, 0.2, 0.4]}
-    if step is not None:
-        segments["timestep"] = step
     mapping = {
         "version": 1,
         "model": model,

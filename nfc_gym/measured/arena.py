@@ -7,7 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.box import box
-from nfc_gym.measured.contest import Judged, clusters, fold_of, judge, left_out_losses, losses, not_worse
+from nfc_gym.measured.contest import (
+    Judged,
+    clusters,
+    dispersion,
+    fold_of,
+    judge,
+    left_out_losses,
+    losses,
+    not_worse,
+    price,
+)
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
 from nfc_gym.measured.problem import Problem
@@ -91,14 +101,16 @@ class Arena:
         starts = np.stack([np.concatenate([x, *thetas]) for x in (moved, current.x)])
         white = self.under.whiten(self.fit_data.problem.residual(plant, starts))
         start = starts[int(loss(white).sum(-1).argmin())]
-        return self._refit(plant, start, 10, self.current.jacobian)
+        # Who leads is fitted again in full; where roll-outs are costly a first look must do with the slopes at hand.
+        return self._refit(plant, start, 10, self.current.jacobian, quick=self.fit_data.problem.rough)
 
-    def _refit(self, plant: Plant, start: Array, rounds: int, known: Array) -> Judged:
+    def _refit(self, plant: Plant, start: Array, rounds: int, known: Array, quick: bool = False) -> Judged:
         """Fit and judge; `known` (S, m, j) is the Jacobian of the first j free parameters.
 
-        With few of them a full Jacobian costs little; with many they keep the one that they have (the chord method).
+        With few of them a full Jacobian costs little; with many, or for a quick look, they keep the one that they have
+        (the chord method).
         """
-        chord = known if known.shape[-1] > _CHORD else None
+        chord = known if quick or known.shape[-1] > _CHORD else None
         return self.judge(fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord))
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
@@ -161,9 +173,8 @@ class Arena:
 
     def likelier(self, j: Judged) -> bool:
         """Whether a candidate is likelier than the model to beat by more than its price, each with its own slack."""
-        count = int(self.fit_data.problem.mask.sum()) + int(self.select.problem.mask.sum())
-        price = 0.5 * np.log(max(count, 2)) * (len(j.fitted.x) - len(self.current.x))
-        return self.unexplained(j.fitted) + price < self.unexplained(self.current)
+        cost = 0.5 * np.log(max(self._numbers, 2)) * (len(j.fitted.x) - len(self.current.x))
+        return self.unexplained(j.fitted) + cost < self.unexplained(self.current)
 
     def unexplained(self, fitted: Fit) -> float:
         """What a model leaves, under a slack of its own: minus the log-likelihood with the slack at its best.
@@ -181,8 +192,26 @@ class Arena:
 
     def worth(self, j: Judged, share: float) -> bool:
         """Whether a gain holds on unseen logs and is a share of the misfit worth naming."""
-        least = share * (float(self.base.sum()) + float(self.current.losses.sum()))
-        return j.lower > 0 and j.gain > 0 and j.total > least
+        return j.lower > 0 and j.gain > 0 and j.total > share * self._misfit
+
+    @property
+    def _misfit(self) -> float:
+        """Loss of the model to beat on both sets of logs."""
+        return float(self.base.sum()) + float(self.current.losses.sum())
+
+    def asked(self, found: Screened, share: float) -> float:
+        """What a screened candidate must gain on both sets of logs: its price, and a share worth naming."""
+        price_of = price(self._numbers, len(found.effect.params), dispersion(self.current))
+        return price_of + share * self._misfit
+
+    def promises(self, found: Screened) -> float:
+        """What a screened candidate would gain on both sets of logs if screening were right."""
+        return found.gain * self._numbers / max(int(self.fit_data.problem.mask.sum()), 1)
+
+    @property
+    def _numbers(self) -> int:
+        """How many are compared, on both sets of logs."""
+        return int(self.fit_data.problem.mask.sum()) + int(self.select.problem.mask.sum())
 
     def ties(self, best: Judged, other: Judged) -> bool:
         """Whether `other` is not significantly worse."""

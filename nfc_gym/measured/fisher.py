@@ -92,12 +92,13 @@ def free_names(plant: Plant) -> list[str]:
     return [*psi, *(f"{p.name.replace('_', ' ')} of {e.id}" for e in plant.effects for p in e.params)]
 
 
-def realistic(effect: Effect) -> list[tuple[Array, Array]]:
+def realistic(effect: Effect, every_size: bool = True) -> list[tuple[Array, Array]]:
     """Sets of realistic sizes: (d, k) with all sizing parameters at once, and (r, k) parameter by parameter.
 
     The sets differ in the shape parameters and in size; a law has one shape at a time, so sets are not to be mixed.
+    Without `every_size` each shape has its middle size only.
     """
-    sets = probe_sets(effect)
+    sets = probe_sets(effect, every_size)
     if overrides(effect, "chart"):
         ranks = max(len(p.probes) for p in effect.params)
         whole = np.array([[p.probes[min(r, len(p.probes) - 1)] for p in effect.params] for r in range(ranks)])

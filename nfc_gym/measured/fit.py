@@ -91,8 +91,13 @@ def fit(
     limits = box(plant)
     fresh = np.arange(0 if known is None else known.shape[-1], len(limits.scale))
 
+    last: dict[str, Array] = {}
+
     def white(x: Array) -> Array:
-        return metric.whiten(problem.residual(plant, x[None]))[0]
+        # The optimiser asks for slopes where it has just asked for the residual.
+        if "x" not in last or not np.array_equal(last["x"], x):
+            last["x"], last["white"] = x.copy(), metric.whiten(problem.residual(plant, x[None]))[0]
+        return last["white"]
 
     def residual(z: Array) -> Array:
         return np.concatenate([white(limits.x(z, start)).ravel(), (z - limits.centre) * limits.pull])
@@ -100,8 +105,6 @@ def fit(
     def slopes(x: Array, size: float) -> Array:
         found = jacobian(problem, metric, limits, x, white(x), fresh, size)
         return found if known is None else np.concatenate([known, found], -1)
-
-    last: dict[str, Array] = {}
 
     def derivative(z: Array, size: float) -> Array:
         tick()

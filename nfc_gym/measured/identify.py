@@ -98,7 +98,7 @@ def _accepted(lens: Lens, effect: Effect) -> _View:
 
 def _look(lens: Lens, effect: Effect, basis: Array) -> _View:
     """A candidate at its realistic sizes, whole and parameter by parameter, in one batch."""
-    sets = realistic(effect)
+    sets = realistic(effect, every_size=not lens.problem.rough)
     change = flat(lens.columns(effect, np.concatenate([rows for pair in sets for rows in pair])))
     at, columns, spans = 0, [], []
     for whole, rows in sets:

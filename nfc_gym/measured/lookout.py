@@ -1,6 +1,7 @@
 """Which candidates deserve a refit: linear screening of all, then a closer look at those that lead."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.conditions import MARK
 
 _FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block
-_ENOUGH = 12  # blocks that such a thinning must leave
+_COSTLY = 20  # the same where roll-outs are costly
+_ENOUGH = 12  # blocks that such a thinning must leave, and does leave where each is costly
+_FAINT = 0.05  # of the best gain: what the best of a family must reach there to be among the field whatever its rank
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
 _SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
 _PURSUED = 40  # candidates that a smooth problem takes a few steps further before it shortlists
@@ -30,12 +33,17 @@ class Lookout:
         self.problem, self.rng, self.say = problem, rng, say
         self.hopeless: set[str] = set()
 
-    def screen(self, screen: Screen, pool: Sequence[Effect]) -> list[Screened]:
-        """Candidates that are not at work yet, by what they gain as far as straight lines tell, best first."""
+    def screen(self, screen: Screen, pool: Sequence[Effect], field: int | None = None) -> list[Screened]:
+        """Candidates that are not at work yet, by what they gain as far as straight lines tell, best first.
+
+        Args:
+          field: how many of a large pool are screened in full, besides the best of each family.
+        """
+        field = field or (_COSTLY if self.problem.rough else _FIELD)
         taken = {_plain(e) for e in screen.current.plant.effects}
         left = [e for e in pool if _plain(e) not in taken and (e.id not in self.hopeless or len(e.where) > 1)]
         self.say(f"screening {len(left)} candidates")
-        found = screen_all(screen, self._promising(screen, left))
+        found = screen_all(screen, self._promising(screen, left, field))
         # Places that show nothing at all are not looked at again; sets of places stay, since they stand for many.
         floor = 1e-3 * float(screen.projected @ screen.projected)
         self.hopeless |= {f.effect.id for f in found[_KEEP:] if f.gain < floor}
@@ -46,7 +54,8 @@ class Lookout:
         if self.problem.rough:
             leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
             thin = self._thinned(screen)
-            look = lambda f: thin.scout(f, self.rng)  # noqa: E731
+            whole = len(self.problem) / len(thin.problem)
+            look = lambda f: _times(whole, thin.scout(f, self.rng))  # noqa: E731
         else:
             leading, look = [f for f in found[:_PURSUED] if f.gain > 0], screen.pursue
         self.say(f"looking closer at {len(leading)} of them")
@@ -55,24 +64,31 @@ class Lookout:
         return looked + [f for f in found if id(f.effect) not in chosen]
 
     def _thinned(self, screen: Screen) -> Screen:
-        """The same screen on every third block, where there are enough of them."""
+        """The same screen on some of the blocks, spread evenly, where there are enough of them."""
         blocks = len(self.problem)
+        every = blocks // _ENOUGH if self.problem.rough else _THIN
         if blocks < _THIN * _ENOUGH:
             return screen
-        index = np.arange(0, blocks, _THIN)
+        index = np.arange(0, blocks, every)
         current = screen.current
         part = Fit(current.plant, current.x, current.white[index], current.jacobian[index])
         return Screen(self.problem.take(index), screen.metric.take(index), part)
 
-    def _promising(self, screen: Screen, pool: list[Effect]) -> list[Effect]:
-        """Of a large pool, those that do best on every third block, and the best of each family."""
+    def _promising(self, screen: Screen, pool: list[Effect], field: int) -> list[Effect]:
+        """Of a large pool, those that do best on some of the blocks, and the best of each family that does anything."""
         thin = self._thinned(screen)
-        if len(pool) <= _FIELD or thin is screen:
+        if len(pool) <= field or thin is screen:
             return pool
-        rough = screen_all(thin, pool)
-        families = {r.effect.family: r.effect for r in reversed(rough)}
-        best = [r.effect for r in rough[:_FIELD]]
+        rough = screen_all(thin, pool, every_size=not self.problem.rough)
+        least = _FAINT * rough[0].gain if self.problem.rough else 0.0
+        families = {r.effect.family: r.effect for r in reversed(rough) if r.gain >= least}
+        best = [r.effect for r in rough[:field]]
         return best + [e for e in families.values() if e not in best]
+
+
+def _times(factor: float, found: Screened) -> Screened:
+    """What was found on some of the blocks, with the gain that all of them would bring."""
+    return replace(found, gain=factor * found.gain)
 
 
 def _plain(effect: Effect) -> str:

@@ -23,6 +23,7 @@ from nfc_gym.physics.rollout import Plant, Segments, Servo, Trajectory
 from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
 
 Array = NDArray[np.float64]
+_DRAWS = 16  # starts from which the noise where bodies touch is estimated
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,8 @@ class RolloutProblem(Problem):
         self._kit = _Kit(model, tuple(logs), tuple(states), layout, servos or {}, linear, settle)
         self._observers = [o for key, c in logs[0].channels.items() if (o := observer(model, key, c.axes)) is not None]
         self.names = tuple(log.name for log in logs)
-        self.rough = bool((model.geom_contype[:, None] & model.geom_conaffinity).any())
+        apart = model.geom_bodyid[:, None] != model.geom_bodyid
+        self.rough = bool((apart & ((model.geom_contype[:, None] & model.geom_conaffinity) != 0)).any())
         self._place(where, None)
 
     def _place(self, where: Cut, measured: list[Array] | None) -> None:
@@ -252,26 +254,53 @@ class RolloutProblem(Problem):
         return self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
 
     def covariance(self, plant: Plant, x: Array) -> Array:
-        """Sensor noise, start-state noise carried through the roll-out, and the discretisation's own error."""
+        """Sensor noise, start-state noise carried through the roll-out, and the discretisation's own error.
+
+        Where bodies touch neither is a straight line: a foot that lands a step sooner or later makes an error in a
+        direction of its own. There both are taken over starts drawn from their noise: with one direction for the
+        discretisation, X of the true model of a trotting quadruped is 3 at a step of 5 ms, and with `_DRAWS` it is 1.
+        """
         size, width = len(self), len(self.columns)
         sigma = np.zeros((size, width, width))
         sigma[:, np.arange(width), np.arange(width)] = np.where(self.mask, self._noise**2, 1.0)
         base = self.residual(plant, x[None])[0]
         carried = self._carried(plant, x, base)
-        # A first-order integrator's whole error is twice the change that half its step makes.
-        order = 4 if plant.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else 1
-        discretised = (self._halved(plant, x) - base) / (1 - 0.5**order)
-        for column in [*carried, discretised]:
+        if self.rough:
+            moved, discretised = self._drawn(plant, x, base)
+            carried = np.concatenate([carried, moved]) * np.sqrt(0.5)  # two estimates of one covariance: their mean
+        else:
+            discretised = (self._halved(plant, x, self.segments) - base) / self._reach(plant)
+        for column in (*carried, *discretised):
             column = np.where(np.isfinite(column), column, 0.0)
             sigma += column[:, :, None] * column[:, None, :]
         return sigma
 
-    def _carried(self, plant: Plant, x: Array, base: Array) -> list[Array]:
-        """Change of the residual for one standard deviation of each start coordinate, (S, m) each."""
+    @staticmethod
+    def _reach(plant: Plant) -> float:
+        """Share of a step's whole error that halving it shows: of a first-order integrator, half."""
+        order = 4 if plant.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else 1
+        return 1 - 0.5**order
+
+    def _drawn(self, plant: Plant, x: Array, base: Array) -> tuple[Array, Array]:
+        """Columns (D, S, m) of start-state noise and of the discretisation's error, from starts drawn at random."""
+        rng = np.random.default_rng(len(self))
+        dq, dv = (np.concatenate([rng.normal(size=sd.shape) * sd for _ in range(_DRAWS)]) for sd in self._start_sd)
+        repeated = _repeat(
+            self.segments,
+            _DRAWS,
+            integrate(self._kit.model, np.concatenate([self.segments.qpos] * _DRAWS), dq),
+            np.concatenate([self.segments.qvel] * _DRAWS) + dv,
+        )
+        coarse = self._again(plant, x, repeated, _DRAWS)
+        fine = self._halved(plant, x, repeated, _DRAWS)
+        return (coarse - base) / np.sqrt(_DRAWS), (fine - coarse) / self._reach(plant) / np.sqrt(_DRAWS)
+
+    def _carried(self, plant: Plant, x: Array, base: Array) -> Array:
+        """(n, S, m) change of the residual for one standard deviation of each of n start coordinates."""
         model, seg = self._kit.model, self.segments
         directions = [(kind, d) for kind in (0, 1) for d in range(model.nv) if (self._start_sd[kind][:, d] > 0).any()]
         if not directions:
-            return []
+            return np.zeros((0, *base.shape))
         starts_q, starts_v = [], []
         for kind, d in directions:
             step = np.zeros((len(self), model.nv))
@@ -279,17 +308,17 @@ class RolloutProblem(Problem):
             starts_q.append(integrate(model, seg.qpos, step) if kind == 0 else seg.qpos)
             starts_v.append(seg.qvel + step if kind == 1 else seg.qvel)
         n = len(directions)
-        repeated = _repeat(seg, n, np.concatenate(starts_q), np.concatenate(starts_v))
-        measured = [np.concatenate([m] * n) for m in self._measured]
-        moved = self._compare(
-            plant, x[None], repeated, measured, np.concatenate([self._where.step] * n), np.concatenate([self.mask] * n)
-        )
-        return list(moved[0].reshape(n, len(self), -1) - base)
+        return self._again(plant, x, _repeat(seg, n, np.concatenate(starts_q), np.concatenate(starts_v)), n) - base
 
-    def _halved(self, plant: Plant, x: Array) -> Array:
-        """Residual with the physics step halved."""
-        segments = _refine(self.segments)
-        return self._compare(_finer(plant), x[None], segments, self._measured, self._where.step * 2, self.mask)[0]
+    def _again(self, plant: Plant, x: Array, segments: Segments, copies: int, finer: int = 1) -> Array:
+        """(copies, S, m) residual of copies of the segments with other starts, at a step so many times finer."""
+        measured = [np.concatenate([m] * copies) for m in self._measured]
+        step, mask = (np.concatenate([a] * copies) for a in (self._where.step * finer, self.mask))
+        return self._compare(plant, x[None], segments, measured, step, mask)[0].reshape(copies, len(self), -1)
+
+    def _halved(self, plant: Plant, x: Array, segments: Segments, copies: int = 1) -> Array:
+        """The same with the physics step halved."""
+        return self._again(_finer(plant), x, _refine(segments), copies, finer=2)
 
     def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
         """See `Problem`."""

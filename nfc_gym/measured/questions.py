@@ -28,7 +28,7 @@ from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 TOLD = 3.92  # sigma between two explanations from which the contest tells them apart (`identify`)
-_FEWEST, _LOOK, _WORK = 20, 60, 2400  # segments of the logs that are looked at: between these, and times candidates
+_FEWEST, _LOOK, _WORK = 12, 60, 2400  # segments of the logs that are looked at: between these, and times candidates
 _MOST = 24  # effects that a motion is designed for at once; of more, the hardest to see of each family
 _SIZES = (0.3, 1.0, 3.0)  # times a realistic size, from the best of which a rival's fit starts
 _ROUNDS = 12  # iterations of that fit

@@ -17,6 +17,8 @@ _PAIRED = 3  # mechanisms that are tried in pairs
 _TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
 _LEFT = 0.1  # nats a number beyond the noise, below which a second law beside one that is believed has nothing to mend
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
+_FAINT = 0.02  # nats a number beyond the noise, below which two laws have nothing to mend together
+_HOPE = 0.25  # of the gain that a law must reach: what screening must promise for a refit to be worth its time
 _ALIKE = 3  # families that may explain the data alike for one of them to be claimed
 
 
@@ -63,10 +65,13 @@ class Contest:
         """
         arena = self.arena
         chance = self.screen.chance(self.screened, arena.blocks[0], arena.rng)
-        entered = sorted((arena.enter([s]) for s in shortlist(self.screened, self.short)), key=lambda j: -j.total)
+        picks = shortlist(self.screened, self.short)
+        hopeful = [s for s in picks if arena.promises(s) > _HOPE * arena.asked(s, self.worth)]
+        # The report names the nearest even where there is no hope.
+        entered = sorted((arena.enter([s]) for s in hopeful or picks[:1]), key=lambda j: -j.total)
         first = [j for j in entered if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
         if not first:
-            ranking = [arena.row(j) for j in entered]  # the report names the nearest
+            ranking = [arena.row(j) for j in entered]
             return Round([], 0.0, ranking, reason="no candidate reduces the misfit more than chance does"), None
         judged = self._final(first)
         arena = self.arena
@@ -74,7 +79,7 @@ class Contest:
         beaten = [arena.judge(j.fitted) for j in beaten]
         outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *beaten]])
         believed = [j for j in judged if self._believed(j)]
-        pairs = self._pairs(judged, entered) if not believed or arena.leftover > _LEFT else []
+        pairs = self._pairs(judged, entered) if arena.leftover > (_LEFT if believed else _FAINT) else []
         outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
         alone = max((j.total for j in believed), default=0.0)
         both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(j)]

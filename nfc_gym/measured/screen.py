@@ -45,10 +45,11 @@ class Screened:
     probe: Array
 
 
-def probe_sets(effect: Effect) -> list[Array]:
+def probe_sets(effect: Effect, every_size: bool = True) -> list[Array]:
     """Sets of realistic parameter vectors, (k', k) each: one row a sizing parameter, sharing the shape parameters.
 
-    An effect with a chart of its own has one set, whose rows span its coordinates.
+    An effect with a chart of its own has one set, whose rows span its coordinates. Without `every_size` each shape is
+    tried at its middle size only.
     """
     if overrides(effect, "chart"):
         rows = np.repeat(np.array([p.probes[0] for p in effect.params])[None], len(effect.params), 0)
@@ -65,7 +66,7 @@ def probe_sets(effect: Effect) -> list[Array]:
     probed = [effect.params[shaping[of.index(k)]].probes for k in range(len(kinds))]
     for choice in product(*(range(len(p)) for p in probed)):
         shape = [effect.params[i].probes[choice[k]] for i, k in zip(shaping, of, strict=True)]
-        for rank in range(ranks):
+        for rank in range(ranks) if every_size else [ranks // 2]:
             rows = np.repeat(effect.null[None], len(sizing), 0)
             rows[:, shaping] = shape
             for row, i in zip(rows, sizing, strict=True):
@@ -92,9 +93,9 @@ class Screen:
         """Remove from (n,) or (n, k) what the fitted parameters can produce."""
         return a - self.basis @ (self.basis.T @ a)
 
-    def try_one(self, effect: Effect) -> Screened:
-        """Probe one candidate at all its sizes in one batch."""
-        sets = probe_sets(effect)
+    def try_one(self, effect: Effect, every_size: bool = True) -> Screened:
+        """Probe one candidate at all its sizes, or at a middle one, in one batch."""
+        sets = probe_sets(effect, every_size)
         plant = self.current.plant.with_effects([*self.current.plant.effects, effect])
         rows = np.concatenate(sets)
         x = np.concatenate([np.repeat(self.current.x[None], len(rows), 0), rows], 1)
@@ -234,12 +235,6 @@ def _span(columns: Array) -> Array:
     return u[:, size > 1e-6]
 
 
-def screen_all(
-    screen: Screen, candidates: Sequence[Effect], tick: Callable[[Effect], None] = lambda e: None
-) -> list[Screened]:
+def screen_all(screen: Screen, candidates: Sequence[Effect], every_size: bool = True) -> list[Screened]:
     """Screen every candidate, best gain first."""
-    out = []
-    for effect in candidates:
-        tick(effect)
-        out.append(screen.try_one(effect))
-    return sorted(out, key=lambda s: -s.gain)
+    return sorted((screen.try_one(effect, every_size) for effect in candidates), key=lambda s: -s.gain)

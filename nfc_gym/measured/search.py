@@ -18,7 +18,7 @@ from nfc_gym.measured.metric import metric
 from nfc_gym.measured.remainder import CLEARLY, SILENT, LawSearch, Remainder
 from nfc_gym.measured.rounds import Contest, Round
 from nfc_gym.measured.screen import Screen
-from nfc_gym.measured.settle import settle
+from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.law import Law
@@ -26,6 +26,8 @@ from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 Say = Callable[[str], None]
+_AGAIN = 4  # iterations of the first round's fit, which starts from a calibrated model
+_GENERICS = 12  # generic alternatives that are screened in full, besides the best of each kind
 
 
 @dataclass(frozen=True)
@@ -175,8 +177,14 @@ class Search:
         this process, and a search that goes on after an interruption draws the same.
         """
         self.rng = self.lookout.rng = np.random.default_rng([self.options.seed, len(state.rounds)])
-        arena = self.settle(state.plant, state.x, polished=not state.rounds)
-        current = self._prune(arena) if state.rounds else arena.current
+        if not state.rounds:  # psi was settled just now: only the noise has been carried anew
+            data = self.fit_data
+            extra = slack(data.problem, data.sigma, state.plant, state.x)
+            under = metric(data.problem, data.sigma, extra)
+            current = fit(data.problem, under, state.plant, state.x, _AGAIN)
+            return Arena(data, self.select, current, under, extra, self.rng, self.say)
+        arena = self.settle(state.plant, state.x)
+        current = self._prune(arena)
         return arena if current is arena.current else self.settle(current.plant, current.x, polished=True)
 
     def _prune(self, arena: Arena) -> Fit:
@@ -193,10 +201,12 @@ class Search:
 
     def _generic(self, arena: Arena, screen: Screen, outcome: Round) -> Judged | None:
         """The smooth law of position, speed or time that still adds most to the accepted effects, if it is believed."""
-        screened = self.lookout.screen(screen, self.generics)
-        judged = sorted((arena.enter([s]) for s in screened[:3] if s.gain > 0), key=lambda j: -j.total)
+        screened = self.lookout.screen(screen, self.generics, _GENERICS)
+        worth = self.options.worth
+        hopeful = [s for s in screened[:3] if s.gain > 0 and arena.promises(s) > arena.asked(s, worth)]
+        judged = sorted((arena.enter([s]) for s in hopeful), key=lambda j: -j.total)
         outcome.ranking += [arena.row(j) for j in judged]
-        if not judged or not arena.worth(judged[0], self.options.worth):
+        if not judged or not arena.worth(judged[0], worth):
             return None
         chance = screen.chance(screened, arena.blocks[0], self.rng)
         return judged[0] if float(judged[0].fit_gains.sum()) > chance.get(arena.label(judged[0]), 0.0) else None

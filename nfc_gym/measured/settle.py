@@ -47,11 +47,12 @@ def settle(
     for turn in range(1, TURNS + 1):
         tick(turn)
         under = metric(problem, sigma, extra)
-        found = fit(problem, under, plant, x, rounds)
+        # Later turns start where the first one ended.
+        found = fit(problem, under, plant, x, rounds if turn == 1 else rounds // 2)
         if problem.rough and seed is not None and turn == 1:
             found = polish(problem, under, found, _EVALUATIONS, seed)
         x, before, extra = found.x, extra, slack(problem, sigma, plant, found.x)
         if np.allclose(np.sqrt(extra + noise), np.sqrt(before + noise), rtol=_STEADY):
             break
     under = metric(problem, sigma, extra)
-    return fit(problem, under, plant, x, rounds // 2), under, extra
+    return fit(problem, under, plant, x, rounds // 3), under, extra

@@ -268,3 +268,56 @@ def test_instant_problems_say_which_channel_they_need(plant: Plant, kind: Callab
     log = run(plant.model, 0)
     with pytest.raises(InputError, match=word):
         kind(plant.model, [log], [estimate_states(plant.model, log)], 0.25)
+
+
+BALLS = 4
+BOUNCY = """
+<mujoco>
+  <option timestep="{step}" integrator="implicitfast"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    {balls}
+  </worldbody>
+</mujoco>
+"""
+BALL = """
+    <body name="ball{i}" pos="{i} 0 0.3">
+      <joint name="up{i}" type="slide" axis="0 0 1"/>
+      <geom name="shell{i}" size="0.05" mass="0.2" solref="-4000 -1"/>
+    </body>
+"""
+
+
+def bouncy(step: float) -> mujoco.MjModel:
+    balls = "".join(BALL.format(i=i) for i in range(BALLS))
+    return mujoco.MjModel.from_xml_string(BOUNCY.format(step=step, balls=balls))
+
+
+def bounce(step: float, seconds: float, rng: np.random.Generator) -> Log:
+    """Balls that were dropped, simulated at a step, seen at 200 Hz with noise."""
+    model, rows = bouncy(step), []
+    data = mujoco.MjData(model)
+    data.qpos[:] = rng.uniform(-0.2, 0.2, BALLS)
+    for _ in range(round(seconds / DT)):
+        rows.append((data.qpos.copy(), data.qvel.copy()))
+        mujoco.mj_step(model, data, round(DT / step))
+    q, v = np.swapaxes(rows, 0, 1)
+    q, v = q + 0.001 * rng.normal(size=q.shape), v + 0.02 * rng.normal(size=v.shape)
+    channels = {f"joint:up{i}:pos": Channel(q[:, i], "m", 0.001) for i in range(BALLS)}
+    channels |= {f"joint:up{i}:vel": Channel(v[:, i], "m/s", 0.02) for i in range(BALLS)}
+    return Log(str(rng.integers(1 << 30)), np.arange(len(q)) * DT, {}, channels)
+
+
+def test_the_noise_of_impacts_is_drawn_from_starts() -> None:
+    """A bounce at a coarse step is off in a direction that depends on when it falls between two steps."""
+    rng = np.random.default_rng(3)
+    logs, model = [bounce(0.0005, 2.1, rng) for _ in range(8)], bouncy(DT)
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    states = [estimate_states(model, log) for log in logs]
+    problem = RolloutProblem(model, logs, states, Layout(0.4, 0.0, (0.1, 0.2, 0.4), 0.4, DT))
+    assert problem.rough
+    drawn = chi2(problem, plant, plant.null)
+    problem.rough = False  # one direction for the discretisation, as where nothing touches
+    straight = chi2(problem, plant, plant.null)
+    print(straight.mean(), np.median(straight.mean(1)), drawn.mean(), np.median(drawn.mean(1)), drawn.mean(1).max())
+    assert 0.7 < drawn.mean() < 1.3 < straight.mean()
