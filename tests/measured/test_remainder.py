@@ -160,6 +160,7 @@ def test_more_than_three_families_that_do_alike_are_no_claim(families: tuple, cl
     arena.row = lambda j: {"id": arena.label(j), "generic": False}
     arena.judge = arena.enter_again = lambda j: j
     arena.sharper = lambda fitted: arena
+    arena.promises, arena.asked = (lambda s: s.gain), (lambda s, share: 0.0)
     arena.enter_apart = lambda *a: None
     monkeypatch.setattr(Contest, "_psi_alone", lambda self, best: None)
     monkeypatch.setattr(rounds, "contains", lambda law, plain: False)
