@@ -1,0 +1,1 @@
+"""Inference of a simulator's fidelity: training data, encoders, posteriors, anomaly detection. No MuJoCo here."""
