@@ -162,7 +162,8 @@ def packed(manifest: Manifest, arrays: Mapping[str, NDArray], counts: Mapping[st
         _check_shape(name, value.shape, shapes[name], "a shard")
         _check_finite(name, value, "a shard")
     whole = {name: np.ascontiguousarray(value) for name, value in arrays.items()}
-    return safetensors.numpy.save(whole, {k: str(v) for k, v in counts.items()})
+    # One entry: several would be written in an order that differs from one process to the next.
+    return safetensors.numpy.save(whole, {"counts": json.dumps(dict(counts))})
 
 
 def _check_shape(name: str, shape: Sequence[int], want: Sequence[int | None], where: str) -> None:
@@ -214,8 +215,8 @@ class WindowWriter:
             return None
         try:
             with safetensors.safe_open(path, "np") as file:
-                return {k: int(v) for k, v in (file.metadata() or {}).items()}
-        except (safetensors.SafetensorError, OSError, ValueError):
+                return json.loads((file.metadata() or {})["counts"])
+        except (safetensors.SafetensorError, OSError, ValueError, KeyError):
             return None
 
     @property

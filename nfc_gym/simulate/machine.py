@@ -58,7 +58,7 @@ HABITS: Mapping[str, Habit] = {
     "quadcopter": Habit(
         20, (5, 50), 8.0, (0.2, 1.0), 0.3, ((3, 0.01), (4, 0.003), (3, 0.02), (3, 0.01), (8, 0.001))
     ),
-    "jackal": Habit(50, (5, 50), 8.0, (0.3, 1.0), 0.6, ((4, 0.003), (3, 0.02), (3, 0.01), (3, 0.01), (2, 0.0))),
+    "jackal": Habit(50, (5, 30), 8.0, (0.3, 1.0), 0.6, ((4, 0.003), (3, 0.02), (3, 0.01), (3, 0.01), (2, 0.0))),
 }  # fmt: skip
 TERRAINS = ("rough", "slopes", "steps", "mixed", "obstacles")  # kinds that windows are made on; Flat is a plane
 

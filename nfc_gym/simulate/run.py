@@ -76,7 +76,7 @@ def simulate(
         "policy": _named(source),
         "policy_share": policy_share if policy is not None else 0.0,
     }
-    manifest = _manifest(environment, windows, seed, per_shard, settings)
+    manifest = manifest_of(environment, windows, seed, per_shard, settings)
     writer = WindowWriter(Path(out), manifest)
     plan = Plan(manifest, source, effects, settings["policy_share"])
     jobs = jobs or workers.cores()
@@ -149,7 +149,8 @@ def _named(policy: Act | str | None) -> str | None:
     return hashlib.sha256(Path(policy).read_bytes()).hexdigest()[:16]
 
 
-def _manifest(environment: str, windows: int, seed: int, per_shard: int, settings: dict[str, Any]) -> Manifest:
+def manifest_of(environment: str, windows: int, seed: int, per_shard: int, settings: dict[str, Any]) -> Manifest:
+    """The manifest of a set that is yet to be made; arguments as of `simulate`, `settings` what else it depends on."""
     shop = workshop(environment)
     machine, space = shop.machine, shop.machine.space
     return Manifest(
