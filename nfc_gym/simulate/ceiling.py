@@ -142,7 +142,9 @@ def _exact(sigma: float) -> tuple[float, float]:
     return float(min((w * mass * spread).sum() * sigma**2, 1 / PRIOR)), float(max(gained, 0.0))
 
 
-def ceiling(environment: str, windows: Batch, noise: Array | None = None, step: float = STEP, nthread: int = 1) -> Ceiling:
+def ceiling(
+    environment: str, windows: Batch, noise: Array | None = None, step: float = STEP, nthread: int = 1
+) -> Ceiling:
     """What windows can tell of psi at most.
 
     Args:
