@@ -15,6 +15,7 @@ the prior's variance, 1/12.
 
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -127,8 +128,8 @@ def _exact(sigma: float) -> tuple[float, float]:
     reach = 8 * sigma
     cuts = [-reach, 0.0, min(reach, 0.5), max(1 - reach, 0.5), 1.0, 1 + reach]
     node, weight = np.polynomial.legendre.leggauss(80)
-    y = np.concatenate([(a + b) / 2 + (b - a) / 2 * node for a, b in zip(cuts[:-1], cuts[1:], strict=True)])
-    w = np.concatenate([(b - a) / 2 * weight for a, b in zip(cuts[:-1], cuts[1:], strict=True)])
+    y = np.concatenate([(a + b) / 2 + (b - a) / 2 * node for a, b in pairwise(cuts)])
+    w = np.concatenate([(b - a) / 2 * weight for a, b in pairwise(cuts)])
     # Seen from the nearer half, both edges are to the left in the tail that ndtr resolves.
     low, high = -y / sigma, (1 - y) / sigma
     mass = np.where(low > 0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))

@@ -1,7 +1,7 @@
 """Elevation maps of windows, rebuilt from their seeds and poses: what the robot perceived, and the ground as it was.
 
-Windows hold no maps: 1e6 of 128 x 128 would take 65 GB. The terrain is made again from its kind, seed and difficulty; the
-depth camera then looks along the window's poses with its own seed, and the map is the one at the window's end.
+Windows hold no maps: 1e6 of 128 x 128 would take 65 GB. The terrain is made again from its kind, seed and difficulty;
+the depth camera then looks along the window's poses with its own seed, and the map is the one at the window's end.
 """
 
 from dataclasses import replace
@@ -18,7 +18,7 @@ from nfc_gym.terrain import DepthCamera, Heightfield, PerceivedMap, elevation
 
 
 class Maps(NamedTuple):
-    """Elevation maps (n, 128, 128) float32 [m] at the end of each window, relative to the base, turned with its heading.
+    """Elevation maps (n, 128, 128) float32 [m] at the end of each window, relative to the base, turned as it heads.
 
     `perceived` is what a depth camera made of the ground, `true` the ground itself; `valid` says which cells were seen.
     The residual terrain is `true - perceived`.

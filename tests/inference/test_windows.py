@@ -13,8 +13,8 @@ from nfc_gym.inference.windows import Manifest, Windows, WindowWriter, packed, s
 MANIFEST = Manifest(
     environment="nfc_gym/ToyFlat-v0", robot="toy", rough=False, psi_names=("mass", "drag"), psi_units=("kg", "1"),
     psi_low=(1.0, 0.0), psi_high=(2.0, 1.0), horizon=4, dt=0.02, state_names=("x", "v", "obs"), action_names=("push",),
-    state_noise=(0.1, 0.0, 0.0), families=("none", "payload"), effects=({"family": "payload"},), terrain_kinds=("rough",),
-    terrain_scale=1.0, seed=0, windows=25, per_shard=10,
+    state_noise=(0.1, 0.0, 0.0), families=("none", "payload"), effects=({"family": "payload"},),
+    terrain_kinds=("rough",), terrain_scale=1.0, seed=0, windows=25, per_shard=10,
 )  # fmt: skip
 
 
@@ -129,7 +129,7 @@ def test_what_cannot_be_read_is_said_so(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format 2, and this version of nfc_gym reads format 1"):
         Windows(tmp_path)
     (tmp_path / "manifest.json").write_text('{"format": 1}')
-    with pytest.raises(InputError, match="psi_names.* missing or unknown"):
+    with pytest.raises(InputError, match=r"psi_names.* missing or unknown"):
         Windows(tmp_path)
     (tmp_path / "manifest.json").write_text("{")
     with pytest.raises(InputError, match="cannot be read"):
@@ -155,5 +155,5 @@ def test_short_windows_and_missing_arrays_are_refused() -> None:
     short = {k: v[:, :3] if k == "states" else v for k, v in arrays(MANIFEST, 0).items()}
     with pytest.raises(InputError, match="windows shorter than 5 rows"):
         packed(MANIFEST, short, {})
-    with pytest.raises(InputError, match="a shard holds .*; want"):
+    with pytest.raises(InputError, match=r"a shard holds .*; want"):
         packed(MANIFEST, {k: v for k, v in arrays(MANIFEST, 0).items() if k != "psi"}, {})
