@@ -208,6 +208,10 @@ def simulate(
         typer.Option(metavar="FILE", help="TorchScript (.pt), or .npz of a perceptron, that moves a share of them."),
     ] = None,
     policy_share: Annotated[float, typer.Option(metavar="SHARE", min=0, max=1, help="That share.")] = 0.5,
+    motor: Annotated[
+        float,
+        typer.Option("--motor-noise", metavar="SD", min=0, max=1, help="Of the actions' full range, not recorded."),
+    ] = 0.02,
     ray: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Use a Ray cluster: its address, auto, or local.")
     ] = None,
@@ -229,7 +233,7 @@ def simulate(
 
         run(
             environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=proposal, policy=policy,
-            policy_share=policy_share, ray=ray, console=Console(),
+            policy_share=policy_share, motor=motor, ray=ray, console=Console(),
         )  # fmt: skip
 
 

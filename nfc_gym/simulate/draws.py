@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 # What a seed is for: the third number of its key.
-LABELS, MOTION, GROUND, PLACES, PROPOSAL = range(5)
+LABELS, MOTION, GROUND, PLACES, PROPOSAL, MOTOR = range(6)
 
 
 def generator(seed: int, shard: int, purpose: int, row: int = 0, attempt: int = 0) -> np.random.Generator:
@@ -19,6 +19,16 @@ def uniforms(seed: int, shard: int, purpose: int, rows: NDArray[np.integer], att
     out = np.empty((len(rows), count))
     for i, row in enumerate(rows):
         out[i] = generator(seed, shard, purpose, int(row), attempt).random(count)
+    return out
+
+
+def normals(
+    seed: int, shard: int, purpose: int, rows: NDArray[np.integer], attempt: int, shape: tuple[int, ...]
+) -> Array:
+    """(n, *shape) standard normal numbers, each row of its window's own generator."""
+    out = np.empty((len(rows), *shape))
+    for i, row in enumerate(rows):
+        out[i] = generator(seed, shard, purpose, int(row), attempt).standard_normal(shape)
     return out
 
 

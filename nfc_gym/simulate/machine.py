@@ -39,27 +39,30 @@ class Habit:
     noise: tuple[tuple[int, float], ...]
 
 
-# Noise: a fused state estimate's position 1 cm, quaternion 0.003 (0.3 degrees), velocity 2 cm/s; a gyroscope's rate
-# 0.01 rad/s; encoders of 0.001 rad and, differentiated, 0.02 rad/s; force plates of 1 N and 0.1 N m, torque estimates
-# of 0.2 N m. Commands and last actions are known exactly. Assumptions of this package's, of a usual machine's size.
+# Noise: a fused state estimate's position 2 cm, quaternion 0.005 (0.6 degrees), velocity 5 cm/s; the rates of a
+# gyroscope on a shaking machine 0.03 rad/s; encoders of 0.002 rad and, differentiated, 0.05 rad/s; foot forces and
+# torques 5 N and 5 N m, joint torques 0.5 N m. Commands and last actions are known exactly. All are assumptions.
 HABITS: Mapping[str, Habit] = {
     "ant": Habit(
         50, (5, 50), 8.0, (0.3, 1.0), 0.3,
-        ((1, 0.01), (3, 0.02), (3, 0.01), (5, 0.003), (8, 0.001), (8, 0.02), (24, 0.5)),
+        ((1, 0.02), (3, 0.05), (3, 0.03), (5, 0.005), (8, 0.002), (8, 0.05), (24, 5.0)),
     ),
     "quadruped": Habit(
         20, (5, 50), 8.0, (0.3, 1.0), 0.3,
-        ((3, 0.02), (3, 0.01), (3, 0.003), (3, 0.0), (12, 0.001), (12, 0.02), (12, 0.0)),
+        ((3, 0.05), (3, 0.03), (3, 0.005), (3, 0.0), (12, 0.002), (12, 0.05), (12, 0.0)),
     ),
     "humanoid": Habit(
         20, (2, 25), 8.0, (0.1, 0.6), 0.2,
-        ((1, 0.01), (3, 0.02), (3, 0.01), (5, 0.003), (21, 0.001), (21, 0.02), (21, 0.2), (12, 1.0), (21, 0.0)),
+        ((1, 0.02), (3, 0.05), (3, 0.03), (5, 0.005), (21, 0.002), (21, 0.05), (21, 0.5), (12, 5.0), (21, 0.0)),
     ),
     "quadcopter": Habit(
-        20, (5, 50), 8.0, (0.2, 1.0), 0.3, ((3, 0.01), (4, 0.003), (3, 0.02), (3, 0.01), (8, 0.001))
+        20, (5, 50), 8.0, (0.2, 1.0), 0.3, ((3, 0.02), (4, 0.005), (3, 0.05), (3, 0.03), (8, 0.002))
     ),
-    "jackal": Habit(50, (5, 30), 8.0, (0.3, 1.0), 0.6, ((4, 0.003), (3, 0.02), (3, 0.01), (3, 0.01), (2, 0.0))),
+    "jackal": Habit(50, (5, 30), 8.0, (0.3, 1.0), 0.6, ((4, 0.005), (3, 0.05), (3, 0.03), (3, 0.02), (2, 0.0))),
 }  # fmt: skip
+# What motors make of a command, as a share of its full range: Gaussian, anew in each control step (the paper's "motor
+# control" noise). Without any, a second of contacts would tell of psi through their chatter, as no real machine does.
+MOTOR = 0.02
 TERRAINS = ("rough", "slopes", "steps", "mixed", "obstacles")  # kinds that windows are made on; Flat is a plane
 
 

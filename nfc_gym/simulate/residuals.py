@@ -67,7 +67,9 @@ def typical(machine: Machine) -> Scales:
 
 def candidates(machine: Machine) -> list[Effect]:
     """Every effect on the motion that the robot's model could lack, in the library's order."""
-    found = propose(machine.model, typical(machine), exclude=UNMOVED, generic=False)
+    # A patch lies at one place of the world; on rough ground the motion begins anywhere.
+    away = ("friction_patch",) if machine.rough else ()
+    found = propose(machine.model, typical(machine), exclude=(*UNMOVED, *away), generic=False)
     return [e for e in found if any(overrides(e, hook) for hook in _HOOKS)]
 
 

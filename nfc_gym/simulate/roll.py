@@ -30,6 +30,7 @@ class Task:
       which: (n,) map.
       start: (n, `ground.count`) uniform numbers of the start.
       signal: (n, W + H, channels) excitation; W is the longest warm-up.
+      jitter: (n, W + H, actions) what the motors add to the actions; it is not recorded.
       warm: (n,) control steps before the window, W at most; rows that need fewer wait.
       guided: (n,) rows that a policy moves.
       given: effects, rows of each contiguous; the rest have none.
@@ -39,6 +40,7 @@ class Task:
     which: NDArray[np.intp]
     start: Array
     signal: Array
+    jitter: Array
     warm: NDArray[np.intp]
     guided: Flags
     given: Sequence[Given]
@@ -67,14 +69,16 @@ class Shadow:
             given = {"psi": task.psi[rows]} | ({"terrain_id": task.which[rows]} if machine.rough else {})
             self.sims.begin(np.arange(len(rows)), given)
 
-    def step(self, machine: Machine, of: Simulations, state: Array, action: Array, alive: Flags) -> Array:
-        """proprio (k, s) one control step after `state` (k, nstate) under `action` (k, a)."""
+    def step(self, machine: Machine, of: Simulations, state: Array, action: Array, acted: Array, alive: Flags) -> Array:
+        """proprio (k, s) one control step after `state` (k, nstate) under `action`, by the motors `acted`, (k, a)."""
+        if not len(self.rows):
+            return np.zeros((0, machine.kind.proprio_size))
         sims, robot = self.sims, self.sims.robot
         sims.batch.state[...] = state
         view = sims.view
         view.task = {name: value[self.rows] for name, value in of.view.task.items()}
         view.now = robot.derive(view)
-        view.ctrl[...] = robot.actuate(action, view)
+        view.ctrl[...] = robot.actuate(acted, view)
         _step(sims, alive[self.rows], machine.kind.frame_skip)
         view.task.update(robot.advance(view, action))
         view.before, view.now = view.now, robot.derive(view)
@@ -124,8 +128,9 @@ def roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy |
         action = drive(view, task.signal[:, t])
         if policy is not None and task.guided.any():
             action[task.guided] = policy.act(sims, task.guided) + _EXPLORE * task.signal[task.guided, t]
-        # What is recorded is what acts, to the bit.
+        # What is recorded is what was commanded, to the bit.
         action = np.clip(action, -1, 1).astype(np.float32).astype(np.float64)
+        acted = np.clip(action + task.jitter[:, t], -1, 1)
         k = t - longest
         if k == 0:
             start[...] = batch.state
@@ -133,8 +138,8 @@ def roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy |
             states[:, k] = np.concatenate(robot.proprio(view), -1)
             pose[:, k] = view.qpos[:, :7]
             actions[:, k] = action
-            shown = shadow.step(machine, sims, batch.state[rows], action[rows], alive) if len(rows) else None
-        view.ctrl[...] = robot.actuate(action, view)
+            shown = shadow.step(machine, sims, batch.state[rows], action[rows], acted[rows], alive)
+        view.ctrl[...] = robot.actuate(acted, view)
         residuals.command(view.ctrl)
         _step(sims, alive & ~residuals.between, kind.frame_skip)
         if residuals.parts:
@@ -149,7 +154,7 @@ def roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy |
         view.task.update(robot.advance(view, action))
         view.before, view.now = view.now, robot.derive(view)
         ended |= alive & ~apart & robot.terminated(view)
-        if k >= 0 and shown is not None:
+        if k >= 0:
             delta[rows] += np.concatenate(robot.proprio(view), -1)[rows] - shown
     states[:, horizon] = np.concatenate(robot.proprio(view), -1)
     pose[:, horizon] = view.qpos[:, :7]

@@ -18,7 +18,7 @@ from nfc_gym.core.posterior import Sampler, load_source
 from nfc_gym.inference.windows import Manifest, Windows, WindowWriter
 from nfc_gym.simulate import workers
 from nfc_gym.simulate.draws import PROPOSAL, Array, generator
-from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.policy import Act
 from nfc_gym.simulate.residuals import families
 from nfc_gym.simulate.shard import Plan, as_path, described, workshop
@@ -37,6 +37,7 @@ def simulate(
     proposal: Sampler | str | Path | None = None,
     policy: Act | str | Path | None = None,
     policy_share: float = 0.5,
+    motor: float = MOTOR,
     ray: str | None = None,
     per_shard: int = PER_SHARD,
     console: Console | None = None,
@@ -54,6 +55,7 @@ def simulate(
         (`core.load_source`). It must stay within the prior's box.
       policy: what moves a share of the windows in place of excitation alone, see `policy.Policy`.
       policy_share: that share.
+      motor: standard deviation of the noise of motors, a share of the actions' full range; actions are kept without.
       ray: address of a Ray cluster, `auto` or `local`; None takes processes of this machine.
       per_shard: windows a shard.
       console: where progress goes; None is silent.
@@ -65,7 +67,7 @@ def simulate(
       InputError: bad input, or the folder holds a set made otherwise.
       NfcError: a worker died.
     """
-    _check(windows, seed, jobs, effects, policy_share, per_shard)
+    _check(windows, seed, jobs, effects, policy_share, motor, per_shard)
     require_writable(Path(out))
     sampler = _opened(proposal)
     source = policy if callable(policy) else as_path(policy)
@@ -73,12 +75,13 @@ def simulate(
     settings = {
         "effects": effects,
         "proposal": _digest(sampler, seed, shop.machine),
+        "motor": motor,
         "policy": _named(source),
         "policy_share": policy_share if policy is not None else 0.0,
     }
     manifest = manifest_of(environment, windows, seed, per_shard, settings)
     writer = WindowWriter(Path(out), manifest)
-    plan = Plan(manifest, source, effects, settings["policy_share"])
+    plan = Plan(manifest, source, effects, settings["policy_share"], motor)
     jobs = jobs or workers.cores()
     left = writer.missing
 
@@ -95,7 +98,9 @@ def simulate(
     return Windows(out)
 
 
-def _check(windows: int, seed: int, jobs: int, effects: float, policy_share: float, per_shard: int) -> None:
+def _check(
+    windows: int, seed: int, jobs: int, effects: float, policy_share: float, motor: float, per_shard: int
+) -> None:
     for name, value, least in (
         ("windows", windows, 1),
         ("seed", seed, 0),
@@ -104,8 +109,8 @@ def _check(windows: int, seed: int, jobs: int, effects: float, policy_share: flo
     ):
         if not isinstance(value, int | np.integer) or value < least:
             raise InputError(f"{name} is {value!r}, want a whole number, {least} or more")
-    for name, share in (("effects", effects), ("policy_share", policy_share)):
-        if not 0 <= share <= 1:
+    for name, share in (("effects", effects), ("policy_share", policy_share), ("motor", motor)):
+        if not 0 <= share <= 1:  # nan is no share either
             raise InputError(f"{name} is {share!r}, want a share from 0 to 1")
 
 

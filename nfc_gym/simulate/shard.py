@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.windows import Manifest, packed
 from nfc_gym.physics.effects import Effect
-from nfc_gym.simulate import ground, motion
+from nfc_gym.simulate import draws, ground, motion
 from nfc_gym.simulate.draws import LABELS, MOTION, PLACES, Array, between, generator, geometric, picked, uniforms
 from nfc_gym.simulate.drive import channels
-from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.policy import Act, Policy
 from nfc_gym.simulate.residuals import Given, candidates, sizes
 from nfc_gym.simulate.roll import Rolled, Task, roll
@@ -32,12 +32,14 @@ class Plan:
       manifest: of the whole set.
       policy: callable or path of what moves a share of the windows.
       effects, policy_share: shares of the windows.
+      motor: standard deviation of what the motors make of an action, see `machine.MOTOR`.
     """
 
     manifest: Manifest
     policy: Act | str | None = None
     effects: float = 0.5
     policy_share: float = 0.5
+    motor: float = MOTOR
 
 
 @dataclass
@@ -138,19 +140,19 @@ def _labels(
 ) -> Labels:
     """psi, effect and sizes of some windows; u is what float32 holds."""
     seed, d, most = plan.manifest.seed, len(shop.machine.space), shop.most
-    draws = uniforms(seed, shard, LABELS, rows, attempt, d + 2 + 2 * most)
-    u = draws[:, :d]
+    drawn = uniforms(seed, shard, LABELS, rows, attempt, d + 2 + 2 * most)
+    u = drawn[:, :d]
     if proposed is not None:
         u = proposed[rows]
     u = np.clip(u.astype(np.float32).astype(float), 0, 1)
     effect = np.full(len(rows), -1)
     theta = np.zeros((len(rows), most))
     chosen = _places(shop, seed, shard)
-    struck = np.flatnonzero(draws[:, d] < plan.effects) if len(chosen) else np.zeros(0, np.intp)
-    effect[struck] = chosen[picked(draws[struck, d + 1], len(chosen))]
+    struck = np.flatnonzero(drawn[:, d] < plan.effects) if len(chosen) else np.zeros(0, np.intp)
+    effect[struck] = chosen[picked(drawn[struck, d + 1], len(chosen))]
     for e in np.unique(effect[struck]):
         at, one = np.flatnonzero(effect == e), shop.effects[e]
-        theta[at, : len(one.params)] = sizes(one, draws[at, d + 2 :])
+        theta[at, : len(one.params)] = sizes(one, drawn[at, d + 2 :])
     return Labels(u, effect, theta)
 
 
@@ -179,6 +181,8 @@ def _task(
         which=which,
         start=u[:, 5 : 5 + starts],
         signal=motion.signals(u[:, 5 + starts :], steps, robot_channels, machine.dt, habit.swing, habit.offset),
+        jitter=plan.motor
+        * draws.normals(plan.manifest.seed, shard, draws.MOTOR, order, attempt, (steps, machine.kind.action_size)),
         warm=low + picked(u[:, 0], high - low + 1),
         guided=(u[:, 2] < plan.policy_share) & (shop.policy is not None),
         given=_given(shop, labels, order),

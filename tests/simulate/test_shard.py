@@ -24,13 +24,13 @@ IDS = [
 ]
 
 
-def plan(environment: str, windows: int, shards: int = 1, effects: float = 0.5, seed: int = 0) -> Plan:
-    return Plan(manifest_of(environment, windows * shards, seed, windows, {}), effects=effects)
+def plan(environment: str, windows: int, shards: int = 1, effects: float = 0.5, **more: float) -> Plan:
+    return Plan(manifest_of(environment, windows * shards, 0, windows, {}), effects=effects, **more)
 
 
 @cache
-def shard(environment: str, windows: int, effects: float = 0.5) -> dict[str, np.ndarray]:
-    return safetensors.numpy.load(make_shard(plan(environment, windows, effects=effects), 0))
+def shard(environment: str, windows: int, effects: float = 0.5, motor: float = 0.02) -> dict[str, np.ndarray]:
+    return safetensors.numpy.load(make_shard(plan(environment, windows, effects=effects, motor=motor), 0))
 
 
 def task(machine: Machine, n: int, given: list[Given]) -> Task:
@@ -42,6 +42,7 @@ def task(machine: Machine, n: int, given: list[Given]) -> Task:
         which=np.zeros(n, int),
         start=rng.random((n, ground.count(machine))),
         signal=motion.signals(u, steps, machine.kind.action_size, machine.dt, habit.swing, habit.offset),
+        jitter=np.zeros((n, steps, machine.kind.action_size)),
         warm=rng.integers(*habit.warm, n),
         guided=np.zeros(n, bool),
         given=given,
@@ -74,7 +75,7 @@ def test_every_robot_moves_in_its_windows(environment: str) -> None:
 
 def test_one_plain_simulation_repeats_a_window_from_its_start() -> None:
     """psi, start, actions and states of windows without effects fit together, by MuJoCo alone."""
-    made, machine = shard(JACKAL, 8, effects=0.0), Machine(JACKAL)
+    made, machine = shard(JACKAL, 8, effects=0.0, motor=0.0), Machine(JACKAL)
     kind = robot_class(machine.kwargs["robot"])
     for i in range(4):
         model = kind.compile(0)
