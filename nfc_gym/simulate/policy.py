@@ -75,8 +75,14 @@ def opened(source: Act | str | Path) -> Act:
         raise InputError(f"policy {path}: no TorchScript file ({str(e).splitlines()[0]})") from None
 
     def act(obs: NDArray[np.float32]) -> NDArray:
-        with torch.no_grad():
-            return module(torch.from_numpy(obs)).numpy()
+        # Sums over several threads round otherwise than over one.
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            with torch.no_grad():
+                return module(torch.from_numpy(obs)).numpy()
+        finally:
+            torch.set_num_threads(threads)
 
     return act
 

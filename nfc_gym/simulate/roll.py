@@ -79,13 +79,14 @@ class Shadow:
         view.task = {name: value[self.rows] for name, value in of.view.task.items()}
         view.now = robot.derive(view)
         view.ctrl[...] = robot.actuate(acted, view)
-        _step(sims, alive[self.rows], machine.kind.frame_skip)
+        step(sims, alive[self.rows], machine.kind.frame_skip)
         view.task.update(robot.advance(view, action))
         view.before, view.now = view.now, robot.derive(view)
         return np.concatenate(robot.proprio(view), -1)
 
 
-def _step(sims: Simulations, rows: Flags, steps: int) -> None:
+def step(sims: Simulations, rows: Flags, steps: int) -> None:
+    """Physics steps of some simulations; one whose solver runs out of memory gets nan for its velocity."""
     if not rows.any():
         return
     try:
@@ -141,11 +142,11 @@ def roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy |
             shown = shadow.step(machine, sims, batch.state[rows], action[rows], acted[rows], alive)
         view.ctrl[...] = robot.actuate(acted, view)
         residuals.command(view.ctrl)
-        _step(sims, alive & ~residuals.between, kind.frame_skip)
+        step(sims, alive & ~residuals.between, kind.frame_skip)
         if residuals.parts:
             for _ in range(kind.frame_skip):
                 residuals.act()
-                _step(sims, alive & residuals.between, 1)
+                step(sims, alive & residuals.between, 1)
             residuals.rest()
         apart = alive & broken(view)
         if apart.any():

@@ -19,7 +19,7 @@ from nfc_gym.inference.windows import Manifest, Windows, WindowWriter
 from nfc_gym.simulate import workers
 from nfc_gym.simulate.draws import PROPOSAL, Array, generator
 from nfc_gym.simulate.machine import MOTOR, Machine
-from nfc_gym.simulate.policy import Act
+from nfc_gym.simulate.policy import Act, Policy
 from nfc_gym.simulate.residuals import families
 from nfc_gym.simulate.shard import Plan, as_path, described, workshop
 
@@ -71,7 +71,9 @@ def simulate(
     require_writable(Path(out))
     sampler = _opened(proposal)
     source = policy if callable(policy) else as_path(policy)
-    shop = workshop(environment, source)
+    shop = workshop(environment)
+    if source is not None:
+        Policy(source, shop.machine)  # says at once what is wrong with it
     settings = {
         "effects": effects,
         "proposal": _digest(sampler, seed, shop.machine),

@@ -1,6 +1,7 @@
 """One shard: labels drawn from the prior, motion rolled out until each window holds, everything packed into bytes."""
 
 from dataclasses import dataclass, field
+from functools import cache, lru_cache
 from pathlib import Path
 
 import mujoco
@@ -57,7 +58,6 @@ class Workshop:
 
     machine: Machine
     effects: list[Effect]
-    policy: Policy | None
     by_family: dict[str, list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -70,16 +70,16 @@ class Workshop:
         return max((len(e.params) for e in self.effects), default=1)
 
 
-_SHOPS: dict[str, Workshop] = {}
+@cache
+def workshop(environment: str) -> Workshop:
+    """The workshop of an environment."""
+    machine = Machine(environment)
+    return Workshop(machine, candidates(machine))
 
 
-def workshop(environment: str, policy: Act | str | None = None) -> Workshop:
-    """The workshop of an environment; that of a named policy or none is kept."""
-    key = f"{environment} {policy}"
-    if key not in _SHOPS or callable(policy):
-        machine = Machine(environment)
-        _SHOPS[key] = Workshop(machine, candidates(machine), None if policy is None else Policy(policy, machine))
-    return _SHOPS[key]
+@lru_cache(maxsize=4)
+def _policy(source: Act | str, environment: str) -> Policy:
+    return Policy(source, workshop(environment).machine)
 
 
 def make_shard(plan: Plan, shard: int, proposed: Array | None = None, nthread: int = 1) -> bytes:
@@ -96,7 +96,8 @@ def make_shard(plan: Plan, shard: int, proposed: Array | None = None, nthread: i
     """
     mujoco.set_mju_user_warning(lambda message: None)  # windows that come apart are counted, not talked about
     manifest = plan.manifest
-    shop = workshop(manifest.environment, plan.policy)
+    shop = workshop(manifest.environment)
+    policy = None if plan.policy is None else _policy(plan.policy, manifest.environment)
     machine, n = shop.machine, manifest.size(shard)
     soil = ground.Ground.of(machine, manifest.seed, shard)
     labels = _labels(plan, shop, shard, np.arange(n), 0, proposed)
@@ -112,7 +113,7 @@ def make_shard(plan: Plan, shard: int, proposed: Array | None = None, nthread: i
         # Rows of one effect lie side by side.
         order = pending[np.argsort(labels.effect[pending], kind="stable")]
         task, kept = _task(plan, shop, shard, order, attempt, labels, soil, longest + horizon)
-        done = roll(machine, task, soil.maps, shop.policy, nthread)
+        done = roll(machine, task, soil.maps, policy, nthread)
         good = ~(done.unstable | done.ended)
         counts["unstable"] += int(done.unstable.sum())
         counts["ended"] += int(done.ended.sum())
@@ -184,7 +185,7 @@ def _task(
         jitter=plan.motor
         * draws.normals(plan.manifest.seed, shard, draws.MOTOR, order, attempt, (steps, machine.kind.action_size)),
         warm=low + picked(u[:, 0], high - low + 1),
-        guided=(u[:, 2] < plan.policy_share) & (shop.policy is not None),
+        guided=(u[:, 2] < plan.policy_share) & (plan.policy is not None),
         given=_given(shop, labels, order),
     )
     plane = not soil.maps

@@ -4,32 +4,52 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import InputError
-from nfc_gym.simulate.ceiling import bounds, ceiling, gain, information, variance
-from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.ceiling import ceiling
+from nfc_gym.simulate.fisher import bounds, gain, information, variance
 
 
 def test_information_of_a_linear_system_is_its_own() -> None:
     """y = A u: I = A' R^-1 A, whatever the step; noise-free outputs are left out."""
     rng = np.random.default_rng(0)
-    a, noise = rng.standard_normal((2, 7, 3)), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.0])
-    found = information(lambda which, u: np.einsum("mkd,md->mk", a[which], u), rng.random((2, 3)), noise, 0.1)
-    rooted = a[:, :6] / noise[:6, None]
-    np.testing.assert_allclose(found, np.einsum("nkd,nke->nde", rooted, rooted), rtol=1e-10)
+    a, noise = rng.standard_normal((7, 3)), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.0])
+    found = information(lambda u, _: u @ a.T, rng.random(3), noise, 0.1)
+    white = a[:6] / noise[:6, None]
+    np.testing.assert_allclose(found, white.T @ white, rtol=1e-10)
 
 
 def test_information_on_the_mass_of_a_pushed_block() -> None:
     """x = F t^2 / (2 m), m = 1 + u: dx/du = -F t^2 / (2 m^2)."""
     time, force, sd = np.linspace(0.1, 1, 10), 3.0, 0.01
-    u = np.array([[0.2], [0.7]])
-    found = information(lambda _, u: force * time**2 / 2 / (1 + u), u, np.full(10, sd), 1e-3)
-    slope = force * time**2 / 2 / (1 + u) ** 2
-    np.testing.assert_allclose(found[:, 0, 0], (slope**2).sum(1) / sd**2, rtol=1e-5)
+    for u in (0.2, 0.7):
+        found = information(lambda u, _: force * time**2 / 2 / (1 + u), np.array([u]), np.full(10, sd), 1e-3)
+        np.testing.assert_allclose(found, ((force * time**2 / 2 / (1 + u) ** 2) ** 2).sum() / sd**2, rtol=1e-5)
+
+
+def test_noise_that_was_not_seen_counts_as_noise() -> None:
+    """y = A u + B e + noise, e standard normal: I = A' (R + B B')^-1 A; what B covers whole tells nothing."""
+    rng = np.random.default_rng(1)
+    a, b, noise = rng.standard_normal((9, 2)), rng.standard_normal((9, 3)), rng.uniform(0.1, 0.3, 9)
+    e = rng.standard_normal((1100, 3))
+    found = information(lambda u, draw: u @ a.T + e[draw] @ b.T, np.full(2, 0.5), noise, 0.1, 1000, 100)
+    truth = a.T @ np.linalg.solve(np.diag(noise**2) + b @ b.T, a)
+    np.testing.assert_allclose(found, truth, rtol=0.1, atol=0.02 * truth.max())
+
+
+def test_chatter_that_differs_with_psi_is_no_information() -> None:
+    """Slopes made of noise alone, anew at each u: the two halves have nothing in common."""
+    rng = np.random.default_rng(2)
+    found = [
+        information(lambda u, _: rng.standard_normal((len(u), 20)), np.full(3, 0.5), np.full(20, 0.1), 0.05, 400, 8)
+        for _ in range(20)
+    ]
+    naive = 20 * 2 / (8 * (2 * 0.05) ** 2)  # what the squares of these slopes come to, over the noise's variance
+    assert np.mean([np.diag(i).mean() for i in found]) < 0.35 * naive
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0])
 def test_one_number_through_noise_against_brute_force(sigma: float) -> None:
-    u = np.linspace(0, 1, 2001)
-    y = np.linspace(-8 * sigma, 1 + 8 * sigma, 4001)
+    u = np.linspace(0, 1, 801)
+    y = np.linspace(-8 * sigma, 1 + 8 * sigma, 1601)
     like = np.exp(-(((y[:, None] - u) / sigma) ** 2) / 2) / sigma / np.sqrt(2 * np.pi)
     mass = np.trapezoid(like, u)
     mean = np.trapezoid(like * u, u) / mass
@@ -58,15 +78,14 @@ def test_independent_parameters_add_up_and_a_shared_one_is_told_by_neither() -> 
     assert together.joint[0] > 5
 
 
-def test_the_wheel_without_drive_is_seen_and_restitution_on_a_plane_is_not(jackal: dict[str, np.ndarray]) -> None:
-    found = ceiling("nfc_gym/JackalFlat-v0", {k: v[:4] for k, v in jackal.items()})
-    names = Machine("nfc_gym/JackalFlat-v0").space.names
-    of = {word: [i for i, n in enumerate(names) if word in n] for word in ("damping", "restitution", "base_mass")}
+def test_noise_of_motors_lowers_a_jackals_ceiling(jackal: dict[str, np.ndarray]) -> None:
+    found = ceiling("nfc_gym/JackalFlat-v0", {k: v[:2] for k, v in jackal.items()}, cloud=32, pairs=4)
     assert np.isfinite(found.information).all()
-    assert found.gain[:, of["base_mass"]].mean() > found.gain[:, of["restitution"]].mean()
     assert (found.variance > 0).all()
     assert (found.variance <= 1 / 12 + 1e-12).all()
     assert (found.joint >= found.gain.sum(1) - 0.05).all()
+    still = ceiling("nfc_gym/JackalFlat-v0", {k: v[:2] for k, v in jackal.items()}, motor=0.0)
+    assert (still.joint > found.joint).all()
 
 
 def test_noise_of_another_robot_is_refused(jackal: dict[str, np.ndarray]) -> None:
