@@ -77,7 +77,7 @@ def maps(manifest: Manifest, windows: Batch) -> Maps:
         stride = max(1, round(1 / seen.camera.rate / manifest.dt))
         last = len(pose[i]) - 1
         for k in range(last % stride, last + 1, stride):
-            map_ = seen.update(field, xyz[k], quat[k], heading[k], k * manifest.dt)
-        out.perceived[i], out.valid[i] = map_, seen.valid
+            out.perceived[i] = seen.update(field, xyz[k], quat[k], heading[k], k * manifest.dt)
+        out.valid[i] = seen.valid
         out.true[i] = elevation(field, xyz[last], heading[last])
     return out

@@ -38,7 +38,7 @@ def signals(u: Array, steps: int, channels: int, dt: float, swing: tuple[float, 
     size = geometric(u[:, 1], *swing)
     own = u[:, 3 : 3 + channels * _OWN].reshape(n, channels, _OWN)
     series = u[:, 3 + channels * _OWN :].reshape(n, steps, channels)
-    time = dt * np.arange(steps)
+    time: Array = dt * np.arange(steps, dtype=np.float64)
     wave = np.empty((n, steps, channels))
     for k, make in enumerate((_sines, _chirp, _steps, _walk, _gait)):
         rows = np.flatnonzero(kind == k)

@@ -124,6 +124,7 @@ def roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy |
     pose = np.zeros((n, horizon + 1, 7), np.float32)
     delta = np.zeros((n, kind.proprio_size))
     start = np.zeros((n, batch.state.shape[1]))
+    shown = np.zeros((len(rows), kind.proprio_size))
     for t in range(longest + horizon):
         alive = (t >= longest - task.warm) & ~unstable & ~ended
         action = drive(view, task.signal[:, t])

@@ -115,7 +115,7 @@ def on_ray(plan: Plan, shards: Sequence[int], proposed: Proposed, address: str, 
       NfcError: a shard's workers died again and again.
     """
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtra("a cluster needs Ray: pip install 'nfc_gym[ray]'") from None
     started = not ray.is_initialized()
