@@ -212,6 +212,7 @@ def simulate(
         float,
         typer.Option("--motor-noise", metavar="SD", min=0, max=1, help="Of the actions' full range, not recorded."),
     ] = 0.02,
+    maps: Annotated[bool, typer.Option("--maps", help="Keep the elevation maps too, 64 KB a window.")] = False,
     ray: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Use a Ray cluster: its address, auto, or local.")
     ] = None,
@@ -235,6 +236,10 @@ def simulate(
             environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=proposal, policy=policy,
             policy_share=policy_share, motor=motor, ray=ray, console=Console(),
         )  # fmt: skip
+        if maps:
+            from nfc_gym.simulate.maps import keep_maps
+
+            keep_maps(out, jobs, Console())
 
 
 @app.command()

@@ -20,7 +20,8 @@ except ImportError:
     raise MissingExtra("windows are kept as safetensors: pip install 'nfc_gym[inference]'") from None
 
 Batch = dict[str, NDArray]
-_DTYPES = {"F32": np.float32, "F64": np.float64, "I16": np.int16, "I32": np.int32, "I64": np.int64}
+MAPS = {"perceived": (None, None), "true": (None, None)}
+_DTYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "I16": np.int16, "I32": np.int32, "I64": np.int64}
 
 
 def shard_path(folder: Path, shard: int) -> Path:
@@ -58,6 +59,11 @@ def check_finite(name: str, value: NDArray, where: str) -> None:
     if value.dtype.kind == "f" and not np.isfinite(value).all():
         row = int(np.argwhere(~np.isfinite(value))[0, 0])
         raise InputError(f"{where}: {name} of window {row} is not finite")
+
+
+def maps_path(folder: Path, shard: int) -> Path:
+    """Where the elevation maps of a shard's windows lie, where they are kept."""
+    return folder / f"maps_{shard:05d}.safetensors"
 
 
 class WindowWriter:
@@ -119,8 +125,17 @@ class WindowWriter:
         write_whole(self.folder / MANIFEST, self.manifest.text())
 
 
-def mapped(path: Path, manifest: Manifest, shard: int) -> Batch:
-    """The arrays of a shard's file, memory-mapped."""
+def mapped(path: Path, shapes: Mapping[str, Sequence[int | None]], count: int) -> Batch:
+    """The arrays of a shard's file, memory-mapped.
+
+    Args:
+      path: the file.
+      shapes: trailing shape of each array that it must hold.
+      count: windows that it must hold.
+
+    Raises:
+      InputError: the file is missing, truncated or foreign, or holds other arrays.
+    """
     try:
         with safetensors.safe_open(path, "np") as file:  # compares the header with the file's length
             names = set(file.keys())
@@ -128,7 +143,6 @@ def mapped(path: Path, manifest: Manifest, shard: int) -> Batch:
         raise InputError(f"{path}: missing, though {MANIFEST} says that it is finished; simulate again") from None
     except (safetensors.SafetensorError, OSError) as e:
         raise InputError(f"{path}: truncated, or no shard ({e}); delete it and simulate again") from None
-    shapes = manifest.shapes()
     if names != set(shapes):
         raise InputError(f"{path}: holds {', '.join(sorted(names))}; want {', '.join(sorted(shapes))}")
     with open(path, "rb") as raw:
@@ -138,8 +152,14 @@ def mapped(path: Path, manifest: Manifest, shard: int) -> Batch:
     for name, want in shapes.items():
         entry = header[name]
         _check_shape(name, entry["shape"], want, str(path))
-        if entry["shape"][0] != manifest.size(shard):
-            raise InputError(f"{path}: {name} has {entry['shape'][0]} windows, want {manifest.size(shard)}")
+        if entry["shape"][0] != count:
+            raise InputError(f"{path}: {name} has {entry['shape'][0]} windows, want {count}")
         begin = 8 + length + entry["data_offsets"][0]
         out[name] = np.memmap(path, _DTYPES[entry["dtype"]], "r", begin, tuple(entry["shape"]))
     return out
+
+
+def save_maps(folder: Path, shard: int, maps: Mapping[str, NDArray]) -> None:
+    """Keep the elevation maps of a shard's windows beside it, `perceived` and `true` (n, rows, columns), as float16."""
+    with replacing(maps_path(folder, shard)) as part:
+        part.write_bytes(safetensors.numpy.save({k: np.ascontiguousarray(v, np.float16) for k, v in maps.items()}))

@@ -17,7 +17,8 @@ A folder holds `manifest.json` and shards `shard_00000.safetensors`, ... Each sh
 | camera_seed, camera_level | (n,) int64, float32 | of the depth camera's noise; what multiplies it |
 | start | (n, m) float64 | the simulator's whole state at the window's beginning (MuJoCo's integration state) |
 
-Needs numpy and safetensors alone.
+Where maps were kept (`nfc-gym simulate --maps`), `maps_00000.safetensors`, ... add `perceived` and `true`, elevation
+maps (n, 128, 128) float16 [m] at each window's end. Needs numpy and safetensors alone.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.manifest import Manifest
-from nfc_gym.inference.shards import Batch, WindowWriter, check_finite, mapped, packed, shard_path
+from nfc_gym.inference.shards import MAPS, Batch, WindowWriter, check_finite, mapped, maps_path, packed, shard_path
 
 __all__ = ["Batch", "Batches", "Manifest", "WindowWriter", "Windows", "packed", "shard_path"]
 
@@ -62,8 +63,17 @@ class Windows:
             )
         if not self.manifest.finished:
             raise InputError(f"{self.folder}: no shard is finished yet")
-        self._shards = [mapped(shard_path(self.folder, k), self.manifest, k) for k in self.manifest.finished]
+        self._shards = self._opened()
         self._ends = np.cumsum([len(s["family"]) for s in self._shards])
+
+    def _opened(self) -> list[Batch]:
+        """Every shard's arrays; with the maps where all of them are kept."""
+        done, shapes = self.manifest.finished, self.manifest.shapes()
+        shards = [mapped(shard_path(self.folder, k), shapes, self.manifest.size(k)) for k in done]
+        if all(maps_path(self.folder, k).exists() for k in done):
+            kept = [mapped(maps_path(self.folder, k), MAPS, self.manifest.size(k)) for k in done]
+            shards = [one | more for one, more in zip(shards, kept, strict=True)]
+        return shards
 
     def __len__(self) -> int:
         return int(self._ends[-1])

@@ -4,17 +4,26 @@ Windows hold no maps: 1e6 of 128 x 128 would take 65 GB. The terrain is made aga
 the depth camera then looks along the window's poses with its own seed, and the map is the one at the window's end.
 """
 
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
 
 from nfc_gym.envs.contract import FLAT
-from nfc_gym.inference.windows import Batch, Manifest
+from nfc_gym.inference.shards import maps_path, save_maps
+from nfc_gym.inference.windows import Batch, Manifest, Windows
 from nfc_gym.physics.state import yaw
 from nfc_gym.simulate.ground import made
+from nfc_gym.simulate.workers import cores
 from nfc_gym.terrain import DepthCamera, Heightfield, PerceivedMap, elevation
+
+READ = ("pose", "terrain_kind", "terrain_seed", "terrain_difficulty", "camera_seed", "camera_level")
 
 
 class Maps(NamedTuple):
@@ -56,12 +65,36 @@ def ground(manifest: Manifest, kind: int, seed: int, difficulty: float) -> Heigh
     return made(manifest.terrain_kinds[kind], int(seed), float(difficulty), manifest.terrain_scale)
 
 
+def keep_maps(folder: str | Path, jobs: int = 0, console: Console | None = None) -> None:
+    """Write the maps of all windows of a folder beside them, 64 KB a window; shards that have theirs are passed over.
+
+    Args:
+      folder: what `simulate` wrote.
+      jobs: processes; 0 takes all cores.
+      console: where progress goes; None is silent.
+    """
+    folder = Path(folder)
+    left = [k for k in Windows(folder).manifest.finished if not maps_path(folder, k).exists()]
+    shown = Progress(console=console, disable=console is None)
+    with ProcessPoolExecutor(min(jobs or cores(), max(len(left), 1)), get_context("spawn")) as pool, shown as bar:
+        for _ in bar.track(pool.map(_keep, [folder] * len(left), left), len(left), description="elevation maps"):
+            pass
+
+
+def _keep(folder: Path, shard: int) -> None:
+    whole = Windows(folder)
+    first = sum(whole.manifest.size(k) for k in whole.manifest.finished if k < shard)
+    rows = np.arange(first, first + whole.manifest.size(shard))
+    rebuilt = maps(whole.manifest, whole.take(rows, READ))
+    save_maps(folder, shard, {"perceived": rebuilt.perceived, "true": rebuilt.true})
+
+
 def maps(manifest: Manifest, windows: Batch) -> Maps:
     """Rebuild the maps of some windows.
 
     Args:
       manifest: of their set.
-      windows: as `Windows` gives them; `pose`, `terrain_*` and `camera_*` are read, (n, ...) each.
+      windows: as `Windows` gives them; what `READ` names is read, (n, ...) each.
     """
     pose = np.asarray(windows["pose"], np.float64)
     kinds, seeds, hard = (windows[f"terrain_{k}"] for k in ("kind", "seed", "difficulty"))

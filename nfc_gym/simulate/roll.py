@@ -105,6 +105,11 @@ def roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy |
       policy: what moves the guided rows.
       nthread: threads; the result does not depend on them.
     """
+    with np.errstate(over="ignore", invalid="ignore"):  # what comes apart is counted
+        return _roll(machine, task, maps, policy, nthread)
+
+
+def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy | None, nthread: int) -> Rolled:
     n, horizon, kind = len(task.psi), machine.habit.horizon, machine.kind
     longest = task.signal.shape[1] - horizon
     sims = machine.simulations(n, nthread, maps)

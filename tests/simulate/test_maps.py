@@ -6,8 +6,10 @@ import numpy as np
 import safetensors.numpy
 
 from nfc_gym.envs.look import look
+from nfc_gym.inference.windows import Windows
+from nfc_gym.simulate import simulate
 from nfc_gym.simulate.ground import made
-from nfc_gym.simulate.maps import maps
+from nfc_gym.simulate.maps import keep_maps, maps
 from nfc_gym.simulate.run import manifest_of
 from nfc_gym.simulate.shard import Plan, make_shard
 
@@ -40,7 +42,17 @@ def test_the_perceived_map_is_seen_ahead_with_an_error_of_centimetres() -> None:
     assert np.abs(louder.delta_e[louder.valid]).mean() > np.abs(error).mean()
 
 
-def test_a_plane_is_level(jackal: dict[str, np.ndarray], tmp_path: Path) -> None:
+def test_kept_maps_are_read_with_the_windows(tmp_path: Path) -> None:
+    windows = simulate("nfc_gym/JackalRough-v0", 3, tmp_path, per_shard=2, jobs=1, effects=0)
+    assert "true" not in windows.names
+    keep_maps(tmp_path, jobs=1)
+    again = Windows(tmp_path)
+    rebuilt = maps(windows.manifest, windows[:])
+    np.testing.assert_array_equal(again[:]["perceived"], rebuilt.perceived.astype(np.float16))
+    np.testing.assert_array_equal(again[2]["true"], rebuilt.true[2].astype(np.float16))
+
+
+def test_a_plane_is_level(jackal: dict[str, np.ndarray]) -> None:
     manifest = manifest_of("nfc_gym/JackalFlat-v0", 8, 0, 8, {})
     found = maps(manifest, {k: v[:2] for k, v in jackal.items()})
     np.testing.assert_allclose(found.true, -jackal["pose"][:2, -1, 2, None, None] + np.zeros((2, 128, 128)), atol=1e-6)
