@@ -10,7 +10,7 @@ from nfc_gym.simulate.ground import made
 from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.roll import step
 
-CLOUD, PAIRS = 128, 8  # draws of the motors' noise, see `information`
+CLOUD, PAIRS = 256, 32  # draws of the motors' noise, see `information`
 
 
 def ceiling(
