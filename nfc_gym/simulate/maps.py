@@ -4,9 +4,7 @@ Windows hold no maps: 1e6 of 128 x 128 would take 65 GB. The terrain is made aga
 the depth camera then looks along the window's poses with its own seed, and the map is the one at the window's end.
 """
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +18,7 @@ from nfc_gym.inference.shards import maps_path, save_maps
 from nfc_gym.inference.windows import Batch, Manifest, Windows
 from nfc_gym.physics.state import yaw
 from nfc_gym.simulate.ground import made
-from nfc_gym.simulate.workers import cores
+from nfc_gym.simulate.workers import cores, pool_of
 from nfc_gym.terrain import DepthCamera, Heightfield, PerceivedMap, elevation
 
 READ = ("pose", "terrain_kind", "terrain_seed", "terrain_difficulty", "camera_seed", "camera_level")
@@ -76,7 +74,7 @@ def keep_maps(folder: str | Path, jobs: int = 0, console: Console | None = None)
     folder = Path(folder)
     left = [k for k in Windows(folder).manifest.finished if not maps_path(folder, k).exists()]
     shown = Progress(console=console, disable=console is None)
-    with ProcessPoolExecutor(min(jobs or cores(), max(len(left), 1)), get_context("spawn")) as pool, shown as bar:
+    with pool_of(min(jobs or cores(), max(len(left), 1))) as pool, shown as bar:
         for _ in bar.track(pool.map(_keep, [folder] * len(left), left), len(left), description="elevation maps"):
             pass
 

@@ -84,7 +84,6 @@ def simulate(
     manifest = manifest_of(environment, windows, seed, per_shard, settings)
     writer = WindowWriter(Path(out), manifest)
     plan = Plan(manifest, source, effects, settings["policy_share"], motor)
-    jobs = jobs or workers.cores()
     left = writer.missing
 
     def proposed(shard: int) -> Array | None:
@@ -92,8 +91,8 @@ def simulate(
 
     if ray is not None:
         made = workers.on_ray(plan, left, proposed, ray, jobs)
-    elif min(jobs, len(left)) > 1:
-        made = workers.processes(plan, left, proposed, min(jobs, len(left)))
+    elif min(jobs or workers.cores(), len(left)) > 1:
+        made = workers.processes(plan, left, proposed, min(jobs or workers.cores(), len(left)))
     else:
         made = workers.serial(plan, left, proposed, jobs)
     _write(writer, made, console)

@@ -2,11 +2,13 @@
 
 import os
 import pickle
+import signal
+import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 from nfc_gym.core.errors import InputError, MissingExtra, NfcError
@@ -42,27 +44,46 @@ def processes(plan: Plan, shards: Sequence[int], proposed: Proposed, jobs: int) 
         pickle.dumps(plan)
     except (pickle.PicklingError, AttributeError, TypeError) as e:
         raise InputError(f"policy: cannot be sent to other processes ({e}); give a file, or jobs=1") from None
+    with pool_of(jobs) as pool:
+        yield from _flow(
+            shards, jobs, lambda k: pool.submit(make_shard, plan, k, proposed(k)), _first, lambda f: f.result()
+        )
+
+
+@contextmanager
+def pool_of(jobs: int) -> Generator[ProcessPoolExecutor, None, None]:
+    """Processes of one thread each, which end at once where this one is interrupted or dies.
+
+    Raises:
+      NfcError: one of them died.
+    """
     with _single_threaded():
-        pool = ProcessPoolExecutor(jobs, get_context("spawn"))
+        pool = ProcessPoolExecutor(jobs, get_context("spawn"), _ready)
         try:
-            yield from _flow(
-                shards, jobs, lambda k: pool.submit(make_shard, plan, k, proposed(k)), _first, lambda f: f.result()
-            )
+            yield pool
         except BrokenProcessPool:
             raise NfcError(
                 "a worker process died, perhaps for want of memory; finished shards stay: the same command goes on, "
                 "and --jobs with a smaller number needs less"
             ) from None
         finally:
-            _stop(pool)
+            running = list((pool._processes or {}).values())
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in running:
+                process.terminate()
 
 
-def _stop(pool: ProcessPoolExecutor) -> None:
-    """End at once: whoever interrupts does not want to wait for shards that nobody will write."""
-    running = list((pool._processes or {}).values())
-    pool.shutdown(wait=False, cancel_futures=True)
-    for process in running:
-        process.terminate()
+def _ready() -> None:
+    """In a worker: Ctrl-C is the caller's to answer, and nobody works on for a caller that was killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        caller = parent_process()
+        if caller is not None:
+            caller.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager
@@ -107,7 +128,8 @@ def on_ray(plan: Plan, shards: Sequence[int], proposed: Proposed, address: str, 
     Args:
       plan, shards, proposed: what is made.
       address: of a running cluster, `auto` for the one that this machine belongs to, `local` to start one here.
-      jobs: workers, where one is started; on a running cluster how many shards are asked for at a time.
+      jobs: workers, where one is started; on a running cluster half as many as shards are asked for at a time. 0 takes
+        all cores.
 
     Raises:
       MissingExtra: Ray is not installed.
@@ -120,13 +142,13 @@ def on_ray(plan: Plan, shards: Sequence[int], proposed: Proposed, address: str, 
         raise MissingExtra("a cluster needs Ray: pip install 'nfc_gym[ray]'") from None
     started = not ray.is_initialized()
     if started:
-        where = {"num_cpus": jobs} if address == "local" else {"address": address}
+        where = {"num_cpus": jobs or cores()} if address == "local" else {"address": address}
         try:
             ray.init(**where, include_dashboard=False, logging_level="warning", log_to_driver=False)
         except (ConnectionError, ValueError, RuntimeError) as e:
             raise InputError(f"--ray {address}: no such cluster ({e}); want its address, auto or local") from None
     make = ray.remote(num_cpus=1, max_retries=_RETRIES)(make_shard)
-    given = ray.put(plan)
+    given, jobs = ray.put(plan), jobs or int(ray.cluster_resources().get("CPU", 1))
     try:
         yield from _flow(
             shards, jobs, lambda k: make.remote(given, k, proposed(k)), lambda refs: ray.wait(refs)[0][0], ray.get

@@ -62,6 +62,34 @@ def test_a_killed_run_goes_on_and_ends_the_same(tmp_path: Path, whole: dict[str,
     assert all((tmp_path / name).stat().st_mtime_ns == t for name, t in at.items())
 
 
+@pytest.mark.skipif(not Path("/proc").exists(), reason="children are looked up in /proc")
+def test_no_worker_outlives_a_killed_caller(tmp_path: Path) -> None:
+    call = f"""if __name__ == '__main__':
+    from nfc_gym.simulate import simulate
+    simulate(**{SET | {"windows": 400}!r}, out={str(tmp_path / "set")!r}, jobs=2)"""
+    (tmp_path / "run.py").write_text(call)
+    (tmp_path / "set").mkdir()
+    path = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, str(tmp_path / "run.py")], env=path)
+    killed_after_a_shard(tmp_path / "set", lambda: None).join()
+    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    workers = [p for p in listed if b"spawn_main" in Path(f"/proc/{p}/cmdline").read_bytes()]
+    assert len(workers) == 2
+    process.kill()
+    process.wait()
+    until = time.monotonic() + 20
+    while time.monotonic() < until and any(alive(p) for p in workers):
+        time.sleep(0.05)
+    assert not any(alive(p) for p in workers)
+
+
+def alive(pid: str) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def test_processes_make_the_same_and_a_dead_one_is_said_so(tmp_path: Path, whole: dict[str, str]) -> None:
     def kill() -> None:
         for child in multiprocessing.active_children()[:1]:
