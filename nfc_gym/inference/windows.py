@@ -23,7 +23,6 @@ maps (n, 128, 128) float16 [m] at each window's end. Needs numpy and safetensors
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -36,52 +35,46 @@ from nfc_gym.inference.shards import MAPS, Batch, WindowWriter, check_finite, ma
 
 __all__ = ["Batch", "Batches", "Manifest", "WindowWriter", "Windows", "packed", "shard_path"]
 
+# What folders must have in common to be read as one.
+ALIKE = (
+    "environment", "psi_names", "psi_low", "psi_high", "horizon", "state_names", "action_names", "families", "effects",
+    "terrain_kinds",
+)  # fmt: skip
+
 
 class Windows:
     """A set of windows, memory-mapped: nothing is read before it is asked for.
 
     Args:
-      folder: what `nfc-gym simulate` wrote, perhaps not finished yet: what is there can be read.
+      folders: what `nfc-gym simulate` wrote, perhaps not finished yet: what is there can be read. Several, as
+        sequential rounds make them, are read one after the other.
       robot: name of the robot that the windows must be of; None is any.
       psi_names: of the parameters that they must have.
 
     Attributes:
-      manifest: see `Manifest`.
+      manifest: of the first folder, see `Manifest`.
 
     Raises:
-      InputError: no or another manifest, a robot or parameters other than wanted, a truncated or foreign shard.
+      InputError: no manifest, another robot or parameters than wanted, folders of different kinds, a truncated or
+        foreign shard.
     """
 
-    def __init__(self, folder: str | Path, robot: str | None = None, psi_names: Sequence[str] | None = None) -> None:
-        self.folder = Path(folder)
-        self.manifest = Manifest.read(self.folder)
-        if robot is not None and robot != self.manifest.robot:
-            raise InputError(f"{self.folder}: windows of the robot {self.manifest.robot!r}, want {robot!r}")
-        if psi_names is not None and tuple(psi_names) != self.manifest.psi_names:
-            raise InputError(
-                f"{self.folder}: the parameters are {', '.join(self.manifest.psi_names)}; want {', '.join(psi_names)}"
-            )
-        if not self.manifest.finished:
-            raise InputError(f"{self.folder}: no shard is finished yet")
-        self._shards = self._opened()
+    def __init__(self, *folders: str | Path, robot: str | None = None, psi_names: Sequence[str] | None = None) -> None:
+        if not folders:
+            raise InputError("windows: name a folder that `nfc-gym simulate` wrote")
+        self.folders = tuple(Path(f) for f in folders)
+        manifests = [Manifest.read(f) for f in self.folders]
+        for folder, each in zip(self.folders, manifests, strict=True):
+            _require(folder, each, manifests[0], robot, psi_names)
+        self.manifest = manifests[0]
+        opened = [_opened(f, m) for f, m in zip(self.folders, manifests, strict=True)]
+        self._shards = [shard for shards in opened for shard in shards]
+        kept = set.intersection(*(set(s) for s in self._shards))
+        self.names = tuple(n for n in self._shards[0] if n in kept)
         self._ends = np.cumsum([len(s["family"]) for s in self._shards])
-
-    def _opened(self) -> list[Batch]:
-        """Every shard's arrays; with the maps where all of them are kept."""
-        done, shapes = self.manifest.finished, self.manifest.shapes()
-        shards = [mapped(shard_path(self.folder, k), shapes, self.manifest.size(k)) for k in done]
-        if all(maps_path(self.folder, k).exists() for k in done):
-            kept = [mapped(maps_path(self.folder, k), MAPS, self.manifest.size(k)) for k in done]
-            shards = [one | more for one, more in zip(shards, kept, strict=True)]
-        return shards
 
     def __len__(self) -> int:
         return int(self._ends[-1])
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """The arrays that each window has."""
-        return tuple(self._shards[0])
 
     def __getitem__(self, rows: Any) -> Batch:
         """Windows by index, slice or array of indices: every array, in the order asked for."""
@@ -112,7 +105,7 @@ class Windows:
             for k in np.unique(of):
                 at = np.flatnonzero(of == k)
                 value[at] = self._shards[k][name][rows[at] - starts[k]]
-            check_finite(name, value, str(self.folder))
+            check_finite(name, value, str(self.folders[0]))
             out[name] = value
         return out
 
@@ -122,6 +115,31 @@ class Windows:
     ) -> "Batches":  # fmt: skip
         """Batches in shuffled order, see `Batches`."""
         return Batches(self, size, seed, np.arange(len(self)) if rows is None else rows, tuple(names), noise)
+
+
+def _require(
+    folder: Path, manifest: Manifest, first: Manifest, robot: str | None, psi_names: Sequence[str] | None
+) -> None:
+    """Refuse windows of another kind than wanted, or than those of the first folder."""
+    if robot is not None and robot != manifest.robot:
+        raise InputError(f"{folder}: windows of the robot {manifest.robot!r}, want {robot!r}")
+    if psi_names is not None and tuple(psi_names) != manifest.psi_names:
+        raise InputError(f"{folder}: the parameters are {', '.join(manifest.psi_names)}; want {', '.join(psi_names)}")
+    odd = [k for k in ALIKE if getattr(manifest, k) != getattr(first, k)]
+    if odd:
+        raise InputError(f"{folder}: another {', '.join(odd)} than the first folder; such windows do not go together")
+    if not manifest.finished:
+        raise InputError(f"{folder}: no shard is finished yet")
+
+
+def _opened(folder: Path, manifest: Manifest) -> list[Batch]:
+    """Every shard's arrays; with the maps where all of them are kept."""
+    done, shapes = manifest.finished, manifest.shapes()
+    shards = [mapped(shard_path(folder, k), shapes, manifest.size(k)) for k in done]
+    if all(maps_path(folder, k).exists() for k in done):
+        kept = [mapped(maps_path(folder, k), MAPS, manifest.size(k)) for k in done]
+        shards = [one | more for one, more in zip(shards, kept, strict=True)]
+    return shards
 
 
 @dataclass

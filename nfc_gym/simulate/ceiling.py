@@ -80,7 +80,7 @@ def replayed(machine: Machine, window: Batch, u: Array, jitter: Array, nthread: 
     view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
     batch.state[...] = window["start"]
     view.now = robot.derive(view)
-    out = []
+    out = [np.concatenate(robot.proprio(view), -1)]
     for action, noise in zip(window["actions"][0].astype(np.float64), np.moveaxis(jitter, 1, 0), strict=True):
         commanded = np.tile(action, (m, 1))
         view.ctrl[...] = robot.actuate(np.clip(action + noise, -1, 1), view)
@@ -88,5 +88,8 @@ def replayed(machine: Machine, window: Batch, u: Array, jitter: Array, nthread: 
         view.task.update(robot.advance(view, commanded))
         view.before, view.now = view.now, robot.derive(view)
         out.append(np.concatenate(robot.proprio(view), -1))
-    states = np.stack(out, 1).reshape(m, -1)
+    states = np.stack(out, 1)
+    with np.errstate(invalid="ignore"):
+        states[..., machine.angles] = np.unwrap(states[..., machine.angles], axis=1)
+    states = states[:, 1:].reshape(m, -1)
     return np.where(np.isfinite(states).all(1, keepdims=True), states, np.nan)

@@ -12,6 +12,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.envs.contract import robot_class
 from nfc_gym.envs.registry import ROBOTS, register
 from nfc_gym.envs.robot import DT, Array
+from nfc_gym.envs.runner import Runner
 from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.simulations import Simulations
 from nfc_gym.physics.parameters import ParameterSpace
@@ -119,6 +120,17 @@ class Machine:
     def noise(self) -> Array:
         """(s,) standard deviation of the measurement noise of `proprio`."""
         return np.repeat([sd for _, sd in self.habit.noise], [k for k, _ in self.habit.noise])
+
+    @cached_property
+    def angles(self) -> list[int]:
+        """Entries of `proprio` that are angles which jump from pi to -pi: a runner's yaw, roll, angle to its target."""
+        return [7, 8, 9] if issubclass(self.kind, Runner) else []
+
+    def difference(self, after: Array, before: Array) -> Array:
+        """`after` minus `before`, (..., s) each of `proprio`; angles go the shorter way round."""
+        change = after - before
+        change[..., self.angles] = (change[..., self.angles] + np.pi) % (2 * np.pi) - np.pi
+        return change
 
     @property
     def terrain_kinds(self) -> tuple[str, ...]:

@@ -162,7 +162,7 @@ def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy 
         view.before, view.now = view.now, robot.derive(view)
         ended |= alive & ~apart & robot.terminated(view)
         if k >= 0:
-            delta[rows] += np.concatenate(robot.proprio(view), -1)[rows] - shown
+            delta[rows] += machine.difference(np.concatenate(robot.proprio(view), -1)[rows], shown)
     states[:, horizon] = np.concatenate(robot.proprio(view), -1)
     pose[:, horizon] = view.qpos[:, :7]
     unstable |= ~ended & ~(np.isfinite(states).all((1, 2)) & np.isfinite(delta).all(1))

@@ -21,7 +21,7 @@ from nfc_gym.simulate.draws import PROPOSAL, Array, generator
 from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.policy import Act, Policy
 from nfc_gym.simulate.residuals import families
-from nfc_gym.simulate.shard import Plan, as_path, described, workshop
+from nfc_gym.simulate.shard import Plan, described, workshop
 
 PER_SHARD = 2048  # windows: enough that arrays are long, few enough that 1e5 windows keep 16 cores busy
 
@@ -70,7 +70,8 @@ def simulate(
     _check(windows, seed, jobs, effects, policy_share, motor, per_shard)
     require_writable(Path(out))
     sampler = _opened(proposal)
-    source = policy if callable(policy) else as_path(policy)
+    # A path is made absolute: workers may stand elsewhere.
+    source = policy if callable(policy) or policy is None else str(Path(policy).resolve())
     shop = workshop(environment)
     if source is not None:
         Policy(source, shop.machine)  # says at once what is wrong with it

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -234,8 +233,3 @@ def described(shop: Workshop) -> list[dict[str, object]]:
         }
         for e in shop.effects
     ]
-
-
-def as_path(source: str | Path | None) -> str | None:
-    """A path as text, absolute: workers may stand elsewhere."""
-    return None if source is None else str(Path(source).resolve())

@@ -95,6 +95,18 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     assert WindowWriter(tmp_path, MANIFEST).missing == [1]
 
 
+def test_rounds_are_read_as_one(tmp_path: Path) -> None:
+    """The second folder's windows follow the first's; folders of another kind are refused."""
+    first, second = written(tmp_path / "a"), written(tmp_path / "b", (0,), replace(MANIFEST, seed=1))
+    both = Windows(first, second, robot="toy")
+    assert len(both) == 35
+    np.testing.assert_array_equal(both[np.array([0, 24, 25, 34])]["family"], [0, 24, 0, 9])
+    assert sum(len(b["psi"]) for b in both.batches(8)) == 35
+    other = written(tmp_path / "c", (0,), replace(MANIFEST, psi_high=(3.0, 1.0)))
+    with pytest.raises(InputError, match="another psi_high than the first folder"):
+        Windows(first, other)
+
+
 def test_another_set_is_not_mixed_in(tmp_path: Path) -> None:
     written(tmp_path, (0,))
     with pytest.raises(InputError, match="another seed; choose another folder"):

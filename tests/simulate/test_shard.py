@@ -138,6 +138,21 @@ def test_the_residual_is_the_mean_of_single_steps_without_the_effect(family: str
         np.testing.assert_allclose(done.delta_s[i, rates], total / machine.habit.horizon, rtol=1e-9, atol=1e-12)
 
 
+def test_a_runners_residual_is_no_turn_round() -> None:
+    """Yaw, roll and the angle to the target jump from pi to -pi; what changes in a step is small all the same."""
+    machine = Machine("nfc_gym/AntFlat-v0")
+    before, after = np.zeros((2, 52)), np.zeros((2, 52))
+    before[:, :12], after[:, :12] = 3.1, -3.1
+    change = machine.difference(after, before)
+    np.testing.assert_allclose(change[:, 7:10], 2 * np.pi - 6.2)
+    np.testing.assert_allclose(change[:, [0, 6, 10, 11]], -6.2)
+    assert machine.difference(before, before).tolist() == np.zeros((2, 52)).tolist()
+    yaw = np.arctan2(*shard(machine.environment, 8)["pose"][:, :, [6, 3]].transpose(2, 0, 1)) * 2
+    wrapped = (yaw + np.pi) % (2 * np.pi) - np.pi
+    assert machine.angles[0] == 7
+    np.testing.assert_allclose(np.cos(shard(machine.environment, 8)["states"][..., 7] - wrapped), 1, atol=0.2)
+
+
 def test_sizes_stay_within_bounds_and_off_the_null() -> None:
     rng = np.random.default_rng(0)
     for effect in workshop(JACKAL).effects:
