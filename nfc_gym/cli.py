@@ -194,7 +194,7 @@ def simulate(
     environment: Annotated[str, typer.Argument(metavar="ID", help="For instance nfc_gym/JackalFlat-v0.")],
     windows: Annotated[int, typer.Option(metavar="N", min=1, help="How many windows.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for manifest.json and the shards.")],
-    seed: Seed = 0,
+    seed: Annotated[int, typer.Option(min=0, help="The same arguments and seed give the same bits.")] = 0,
     jobs: Annotated[int, typer.Option(min=0, max=1024, help="Processes; 0 takes all cores.")] = 0,
     effects: Annotated[
         float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of windows with an effect that the model lacks.")
@@ -205,12 +205,14 @@ def simulate(
     ] = None,
     policy: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="TorchScript (.pt), or .npz of a perceptron, that moves a share of them."),
+        typer.Option(metavar="FILE", help="TorchScript (.pt), or .npz of a perceptron, that moves some windows."),
     ] = None,
-    policy_share: Annotated[float, typer.Option(metavar="SHARE", min=0, max=1, help="That share.")] = 0.5,
+    policy_share: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of windows that it moves.")
+    ] = 0.5,
     motor: Annotated[
         float,
-        typer.Option("--motor-noise", metavar="SD", min=0, max=1, help="Of the actions' full range, not recorded."),
+        typer.Option("--motor-noise", metavar="SD", min=0, max=1, help="Of motors, a share of the actions' range."),
     ] = 0.02,
     maps: Annotated[bool, typer.Option("--maps", help="Keep the elevation maps too, 64 KB a window.")] = False,
     ray: Annotated[
