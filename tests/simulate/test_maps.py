@@ -15,14 +15,14 @@ from nfc_gym.simulate.shard import Plan, make_shard
 
 
 def rough(effects: float = 0.0) -> tuple:
-    plan = Plan(manifest_of("nfc_gym/JackalRough-v0", 6, 0, 6, {}), effects=effects)
+    plan = Plan(manifest_of("nfc_gym/JackalRough-v0", 4, 0, 4, {}), effects=effects)
     return plan.manifest, safetensors.numpy.load(make_shard(plan, 0))
 
 
 def test_the_true_map_is_the_one_that_the_environment_shows() -> None:
     manifest, windows = rough()
     found = maps(manifest, windows)
-    for i in range(6):
+    for i in range(4):
         kind, seed = manifest.terrain_kinds[windows["terrain_kind"][i]], int(windows["terrain_seed"][i])
         field = made(kind, seed, float(windows["terrain_difficulty"][i]), manifest.terrain_scale)
         np.testing.assert_allclose(found.true[i], look(windows["pose"][i, -1].astype(float), field), atol=1e-6)
@@ -38,7 +38,7 @@ def test_the_perceived_map_is_seen_ahead_with_an_error_of_centimetres() -> None:
     assert first.valid[:, 66:100].sum() > 3 * first.valid[:, 28:62].sum()
     error = first.delta_e[first.valid]
     assert 0.002 < np.abs(error).mean() < 0.08
-    louder = maps(manifest, windows | {"camera_level": np.full(6, 4.0, np.float32)})
+    louder = maps(manifest, windows | {"camera_level": np.full(4, 4.0, np.float32)})
     assert np.abs(louder.delta_e[louder.valid]).mean() > np.abs(error).mean()
 
 

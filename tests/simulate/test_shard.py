@@ -50,7 +50,7 @@ def task(machine: Machine, n: int, given: list[Given]) -> Task:
 
 
 def test_any_number_of_threads_gives_the_same_bits() -> None:
-    made = plan("nfc_gym/JackalRough-v0", 16)
+    made = plan("nfc_gym/JackalRough-v0", 8)
     assert make_shard(made, 0, nthread=1) == make_shard(made, 0, nthread=3)
 
 
