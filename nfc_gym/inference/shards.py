@@ -20,7 +20,7 @@ except ImportError:
     raise MissingExtra("windows are kept as safetensors: pip install 'nfc_gym[inference]'") from None
 
 Batch = dict[str, NDArray]
-MAPS = {"perceived": (None, None), "true": (None, None)}
+MAPS = {"map": (None, None), "delta_e": (None, None)}
 _DTYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "I16": np.int16, "I32": np.int32, "I64": np.int64}
 
 
@@ -160,6 +160,6 @@ def mapped(path: Path, shapes: Mapping[str, Sequence[int | None]], count: int) -
 
 
 def save_maps(folder: Path, shard: int, maps: Mapping[str, NDArray]) -> None:
-    """Keep the elevation maps of a shard's windows beside it, `perceived` and `true` (n, rows, columns), as float16."""
+    """Keep the elevation maps of a shard's windows beside it, `map` and `delta_e` (n, rows, columns), as float16."""
     with replacing(maps_path(folder, shard)) as part:
         part.write_bytes(safetensors.numpy.save({k: np.ascontiguousarray(v, np.float16) for k, v in maps.items()}))

@@ -17,8 +17,9 @@ A folder holds `manifest.json` and shards `shard_00000.safetensors`, ... Each sh
 | camera_seed, camera_level | (n,) int64, float32 | of the depth camera's noise; what multiplies it |
 | start | (n, m) float64 | the simulator's whole state at the window's beginning (MuJoCo's integration state) |
 
-Where maps were kept (`nfc-gym simulate --maps`), `maps_00000.safetensors`, ... add `perceived` and `true`, elevation
-maps (n, 128, 128) float16 [m] at each window's end. Needs numpy and safetensors alone.
+Where maps were kept (`nfc-gym simulate --maps`), `maps_00000.safetensors`, ... add `map`, the perceived elevation
+(n, 128, 128) [m] at each window's end, and `delta_e`, truth minus perceived: float16 on disk, float32 when read.
+Needs numpy and safetensors alone.
 """
 
 from collections.abc import Iterator, Sequence
@@ -101,7 +102,8 @@ class Windows:
         out: Batch = {}
         for name in names or self.names:
             like = self._shards[0][name]
-            value = np.empty((len(rows), *like.shape[1:]), like.dtype)
+            kind = np.float32 if like.dtype == np.float16 else like.dtype
+            value = np.empty((len(rows), *like.shape[1:]), kind)
             for k in np.unique(of):
                 at = np.flatnonzero(of == k)
                 value[at] = self._shards[k][name][rows[at] - starts[k]]

@@ -84,7 +84,7 @@ def _keep(folder: Path, shard: int) -> None:
     first = sum(whole.manifest.size(k) for k in whole.manifest.finished if k < shard)
     rows = np.arange(first, first + whole.manifest.size(shard))
     rebuilt = maps(whole.manifest, whole.take(rows, READ))
-    save_maps(folder, shard, {"perceived": rebuilt.perceived, "true": rebuilt.true})
+    save_maps(folder, shard, {"map": rebuilt.perceived, "delta_e": rebuilt.delta_e})
 
 
 def maps(manifest: Manifest, windows: Batch) -> Maps:

@@ -16,6 +16,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable
 from nfc_gym.core.posterior import Sampler, load_source
 from nfc_gym.inference.windows import Manifest, Windows, WindowWriter
+from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.simulate import workers
 from nfc_gym.simulate.draws import PROPOSAL, Array, generator
 from nfc_gym.simulate.machine import MOTOR, Machine
@@ -70,8 +71,7 @@ def simulate(
     _check(windows, seed, jobs, effects, policy_share, motor, per_shard)
     require_writable(Path(out))
     sampler = _opened(proposal)
-    # A path is made absolute: workers may stand elsewhere.
-    source = policy if callable(policy) or policy is None else str(Path(policy).resolve())
+    source = settled(policy)
     shop = workshop(environment)
     if source is not None:
         Policy(source, shop.machine)  # says at once what is wrong with it
@@ -90,12 +90,7 @@ def simulate(
     def proposed(shard: int) -> Array | None:
         return None if sampler is None else drawn(sampler, shop.machine, seed, shard, manifest.size(shard))
 
-    if ray is not None:
-        made = workers.on_ray(plan, left, proposed, ray, jobs)
-    elif min(jobs or workers.cores(), len(left)) > 1:
-        made = workers.processes(plan, left, proposed, min(jobs or workers.cores(), len(left)))
-    else:
-        made = workers.serial(plan, left, proposed, jobs)
+    made = workers.made(plan, left, proposed, jobs, ray)
     _write(writer, made, console)
     return Windows(out)
 
@@ -121,17 +116,21 @@ def _opened(proposal: Sampler | str | Path | None) -> Sampler | None:
 
 
 def drawn(sampler: Sampler, machine: Machine, seed: int, shard: int, n: int) -> Array:
-    """u (n, d) that a proposal gives the windows of a shard.
+    """u (n, d) that a proposal gives the windows of a shard; errors as `units`."""
+    return units(sampler.sample(n, generator(seed, shard, PROPOSAL)).psi, machine.space, n)
+
+
+def units(psi: Array | None, space: ParameterSpace, n: int) -> Array:
+    """psi (n, d) in physical units -> u (n, d) in [0, 1].
 
     Raises:
-      InputError: it says nothing of psi, has other parameters, or leaves the prior's box.
+      InputError: there is none, it has other parameters, or leaves the prior's box.
     """
-    psi, space = sampler.sample(n, generator(seed, shard, PROPOSAL)).psi, machine.space
     if psi is None or psi.shape != (n, len(space)):
-        have = "says nothing of psi" if psi is None else f"has psi of {psi.shape[-1]} parameters"
-        raise InputError(f"the proposal {have}; want {len(space)}: {', '.join(space.names)}")
+        have = "says nothing of psi" if psi is None else f"has psi of shape {psi.shape}"
+        raise InputError(f"the proposal {have}; want {(n, len(space))}: {', '.join(space.names)}")
     u = (psi - space.low) / (space.high - space.low)
-    out = np.argwhere((u < -1e-6) | (u > 1 + 1e-6))
+    out = np.argwhere(~((u >= -1e-6) & (u <= 1 + 1e-6)))
     if len(out):
         i, j = out[0]
         raise InputError(
@@ -139,6 +138,11 @@ def drawn(sampler: Sampler, machine: Machine, seed: int, shard: int, n: int) -> 
             f"[{space.low[j]:g}, {space.high[j]:g}] {space.units[j]}"
         )
     return np.clip(u, 0, 1)
+
+
+def settled(policy: Act | str | Path | None) -> Act | str | None:
+    """A policy as plans have it: a path is made absolute, as workers may stand elsewhere."""
+    return policy if callable(policy) or policy is None else str(Path(policy).resolve())
 
 
 def _digest(sampler: Sampler | None, seed: int, machine: Machine) -> str | None:

@@ -27,6 +27,21 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def made(plan: Plan, shards: Sequence[int], proposed: Proposed, jobs: int, ray: str | None) -> Made:
+    """Shards as they are finished, from whoever is to make them.
+
+    Args:
+      plan, shards: what is made.
+      proposed: u (n, d) of a shard's windows, or None for draws from the prior.
+      jobs: processes, or threads where a single shard is left; 0 takes all cores.
+      ray: address of a cluster, see `on_ray`; None takes this machine.
+    """
+    if ray is not None:
+        return on_ray(plan, shards, proposed, ray, jobs)
+    several = min(jobs or cores(), len(shards))
+    return processes(plan, shards, proposed, several) if several > 1 else serial(plan, shards, proposed, jobs)
+
+
 def serial(plan: Plan, shards: Sequence[int], proposed: Proposed, threads: int) -> Made:
     """One after the other in this process."""
     for k in shards:

@@ -44,12 +44,13 @@ def test_the_perceived_map_is_seen_ahead_with_an_error_of_centimetres() -> None:
 
 def test_kept_maps_are_read_with_the_windows(tmp_path: Path) -> None:
     windows = simulate("nfc_gym/JackalRough-v0", 3, tmp_path, per_shard=2, jobs=1, effects=0)
-    assert "true" not in windows.names
+    assert "map" not in windows.names
     keep_maps(tmp_path, jobs=1)
     again = Windows(tmp_path)
     rebuilt = maps(windows.manifest, windows[:])
-    np.testing.assert_array_equal(again[:]["perceived"], rebuilt.perceived.astype(np.float16))
-    np.testing.assert_array_equal(again[2]["true"], rebuilt.true[2].astype(np.float16))
+    assert again[:]["map"].dtype == np.float32
+    np.testing.assert_array_equal(again[:]["map"], rebuilt.perceived.astype(np.float16))
+    np.testing.assert_array_equal(again[2]["delta_e"], rebuilt.delta_e[2].astype(np.float16))
 
 
 def test_a_plane_is_level(jackal: dict[str, np.ndarray]) -> None:
