@@ -33,9 +33,9 @@ ALLOWED: dict[str, set[str]] = {
         "envs",
         "wrappers",
         "measured",
-        "adaptation",
         "simulate",
-    },
+        "adaptation",
+    },  # fmt: skip
     "": {"core", "envs"},
 }
 # package -> all that it may import from outside the standard library
