@@ -35,7 +35,7 @@ ALLOWED: dict[str, set[str]] = {
         "measured",
         "simulate",
         "adaptation",
-    },  # fmt: skip
+    },
     "": {"core", "envs"},
 }
 # package -> all that it may import from outside the standard library
