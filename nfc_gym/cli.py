@@ -1,4 +1,4 @@
-"""`nfc-gym`: check, close-loop, predict, excite, demo. Everything heavy is imported inside the command that needs it.
+"""`nfc-gym`: check, close-loop, predict, excite, simulate, demo. Heavy imports are inside the command that needs them.
 
 Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the same command resumes; 1 a fault of ours.
 """
@@ -186,6 +186,62 @@ def excite(
             mapping, fit, out, seconds=seconds, seed=seed, tries=tries, budget=budget, jobs=jobs, overwrite=overwrite,
             console=Console(),
         )  # fmt: skip
+
+
+@app.command()
+def simulate(
+    ctx: typer.Context,
+    environment: Annotated[str, typer.Argument(metavar="ID", help="For instance nfc_gym/JackalFlat-v0.")],
+    windows: Annotated[int, typer.Option(metavar="N", min=1, help="How many windows.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for manifest.json and the shards.")],
+    seed: Annotated[int, typer.Option(min=0, help="The same arguments and seed give the same bits.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, max=1024, help="Processes; 0 takes all cores.")] = 0,
+    effects: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of windows with an effect that the model lacks.")
+    ] = 0.5,
+    proposal: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw psi from this (.npz of psi, or a posterior) and not from the prior."),
+    ] = None,
+    policy: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="TorchScript (.pt), or .npz of a perceptron, that moves some windows."),
+    ] = None,
+    policy_share: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of windows that it moves.")
+    ] = 0.5,
+    motor: Annotated[
+        float,
+        typer.Option("--motor-noise", metavar="SD", min=0, max=1, help="Of motors, a share of the actions' range."),
+    ] = 0.02,
+    maps: Annotated[bool, typer.Option("--maps", help="Keep the elevation maps too, 64 KB a window.")] = False,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Use a Ray cluster: its address, auto, or local.")
+    ] = None,
+) -> None:
+    """Make a training set: windows of simulated motion with the psi, the effect and the terrain that made each.
+
+    Each window is simulated under its own psi, drawn from the prior, on its own ground, excited richly or moved by a
+    policy, and half of the windows have an effect that the model lacks (friction in a joint, a payload, slip ...): what
+    that adds to a control step is the residual delta_s to be learned. Windows that come apart are drawn anew.
+
+    The same arguments and seed give the same bits with any --jobs. Interrupted, even killed, the same command goes on:
+    finished shards stay. DIR holds manifest.json, which says what every array is, and shard_00000.safetensors, ...;
+    nfc_gym.inference.windows.Windows(DIR) reads them. A sequential round draws psi from --proposal.
+
+    Example: nfc-gym simulate nfc_gym/JackalFlat-v0 --windows 100000 --out windows/jackal
+    """
+    with _outcome(ctx, resumes=True):
+        from nfc_gym.simulate import simulate as run
+
+        run(
+            environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=proposal, policy=policy,
+            policy_share=policy_share, motor=motor, ray=ray, console=Console(),
+        )  # fmt: skip
+        if maps:
+            from nfc_gym.simulate.maps import keep_maps
+
+            keep_maps(out, jobs, Console())
 
 
 @app.command()

@@ -20,8 +20,22 @@ ALLOWED: dict[str, set[str]] = {
     "envs": {"core", "physics", "terrain", "assets"},
     "wrappers": {"core", "physics", "terrain"},
     "measured": {"", "core", "physics", "terrain", "assets"},
+    # of inference only `windows`, the format on disk
+    "simulate": {"core", "physics", "terrain", "assets", "envs", "wrappers", "inference"},
     "adaptation": {"", "core", "physics", "terrain", "assets", "inference", "envs", "wrappers", "measured"},
-    "cli": {"", "core", "physics", "terrain", "assets", "inference", "envs", "wrappers", "measured", "adaptation"},
+    "cli": {
+        "",
+        "core",
+        "physics",
+        "terrain",
+        "assets",
+        "inference",
+        "envs",
+        "wrappers",
+        "measured",
+        "simulate",
+        "adaptation",
+    },
     "": {"core", "envs"},
 }
 # package -> all that it may import from outside the standard library

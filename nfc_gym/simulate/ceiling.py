@@ -1,0 +1,95 @@
+"""The ceiling: what a window can tell of psi at most, by the Fisher information of its noisy states (`fisher`)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.inference.windows import Batch
+from nfc_gym.simulate.fisher import STEP, Array, Ceiling, bounds, information
+from nfc_gym.simulate.ground import made
+from nfc_gym.simulate.machine import MOTOR, Machine
+from nfc_gym.simulate.roll import step
+
+CLOUD, PAIRS = 256, 32  # draws of the motors' noise, see `information`
+
+
+def ceiling(
+    environment: str,
+    windows: Batch,
+    noise: Array | None = None,
+    motor: float = MOTOR,
+    *,
+    width: float = STEP,
+    cloud: int = CLOUD,
+    pairs: int = PAIRS,
+    seed: int = 0,
+    nthread: int = 1,
+) -> Ceiling:
+    """What windows can tell of psi at most.
+
+    Args:
+      environment: id.
+      windows: as `Windows` gives them: `psi`, `start`, `actions` and the terrain are read. The effect, if one was
+        injected, is left out: the ceiling is that of psi in the simulator as it is.
+      noise: (s,) standard deviation of each entry of the states; None is the robot's own (`Machine.noise`).
+      motor: standard deviation of the motors' noise, as the windows were simulated with; 0 for none.
+      width, cloud, pairs: step of u, and draws, see `information`.
+      seed: of the motors' noise.
+      nthread: threads of the simulation; 0 takes every core.
+    """
+    machine = Machine(environment)
+    sd = machine.noise if noise is None else np.asarray(noise, float)
+    if sd.shape != (machine.kind.proprio_size,):
+        raise InputError(f"noise has shape {sd.shape}, want ({machine.kind.proprio_size},): one of each state entry")
+    if motor == 0:
+        cloud, pairs = 0, 1
+    n, horizon, size = windows["actions"].shape
+    found = []
+    for i in range(n):
+        jitter = motor * np.random.default_rng([seed, i]).standard_normal((cloud + pairs, horizon, size))
+        one = {name: value[i : i + 1] for name, value in windows.items()}
+
+        def simulator(u: Array, draw: NDArray[np.intp], one: Batch = one, jitter: Array = jitter) -> Array:
+            return replayed(machine, one, u, jitter[draw], nthread)
+
+        u = np.asarray(windows["psi"][i], float)
+        found.append(information(simulator, u, np.tile(sd, horizon), width, cloud, pairs))
+    return bounds(np.array(found))
+
+
+def replayed(machine: Machine, window: Batch, u: Array, jitter: Array, nthread: int) -> Array:
+    """States (m, H s) after each control step of one window from its start, under other psi, u (m, d).
+
+    Args:
+      machine: the robot.
+      window: its arrays, with a leading axis of 1.
+      u: (m, d).
+      jitter: (m, H, a) added to the actions.
+      nthread: threads.
+
+    Returns:
+      nan for a simulation that comes apart.
+    """
+    kind, m = machine.kind, len(u)
+    ground, seed, hard = (window[f"terrain_{k}"][0].item() for k in ("kind", "seed", "difficulty"))
+    maps = [made(machine.terrain_kinds[ground], seed, hard, kind.terrain_scale)] if machine.rough else []
+    sims = machine.simulations(m, nthread, maps)
+    robot, view, batch = sims.robot, sims.view, sims.batch
+    sims.begin(np.arange(m), {"psi": machine.space.low + u * (machine.space.high - machine.space.low)})
+    # Whatever of the task is in the states (a target, a goal) is the same for all psi.
+    view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
+    batch.state[...] = window["start"]
+    view.now = robot.derive(view)
+    out = [np.concatenate(robot.proprio(view), -1)]
+    for action, noise in zip(window["actions"][0].astype(np.float64), np.moveaxis(jitter, 1, 0), strict=True):
+        commanded = np.tile(action, (m, 1))
+        view.ctrl[...] = robot.actuate(np.clip(action + noise, -1, 1), view)
+        step(sims, np.ones(m, bool), kind.frame_skip)
+        view.task.update(robot.advance(view, commanded))
+        view.before, view.now = view.now, robot.derive(view)
+        out.append(np.concatenate(robot.proprio(view), -1))
+    states = np.stack(out, 1)
+    with np.errstate(invalid="ignore"):
+        states[..., machine.angles] = np.unwrap(states[..., machine.angles], axis=1)
+    states = states[:, 1:].reshape(m, -1)
+    return np.where(np.isfinite(states).all(1, keepdims=True), states, np.nan)
