@@ -9,6 +9,7 @@ from nfc_gym.measured.demo import body_channels
 
 from . import ant, legged, quadcopter, quadruped
 
+
 def quadcopter_mapping(weighed: float) -> str:
     """The chassis was weighed; four arms and four mounts of one make.
 

@@ -13,8 +13,9 @@ from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.model import compile_model, read_spec, registered
-from nfc_gym.measured.problem import Problem, RolloutProblem
+from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.segments import Layout, servos
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, estimate_states
 from nfc_gym.physics.effects import complete_inertia, propose
 from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrides

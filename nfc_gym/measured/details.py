@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
-from nfc_gym.measured.problem import RolloutProblem
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.verdict import Models, Verified
 
 Array = NDArray[np.float64]

@@ -16,9 +16,9 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.envelope import Envelope, envelope
 from nfc_gym.measured.motions import patterns
-from nfc_gym.measured.problem import RolloutProblem, interpolate
 from nfc_gym.measured.room import room
 from nfc_gym.measured.segments import resample, servos
+from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import actuator_names
 from nfc_gym.physics.effects.generic import TIME

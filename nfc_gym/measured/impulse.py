@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.instant import InstantProblem, still
 from nfc_gym.measured.metric import Metric
-from nfc_gym.measured.problem import Problem, RolloutProblem
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param
 from nfc_gym.physics.effects.law import Law
 from nfc_gym.physics.rollout import Plant

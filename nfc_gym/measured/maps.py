@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from nfc_gym.measured.instant import InstantProblem
 from nfc_gym.measured.laws import Scanned
-from nfc_gym.measured.problem import Problem, RolloutProblem
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.verdict import Verified
 from nfc_gym.physics.effects.base import Array
 from nfc_gym.physics.effects.law import degrees, turns

@@ -16,8 +16,8 @@ from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.export import unpack
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
-from nfc_gym.measured.problem import RolloutProblem, interpolate
 from nfc_gym.measured.segments import Layout, servos
+from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]

@@ -4,7 +4,7 @@ A score test with secants: delay, dry friction and saturation have no useful der
 realistic sizes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 

@@ -1,7 +1,7 @@
 """Cutting logs into segments: starts, commands on the grid of physics steps, and where the samples fall on it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -156,6 +156,40 @@ def lay(
         condition=np.array([logs[i].condition for i in where.log]),
         past=Past(_Backwards(model, tuple(logs), tuple(states), where, layout), np.arange(len(where.log))),
     )
+
+
+def _map(segments: Segments, rows, qpos: Array, qvel: Array, past: Past | None) -> Segments:
+    return replace(
+        segments,
+        qpos=qpos,
+        qvel=qvel,
+        ctrl=rows(segments.ctrl),
+        exogenous={k: rows(v) for k, v in segments.exogenous.items()},
+        known={k: rows(v) for k, v in segments.known.items()},
+        servo=[(law, {n: rows(v) for n, v in terms.items()}) for law, terms in segments.servo],
+        past=past,
+    )
+
+
+def pick(segments: Segments, index: NDArray[np.intp]) -> Segments:
+    """Some of the segments."""
+    past = segments.past and segments.past.pick(index)
+    picked = _map(segments, lambda a: a[index], segments.qpos[index], segments.qvel[index], past)
+    return picked if segments.condition is None else replace(picked, condition=segments.condition[index])
+
+
+def repeat(segments: Segments, n: int, qpos: Array, qvel: Array) -> Segments:
+    """The segments n times over, from other starts: (n S, nq) and (n S, nv)."""
+    past = segments.past and segments.past.repeat(n)
+    many = _map(segments, lambda a: np.concatenate([a] * n), qpos, qvel, past)
+    return many if segments.condition is None else replace(many, condition=np.tile(segments.condition, n))
+
+
+def refine(segments: Segments) -> Segments:
+    """The same segments on a grid of half the step; commands are held, as on the coarse grid."""
+    past = segments.past and segments.past.refine()
+    fine = _map(segments, lambda a: np.repeat(a, 2, axis=1), segments.qpos, segments.qvel, past)
+    return replace(fine, dt=segments.dt / 2, history=2 * segments.history, settle=2 * segments.settle)
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import pytest
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.fit import Fit, box, fit, jacobian, uncertainty
 from nfc_gym.measured.metric import Metric, loss, metric
-from nfc_gym.measured.problem import RolloutProblem
 from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant

@@ -10,10 +10,10 @@ from hidden_laws import BLOCK, CRAFT, STEP, WHEEL, Machine, Push, hover, nothing
 
 from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.fit import Fit
-from nfc_gym.measured.problem import RolloutProblem
 from nfc_gym.measured.remainder import LawSearch, Remainder
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import Scales, build, complete_inertia, propose
 from nfc_gym.physics.effects.law import Law

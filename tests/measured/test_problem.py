@@ -11,8 +11,8 @@ from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.metric import metric
-from nfc_gym.measured.problem import RolloutProblem, interpolate
 from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant

@@ -9,9 +9,9 @@ from nfc_gym.core import Channel, Log
 from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.fit import fit
 from nfc_gym.measured.lookout import Lookout
-from nfc_gym.measured.problem import RolloutProblem
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects import build

@@ -1,0 +1,307 @@
+"""Multiple shooting: segments of logs rolled out from their measured starts, and the noise that their errors have."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.log import Log
+from nfc_gym.measured.observe import Observer, observer
+from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.measured.segments import Cut, Layout, cut, lay, pick, refine, repeat
+from nfc_gym.measured.states import States, channel_noise
+from nfc_gym.physics.effects.base import overrides
+from nfc_gym.physics.rollout import Plant, Segments, Servo, Trajectory
+from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
+
+Array = NDArray[np.float64]
+_DRAWS = 16  # starts from which the noise where bodies touch is estimated
+
+
+def interpolate(grid: Array, step: Array, quaternion: bool) -> Array:
+    """Values (P, S, K + 1, dim) on the physics grid at steps (S, h), linearly: (P, S, h, dim)."""
+    low = np.clip(np.floor(step + 1e-9).astype(int), 0, grid.shape[2] - 2)
+    part = np.clip(step - low, 0, 1)[None, :, :, None]
+    block = np.arange(grid.shape[1])[:, None]
+    out = grid[:, block, low] * (1 - part) + grid[:, block, low + 1] * part
+    return out / np.linalg.norm(out, axis=-1, keepdims=True) if quaternion else out
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Measured states of a block at n samples.
+
+    Attributes:
+      steps: (n,) physics steps after the block's start, not whole numbers.
+      qpos, qvel: (n, nq), (n, nv).
+      straight: (nq,) coordinates that are known and add plainly (no quaternions).
+      observed: (nv,) degrees of freedom that were measured.
+    """
+
+    steps: Array
+    qpos: Array
+    qvel: Array
+    straight: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Kit:
+    """What a roll-out problem is made of, kept to lay it out again at another time step."""
+
+    model: mujoco.MjModel
+    logs: tuple[Log, ...]
+    states: tuple[States, ...]
+    layout: Layout
+    servos: Mapping[str, Servo]
+    linear: frozenset[str]
+    settle: bool
+
+
+class RolloutProblem(Problem):
+    """Segments that start at measured states; states are compared at several horizons."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        logs: Sequence[Log],
+        states: Sequence[States],
+        layout: Layout,
+        servos: Mapping[str, Servo] | None = None,
+        linear: frozenset[str] = frozenset(),
+        settle: bool = False,
+    ) -> None:
+        where = cut(logs, layout)
+        self._kit = _Kit(model, tuple(logs), tuple(states), layout, servos or {}, linear, settle)
+        self._observers = [o for key, c in logs[0].channels.items() if (o := observer(model, key, c.axes)) is not None]
+        self.names = tuple(log.name for log in logs)
+        apart = model.geom_bodyid[:, None] != model.geom_bodyid
+        self.rough = bool((apart & ((model.geom_contype[:, None] & model.geom_conaffinity) != 0)).any())
+        self._place(where, None)
+
+    def _place(self, where: Cut, measured: list[Array] | None) -> None:
+        kit = self._kit
+        self._where, self.log_of = where, where.log
+        self.time_of = np.array([kit.logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)])
+        segments = lay(kit.model, kit.logs, kit.states, where, kit.layout, kit.servos, kit.linear)
+        self.segments = replace(segments, settle=round(0.5 / kit.layout.dt) if kit.settle else 0)
+        self._start_sd = [
+            np.stack([getattr(kit.states[i], name)[s] for i, s in zip(where.log, where.start, strict=True)])
+            for name in ("qpos_sd", "qvel_sd")
+        ]
+
+        def rows(log: Log, name: str, at: NDArray[np.intp]) -> Array:
+            channel = log.channels[name]
+            values = channel.values.reshape(len(log), -1)[at]
+            return values if channel.mask is None else np.where(channel.mask[at][:, None], values, np.nan)
+
+        def take(o: Observer) -> Array:
+            return np.stack([rows(kit.logs[i], o.name, n) for i, n in zip(where.log, where.samples, strict=True)])
+
+        self._measured = measured if measured is not None else [take(o) for o in self._observers]
+        noise = [np.array([channel_noise(log, o.name) for log in kit.logs])[where.log] for o in self._observers]
+        horizons = len(kit.layout.horizons)
+        self._noise = np.concatenate(
+            [np.repeat(n[:, None], horizons * o.size, 1) for n, o in zip(noise, self._observers, strict=True)], 1
+        )
+        self.mask = np.isfinite(
+            np.concatenate(
+                [self._flat(o.difference(m, m), o) for m, o in zip(self._measured, self._observers, strict=True)], -1
+            )
+        )
+        self.columns = self._describe()
+
+    @staticmethod
+    def _flat(difference: Array, o: Observer) -> Array:
+        return difference.reshape(*difference.shape[:-2], -1)
+
+    def _describe(self) -> Columns:
+        group, unit, horizon, place = [], [], [], []
+        for o in self._observers:
+            for h in self._kit.layout.horizons:
+                for _ in range(o.size):
+                    group.append(o.group)
+                    unit.append(o.unit)
+                    horizon.append(h)
+                    place.append(o.place)
+        return Columns(tuple(group), tuple(unit), np.array(horizon), tuple(place))
+
+    def stretches(self) -> list[Stretch]:
+        """The measured states along each block."""
+        kit, out = self._kit, []
+        straight = np.zeros(kit.model.nq, bool)
+        observed, known = kit.states[0].observed, np.any(kit.states[0].qpos_sd > 0, axis=0)
+        for j in range(kit.model.njnt):
+            q, d, kind = int(kit.model.jnt_qposadr[j]), int(kit.model.jnt_dofadr[j]), int(kit.model.jnt_type[j])
+            if kind == int(mujoco.mjtJoint.mjJNT_FREE):  # of a base whose velocity alone is measured no place is known
+                straight[q : q + 3] = known[d : d + 3]
+            elif kind >= int(mujoco.mjtJoint.mjJNT_SLIDE):  # a joint's measured speed is integrated
+                straight[q] = observed[d]
+        for i, start in zip(self._where.log, self._where.start, strict=True):
+            time = kit.logs[i].time
+            last = int(np.searchsorted(time, time[start] + self.segments.steps * self.segments.dt)) + 1
+            rows = slice(start, last)
+            states = kit.states[i]
+            steps = (time[rows] - time[start]) / self.segments.dt
+            out.append(Stretch(steps, states.qpos[rows], states.qvel[rows], straight, observed))
+        return out
+
+    @property
+    def observers(self) -> list[Observer]:
+        """The compared channels, in the order of the columns."""
+        return self._observers
+
+    def samples(self, channel: int) -> tuple[Array, Array]:
+        """The first block's compared samples of a channel: (h,) physics steps after the start and (h, dim) values."""
+        there = np.isfinite(self._measured[channel][0]).all(1)
+        return self._where.step[0][there], self._measured[channel][0][there]
+
+    def predict(
+        self, plant: Plant, x: Array, segments: Segments, observers: Sequence[Observer]
+    ) -> tuple[list[Array], Trajectory]:
+        """What each channel would report along a roll-out, (P, S, K + 1, dim) each, sensor effects included."""
+        plant, x = plant.under(x, segments.condition)
+        traj = plant.shoot(x, segments, sensors=any(o.needs_sensors for o in observers))
+        thetas = plant.split(x)[1]
+        out = []
+        for o in observers:
+            values = o.predict(traj)
+            for effect, theta in zip(plant.effects, thetas, strict=True):
+                if overrides(effect, "sense"):
+                    values = effect.sense(o.name, values, theta[:, None, :] if theta.ndim == 2 else theta, segments.dt)
+            out.append(o.pick(values))
+        return out, traj
+
+    def _compare(
+        self,
+        plant: Plant,
+        x: Array,
+        segments: Segments,
+        measured: Sequence[Array],
+        step: Array,
+        mask: NDArray[np.bool_],
+    ) -> Array:
+        values, traj = self.predict(plant, x, segments, self._observers)
+        parts = [
+            self._flat(o.difference(interpolate(v, step, o.quaternion), m), o)
+            for o, v, m in zip(self._observers, values, measured, strict=True)
+        ]
+        residual = np.where(mask, np.concatenate(parts, -1), 0.0)
+        return np.where(traj.stable[..., None], residual, np.nan)
+
+    def residual(self, plant: Plant, x: Array) -> Array:
+        """See `Problem`."""
+        return self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
+
+    def covariance(self, plant: Plant, x: Array) -> Array:
+        """Sensor noise, start-state noise carried through the roll-out, and the discretisation's own error.
+
+        Where bodies touch neither is a straight line: a foot that lands a step sooner or later makes an error in a
+        direction of its own. There both are taken over starts drawn from their noise: with one direction for the
+        discretisation, X of the true model of a trotting quadruped is 3 at a step of 5 ms, and with `_DRAWS` it is 1.
+        """
+        size, width = len(self), len(self.columns)
+        sigma = np.zeros((size, width, width))
+        sigma[:, np.arange(width), np.arange(width)] = np.where(self.mask, self._noise**2, 1.0)
+        base = self.residual(plant, x[None])[0]
+        carried = self._carried(plant, x, base)
+        if self.rough:
+            moved, discretised = self._drawn(plant, x, base)
+            carried = np.concatenate([carried, moved]) * np.sqrt(0.5)  # two estimates of one covariance: their mean
+        else:
+            discretised = (self._halved(plant, x, self.segments) - base) / self._reach(plant)
+        for column in (*carried, *discretised):
+            column = np.where(np.isfinite(column), column, 0.0)
+            sigma += column[:, :, None] * column[:, None, :]
+        return sigma
+
+    @staticmethod
+    def _reach(plant: Plant) -> float:
+        """Share of a step's whole error that halving it shows: of a first-order integrator, half."""
+        order = 4 if plant.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else 1
+        return 1 - 0.5**order
+
+    def _drawn(self, plant: Plant, x: Array, base: Array) -> tuple[Array, Array]:
+        """Columns (D, S, m) of start-state noise and of the discretisation's error, from starts drawn at random."""
+        rng = np.random.default_rng(len(self))
+        dq, dv = (np.concatenate([rng.normal(size=sd.shape) * sd for _ in range(_DRAWS)]) for sd in self._start_sd)
+        repeated = repeat(
+            self.segments,
+            _DRAWS,
+            integrate(self._kit.model, np.concatenate([self.segments.qpos] * _DRAWS), dq),
+            np.concatenate([self.segments.qvel] * _DRAWS) + dv,
+        )
+        coarse = self._again(plant, x, repeated, _DRAWS)
+        fine = self._halved(plant, x, repeated, _DRAWS)
+        return (coarse - base) / np.sqrt(_DRAWS), (fine - coarse) / self._reach(plant) / np.sqrt(_DRAWS)
+
+    def _carried(self, plant: Plant, x: Array, base: Array) -> Array:
+        """(n, S, m) change of the residual for one standard deviation of each of n start coordinates."""
+        model, seg = self._kit.model, self.segments
+        directions = [(kind, d) for kind in (0, 1) for d in range(model.nv) if (self._start_sd[kind][:, d] > 0).any()]
+        if not directions:
+            return np.zeros((0, *base.shape))
+        starts_q, starts_v = [], []
+        for kind, d in directions:
+            step = np.zeros((len(self), model.nv))
+            step[:, d] = self._start_sd[kind][:, d]
+            starts_q.append(integrate(model, seg.qpos, step) if kind == 0 else seg.qpos)
+            starts_v.append(seg.qvel + step if kind == 1 else seg.qvel)
+        n = len(directions)
+        return self._again(plant, x, repeat(seg, n, np.concatenate(starts_q), np.concatenate(starts_v)), n) - base
+
+    def _again(self, plant: Plant, x: Array, segments: Segments, copies: int, finer: int = 1) -> Array:
+        """(copies, S, m) residual of copies of the segments with other starts, at a step so many times finer."""
+        measured = [np.concatenate([m] * copies) for m in self._measured]
+        step, mask = np.concatenate([self._where.step * finer] * copies), np.concatenate([self.mask] * copies)
+        return self._compare(plant, x[None], segments, measured, step, mask)[0].reshape(copies, len(self), -1)
+
+    def _halved(self, plant: Plant, x: Array, segments: Segments, copies: int = 1) -> Array:
+        """The same with the physics step halved."""
+        return self._again(_finer(plant), x, refine(segments), copies, finer=2)
+
+    def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
+        """See `Problem`."""
+        out = object.__new__(RolloutProblem)
+        out.__dict__.update(self.__dict__)
+        w = self._where
+        out._where = Cut(w.log[index], w.start[index], w.samples[index], w.step[index])
+        out.log_of, out.time_of = self.log_of[index], self.time_of[index]
+        out.segments = pick(self.segments, index)
+        out._start_sd = [s[index] for s in self._start_sd]
+        out._measured = [m[index] for m in self._measured]
+        out._noise, out.mask = self._noise[index], self.mask[index]
+        return out
+
+    def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "RolloutProblem":
+        """The model's own motion from the measured starts at half the step, with fresh start and sensor noise."""
+        values, traj = self.predict(_finer(plant), x[None], refine(self.segments), self._observers)
+        out = self.take(np.flatnonzero(traj.stable[0]))
+        stable, step = traj.stable[0], self._where.step * 2
+        measured = []
+        at = 0
+        for o, v, m in zip(self._observers, values, self._measured, strict=True):
+            clean = interpolate(v, step, o.quaternion)[0]
+            width = m.shape[1] * o.size
+            noise = rng.normal(size=(*m.shape[:2], o.size)) * self._noise[:, at : at + width].reshape(
+                *m.shape[:2], o.size
+            )
+            noisy = quat_multiply(clean, vector_to_quat(noise)) if o.quaternion else clean + noise
+            measured.append(noisy[stable])
+            at += width
+        dq, dv = (rng.normal(size=sd.shape) * sd for sd in out._start_sd)
+        out._measured = measured
+        out.segments = replace(
+            out.segments, qpos=integrate(self._kit.model, out.segments.qpos, dq), qvel=out.segments.qvel + dv
+        )
+        return out
+
+
+def _finer(plant: Plant) -> Plant:
+    """The same plant with half the physics step."""
+    model = copy.copy(plant.model)
+    model.opt.timestep = plant.model.opt.timestep / 2
+    return Plant(model, plant.space, plant.effects, plant.nthread)
