@@ -1,0 +1,136 @@
+"""The conditional score model of psi and delta_s: an adaLN residual network that predicts v of `diffusion`."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from nfc_gym.inference.heads import diffusion
+from nfc_gym.inference.heads.density import Density
+
+_WAVES = 8
+_ROOM = 2**24  # numbers that one chunk of `log_prob` may hold in a hidden layer's derivatives
+
+
+def time_features(phi: Tensor) -> Tensor:
+    """(..., 32) waves of the angle and of its log signal-to-noise ratio, from which a network reads phi at any scale."""
+    scales = 2.0 ** torch.arange(_WAVES, device=phi.device, dtype=phi.dtype)
+    ratio = phi.tan().clamp(1e-4, 1e4).log()[..., None] * scales / 32
+    phase = torch.cat([phi[..., None] * scales, ratio], -1)
+    return torch.cat([phase.sin(), phase.cos()], -1)
+
+
+class Block(nn.Module):
+    """A residual block whose normalisation the condition scales, shifts and gates (adaLN-zero: Peebles and Xie 2023)."""
+
+    def __init__(self, hidden: int, dropout: float) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(hidden, elementwise_affine=False)
+        self.path = nn.Sequential(
+            nn.Linear(hidden, hidden), nn.SiLU(), nn.Dropout(dropout), nn.Linear(hidden, hidden)
+        )  # fmt: skip
+        self.modulate = nn.Linear(hidden, 3 * hidden)
+        nn.init.zeros_(self.modulate.weight)
+        nn.init.zeros_(self.modulate.bias)
+
+    def forward(self, h: Tensor, condition: Tensor) -> Tensor:
+        """The shape of h; the condition is broadcast against it."""
+        shift, scale, gate = self.modulate(condition).chunk(3, -1)
+        return h + gate * self.path(self.norm(h) * (1 + scale) + shift)
+
+
+class Score(Density):
+    """A diffusion posterior of the blocks, all noised at the same time.
+
+    With more than one block, half of the training draws see the first block alone (the others absent and flagged so),
+    so that one network holds the joint density of (psi, delta_s) and that of psi, both exactly evaluated.
+    The output is a network's plus a linear map of each coordinate, a(c, phi) x + b(c, phi): of a Gaussian posterior v is
+    linear, and the network is left with what is not. All of it starts at 0, which is the prior.
+
+    Args:
+      sizes: width of each block.
+      features: F.
+      hidden: width of the layers.
+      depth: number of residual blocks.
+      dropout: in the blocks, while training.
+      draws: noise draws for each point and step; the encoder runs once for all of them.
+    """
+
+    def __init__(
+        self, sizes: Sequence[int], features: int, hidden: int = 256, depth: int = 4, dropout: float = 0.0, draws: int = 4
+    ) -> None:  # fmt: skip
+        super().__init__(sizes, features)
+        self.draws, self.hidden = draws, hidden
+        d = sum(sizes)
+        self.condition = nn.Sequential(nn.Linear(features, hidden), nn.SiLU(), nn.Linear(hidden, hidden))
+        self.time = nn.Sequential(nn.Linear(4 * _WAVES, hidden), nn.SiLU(), nn.Linear(hidden, hidden))
+        self.present = nn.Linear(len(sizes), hidden, bias=False)
+        self.first = nn.Linear(d, hidden)
+        self.blocks = nn.ModuleList([Block(hidden, dropout) for _ in range(depth)])
+        self.last = nn.Linear(hidden, d)
+        self.affine = nn.Linear(hidden, 2 * d)
+        for layer in (self.last, self.affine):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        starts = torch.cat([torch.full((s,), i) for i, s in enumerate(sizes)])
+        self.register_buffer("block_of", starts, persistent=False)
+
+    def v(self, x: Tensor, phi: Tensor, condition: Tensor, blocks: Tensor) -> Tensor:
+        """v (..., d) at x; phi and the number of present blocks are broadcast against x's leading axes."""
+        here = (self.block_of < blocks[..., None]).to(x.dtype)  # type: ignore[operator]
+        flags = (torch.arange(len(self.sizes), device=x.device) < blocks[..., None]).to(x.dtype)
+        c = nn.functional.silu(condition + self.time(time_features(phi)) + self.present(flags))
+        x = x * here
+        h = self.first(x)
+        for block in self.blocks:
+            h = block(h, c)
+        slope, offset = self.affine(c).chunk(2, -1)
+        return (self.last(nn.functional.silu(h)) + slope * x + offset) * here
+
+    def loss(self, x: Tensor, features: Tensor) -> Tensor:
+        """(B,) mean square error of v, over noise at stratified angles."""
+        b = len(x)
+        x = x.repeat_interleave(self.draws, 1)
+        n = x.shape[1]
+        strata = (torch.randperm(b * n, device=x.device).view(b, n) + torch.rand(b, n, device=x.device)) / (b * n)
+        phi = diffusion.FLOOR + (diffusion.MOST - diffusion.FLOOR) * strata.pow(1.5)
+        blocks = torch.full((b, n), len(self.sizes), device=x.device)
+        if len(self.sizes) > 1:
+            blocks[torch.rand(b, n, device=x.device) < 0.5] = 1
+        noise = torch.randn_like(x)
+        c, s = phi.cos()[..., None], phi.sin()[..., None]
+        guess = self.v(c * x + s * noise, phi, self.condition(features)[:, None], blocks)
+        wrong = (guess - (c * noise - s * x)).square() * (self.block_of < blocks[..., None])  # type: ignore[operator]
+        return wrong.sum(-1).mean(1) / x.shape[-1]
+
+    def field(self, features: Tensor, blocks: int | None) -> diffusion.Field:
+        """v as a function of x (B, n, width of the blocks) and one angle."""
+        condition = self.condition(features)[:, None]
+        count = torch.tensor(len(self.sizes) if blocks is None else blocks, device=features.device)
+        width, rest = self.width(blocks), self.width(None) - self.width(blocks)
+
+        def field(x: Tensor, phi: Tensor) -> Tensor:
+            return self.v(nn.functional.pad(x, (0, rest)), phi, condition, count)[..., :width]
+
+        return field
+
+    def sample(
+        self, n: int, features: Tensor, blocks: int | None = None, *, steps: int = 10, stochastic: bool = False
+    ) -> Tensor:  # fmt: skip
+        """(B, n, width) draws by the ODE, or by the reverse SDE in ten times the steps."""
+        noise = torch.randn(len(features), n, self.width(blocks), device=features.device)
+        field = self.field(features, blocks)
+        if stochastic:
+            return diffusion.reverse_sde(field, noise, 10 * steps)
+        return diffusion.flow(field, noise, steps)
+
+    def log_prob(self, x: Tensor, features: Tensor, blocks: int | None = None, *, steps: int = 20) -> Tensor:
+        """(B, n) log density by the ODE."""
+        chunk = max(1, _ROOM // (x.shape[1] * x.shape[2] * self.hidden))
+        rows = [
+            diffusion.log_density(self.field(f, blocks), part, steps)
+            for part, f in zip(x.split(chunk), features.split(chunk), strict=True)
+        ]
+        return torch.cat(rows)
+
+

@@ -1,0 +1,191 @@
+"""`Network`: encoder and heads on their scales, built from plain configuration."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.inference.data import Batch
+from nfc_gym.inference.encoders import Joined, Regressions
+from nfc_gym.inference.encoders.base import TINY, Standard
+from nfc_gym.inference.heads.density import Chain, Density
+from nfc_gym.inference.heads.flow import Flow
+from nfc_gym.inference.heads.mixture import Mixture
+from nfc_gym.inference.heads.score import Score
+from nfc_gym.inference.heads.structure import Structure
+from nfc_gym.inference.random import seeded
+from nfc_gym.inference.space import EDGE, PriorBox
+
+DENSITIES = ("score", "mixture", "flow")
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """What is built; the defaults are the paper's "SDE + TCN".
+
+    Attributes:
+      encoder: of the motion: tcn, nn, qmc-rff, qmc-fks, or none.
+      density: of (psi, delta_s): score, mixture or flow.
+      width: of the layers of the encoder `nn`.
+      summaries: physics summaries beside the encoder.
+      elevation: the elevation map beside the encoder.
+      delta_s: infer the residual dynamics too.
+      families: names of the families of effects, the first "none", where a structure head is wanted.
+      features: width of the layer that the encoders' features are mapped to; 0 hands them on as they are.
+      hidden: width of the heads' layers.
+      depth: residual blocks of the score model, transforms of the flow.
+      dropout: in the score model's blocks.
+      draws: noise draws a window and step, of the score model.
+      components: of the mixture.
+    """
+
+    encoder: str = "tcn"
+    density: str = "score"
+    width: int = 1024
+    summaries: bool = False
+    elevation: bool = False
+    delta_s: bool = False
+    families: tuple[str, ...] = ()
+    features: int = 1024
+    hidden: int = 256
+    depth: int = 4
+    dropout: float = 0.0
+    draws: int = 4
+    components: int = 8
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "families", tuple(self.families))
+        if self.density not in DENSITIES:
+            raise InputError(f"no density named {self.density!r}; there are: {', '.join(DENSITIES)}")
+        if len(self.families) == 1:
+            raise InputError(f"structure head: two families or more, the first 'none', got {self.families}")
+        for name in ("hidden", "depth", "draws", "components"):
+            if getattr(self, name) < 1:
+                raise InputError(f"network: {name} must be 1 or more, got {getattr(self, name)}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values that JSON holds."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a window: `horizon` H steps, `states` s, `actions` a; `layout` of joints, for the physics summaries."""
+
+    horizon: int
+    states: int
+    actions: int
+    layout: Mapping[str, Any] | None = None
+
+    @classmethod
+    def of(cls, batch: Batch, layout: Mapping[str, Any] | None = None) -> "Sizes":
+        """Those of a batch of windows."""
+        actions = batch["actions"]
+        return cls(actions.shape[1], batch["states"].shape[2], actions.shape[2], layout)
+
+
+class Network(nn.Module):
+    """From a window to densities over what made it.
+
+    Args:
+      config: what to build.
+      sizes: of a window.
+      prior: psi's box.
+      seed: of the initial weights.
+
+    Attributes:
+      blocks: names of what the density is over: psi, and delta_s where it is inferred.
+    """
+
+    varies: Tensor
+
+    def __init__(self, config: NetworkConfig, sizes: Sizes, prior: PriorBox, seed: int = 0) -> None:
+        super().__init__()
+        self.config, self.sizes, self.prior = config, sizes, prior
+        self.blocks = ("psi", "delta_s") if config.delta_s else ("psi",)
+        with seeded(seed):
+            plan = Regressions.of(sizes.layout, sizes.states, sizes.actions) if config.summaries else None
+            self.encoder = Joined(
+                config.encoder, sizes.horizon, sizes.states, sizes.actions, width=config.width,
+                summaries=config.summaries, regressions=plan, elevation=config.elevation,
+            )  # fmt: skip
+            width = config.features or self.encoder.features
+            self.project = nn.Linear(self.encoder.features, width) if config.features else nn.Identity()
+            self.delta_scale = Standard(sizes.states)
+            self.register_buffer("varies", torch.ones(sizes.states, dtype=torch.bool))
+            self.density = self._density(width)
+            self.structure = Structure(width, len(config.families), config.hidden) if config.families else None
+
+    def _density(self, features: int) -> Density:
+        c = self.config
+        widths = [self.prior.size, self.sizes.states][: len(self.blocks)]
+        if c.density == "score":
+            return Score(widths, features, c.hidden, c.depth, c.dropout, c.draws)
+        if c.density == "mixture":
+            return Chain(widths, features, partial(Mixture, hidden=c.hidden, components=c.components))
+        return Chain(widths, features, partial(Flow, hidden=c.hidden, transforms=c.depth))
+
+    @torch.no_grad()
+    def fit_scales(self, batch: Batch) -> None:
+        """Take scales of inputs and of delta_s from windows of the training set.
+
+        Raises:
+          InputError: the windows are of other sizes than the network, or lack what it infers.
+        """
+        self.require(batch)
+        self.encoder.fit(batch["states"], batch["actions"], batch.get("map"))
+        if self.config.delta_s:
+            self.delta_scale.fit(batch["delta_s"])
+            flat = batch["delta_s"]
+            self.varies.copy_(flat.std(0, correction=0) > TINY * (1 + flat.mean(0).abs()))
+
+    def require(self, batch: Batch) -> None:
+        """Refuse windows that are not this network's.
+
+        Raises:
+          InputError: see `fit_scales`.
+        """
+        got, want = Sizes.of(batch), self.sizes
+        for name in ("horizon", "states", "actions"):
+            if getattr(got, name) != getattr(want, name):
+                raise InputError(f"windows: {name} is {getattr(got, name)}, the network's is {getattr(want, name)}")
+        if batch["psi"].shape[1] != len(self.prior):
+            raise InputError(
+                f"windows: psi has {batch['psi'].shape[1]} entries; the prior of {self.prior.robot!r} has "
+                f"{len(self.prior)}: {', '.join(self.prior.names)}"
+            )
+        for name, wanted in (
+            ("delta_s", self.config.delta_s), ("map", self.config.elevation), ("family", self.structure is not None)
+        ):  # fmt: skip
+            if wanted and name not in batch:
+                raise InputError(f"windows: the network needs {name!r}; the set has: {', '.join(batch)}")
+        if self.config.delta_s and batch["delta_s"].shape[1] != want.states:
+            raise InputError(f"windows: delta_s has {batch['delta_s'].shape[1]} entries, states have {want.states}")
+
+    def encode(self, states: Tensor, actions: Tensor, elevation: Tensor | None = None) -> Tensor:
+        """Features (B, F) of windows as logged."""
+        return self.project(self.encoder(states, actions, elevation))
+
+    def targets(self, batch: Batch) -> Tensor:
+        """(B, D) what the density is over: z of the free psi, then the standardised delta_s.
+
+        Entries of delta_s that never vary in training are N(0, 1) noise here, and come back as the constant they are.
+        """
+        free = torch.tensor(self.prior.free, device=batch["psi"].device)
+        parts = [torch.special.ndtri(batch["psi"][:, free].clamp(EDGE, 1 - EDGE))]
+        if self.config.delta_s:
+            scaled = self.delta_scale(batch["delta_s"])
+            parts.append(torch.where(self.varies, scaled, torch.randn_like(scaled)))
+        return torch.cat(parts, 1)
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Mean loss of each head over a batch; their sum is what training brings down."""
+        features = self.encode(batch["states"], batch["actions"], batch.get("map"))
+        out = {"density": self.density.loss(self.targets(batch)[:, None], features).mean()}
+        if self.structure is not None:
+            out["structure"] = cast(Structure, self.structure).loss(batch["family"], features).mean()
+        return out
