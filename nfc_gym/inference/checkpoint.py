@@ -7,21 +7,20 @@ from typing import Any
 
 import torch
 from safetensors.torch import save_file
-from torch import Tensor
 
 from nfc_gym import __version__
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
-from nfc_gym.inference.network import Network, NetworkConfig, Sizes
+from nfc_gym.inference.network import Encoded, Network, NetworkConfig, Sizes
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.state import read
 
 FORMAT = "nfc_gym-posterior-1"
-GIVEN = "given/features"  # the encoded window, in the file of a posterior that was given one
+GIVEN = "given/"  # before the names of the encoded window's tensors, in the file of a posterior that was given one
 
 
-def save(path: Path, network: Network, *, given: Tensor | None = None, notes: dict[str, Any] | None = None) -> None:
-    """Write a network; with `given` (1, F), also the features of the window that its posterior was given.
+def save(path: Path, network: Network, *, given: Encoded | None = None, notes: dict[str, Any] | None = None) -> None:
+    """Write a network; with `given`, also what is kept of the window that its posterior was given.
 
     Args:
       path: ends in `.safetensors`.
@@ -37,14 +36,14 @@ def save(path: Path, network: Network, *, given: Tensor | None = None, notes: di
     }  # fmt: skip
     tensors = {k: t.detach().cpu().contiguous().clone() for k, t in network.state_dict().items()}
     if given is not None:
-        tensors[GIVEN] = given.detach().cpu().contiguous()
+        tensors |= {GIVEN + k: t.detach().cpu().contiguous() for k, t in given._asdict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part:
         save_file(tensors, part, {"format": FORMAT, "about": json.dumps(about)})
 
 
-def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Tensor | None, dict[str, Any]]:
-    """A network, the features of the window it was given (or None), and the notes kept beside it.
+def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | None, dict[str, Any]]:
+    """A network, what is kept of the window it was given (or None), and the notes kept beside it.
 
     Args:
       path: of the file.
@@ -66,10 +65,10 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Tensor | N
         raise InputError(f"{path}: its metadata describe no network that this version knows ({e})") from None
     if prior is not None:
         prior.require_same(own, str(path))
-    given = tensors.pop(GIVEN, None)
+    kept = {k.removeprefix(GIVEN): tensors.pop(k) for k in list(tensors) if k.startswith(GIVEN)}
     network = Network(config, sizes, own)
     try:
         network.load_state_dict(tensors)
     except RuntimeError as e:
         raise InputError(f"{path}: its weights are not those of the network that it describes ({e})") from None
-    return network.eval(), given, about["notes"]
+    return network.eval(), Encoded(**kept) if kept else None, about["notes"]

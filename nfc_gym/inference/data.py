@@ -8,10 +8,12 @@ A batch is a dict of named tensors with a leading axis of windows:
   family   (B,) int16, index of the injected effect's family, 0 for none (where the structure head is trained)
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nfc_gym.core.errors import InputError
@@ -20,11 +22,11 @@ Batch = dict[str, Tensor]
 _AXES = {"states": 3, "actions": 3, "psi": 2, "delta_s": 2, "delta_e": 3, "map": 3, "family": 1}
 
 
-class Windows(Protocol):
+class WindowSet(Protocol):
     """A set of windows to train on, wherever it lies."""
 
     @property
-    def manifest(self) -> Mapping[str, Any]:
+    def manifest(self) -> Any:
         """What is known of the whole set."""
         ...
 
@@ -61,7 +63,7 @@ class TensorWindows:
         return len(self.tensors["psi"])
 
     def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
-        """See `Windows.batches`."""
+        """See `WindowSet.batches`."""
         order = torch.arange(len(self))
         if seed is not None:
             order = order[torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))]
@@ -83,6 +85,35 @@ class TensorWindows:
     def to(self, device: str | torch.device) -> "TensorWindows":
         """The same on another device."""
         return TensorWindows({k: t.to(device) for k, t in self.tensors.items()}, self.manifest)
+
+
+class StoredWindows:
+    """Some rows of a stored set, read as they are needed: numpy batches made tensors.
+
+    Args:
+      stored: has `manifest`, a length and `batches(size, seed, rows, names)`, which gives dicts of arrays.
+      rows: (k,) which windows; default all.
+      names: which arrays; default those that training knows.
+    """
+
+    def __init__(self, stored: Any, rows: NDArray[np.integer] | None = None, names: Sequence[str] = ()) -> None:
+        self.stored, self.manifest = stored, stored.manifest
+        self.rows = np.arange(len(stored)) if rows is None else rows
+        self.names = tuple(names) or tuple(n for n in stored.names if n in _AXES)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
+        """See `WindowSet.batches`; None is an order of its own, the same each time."""
+        for arrays in self.stored.batches(size, 0 if seed is None else seed, self.rows, self.names):
+            yield {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+
+    def split(self, share: float) -> tuple["StoredWindows", "StoredWindows"]:
+        """The first windows, and the last `share` of them: to train on and to hold out."""
+        cut = len(self) - max(1, round(share * len(self)))
+        first, last = (StoredWindows(self.stored, rows, self.names) for rows in (self.rows[:cut], self.rows[cut:]))
+        return first, last
 
 
 def require_batch(tensors: Batch) -> None:

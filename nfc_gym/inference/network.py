@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,7 @@ from nfc_gym.inference.heads.flow import Flow
 from nfc_gym.inference.heads.mixture import Mixture
 from nfc_gym.inference.heads.score import Score
 from nfc_gym.inference.heads.structure import Structure
+from nfc_gym.inference.linear import LinearBase
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import EDGE, PriorBox
 
@@ -33,6 +34,8 @@ class NetworkConfig:
       width: of the layers of the encoder `nn`.
       summaries: physics summaries beside the encoder.
       elevation: the elevation map beside the encoder.
+      linear: densities start from what a ridge regression tells (`LinearBase`): on the physics summaries where they are
+        on, else on the window itself. False starts from the prior.
       delta_s: infer the residual dynamics too.
       families: names of the families of effects, the first "none", where a structure head is wanted.
       features: width of the layer that the encoders' features are mapped to; 0 hands them on as they are.
@@ -48,6 +51,7 @@ class NetworkConfig:
     width: int = 1024
     summaries: bool = False
     elevation: bool = False
+    linear: bool = False
     delta_s: bool = False
     families: tuple[str, ...] = ()
     features: int = 1024
@@ -88,6 +92,13 @@ class Sizes:
         return cls(actions.shape[1], batch["states"].shape[2], actions.shape[2], layout)
 
 
+class Encoded(NamedTuple):
+    """What a network keeps of B windows: `features` (B, F), and the linear base's `mean` (B, D), else zeros."""
+
+    features: Tensor
+    mean: Tensor
+
+
 class Network(nn.Module):
     """From a window to densities over what made it.
 
@@ -118,6 +129,8 @@ class Network(nn.Module):
             self.delta_scale = Standard(sizes.states)
             self.register_buffer("varies", torch.ones(sizes.states, dtype=torch.bool))
             self.density = self._density(width)
+            size = self.density.width(None)
+            self.base = LinearBase(self.encoder.fixed_size, size) if config.linear else None
             self.structure = Structure(width, len(config.families), config.hidden) if config.families else None
 
     def _density(self, features: int) -> Density:
@@ -142,6 +155,8 @@ class Network(nn.Module):
             self.delta_scale.fit(batch["delta_s"])
             flat = batch["delta_s"]
             self.varies.copy_(flat.std(0, correction=0) > TINY * (1 + flat.mean(0).abs()))
+        if self.base is not None:
+            self.base.fit(self.encoder.fixed(batch["states"], batch["actions"]), self.targets(batch))
 
     def require(self, batch: Batch) -> None:
         """Refuse windows that are not this network's.
@@ -166,9 +181,24 @@ class Network(nn.Module):
         if self.config.delta_s and batch["delta_s"].shape[1] != want.states:
             raise InputError(f"windows: delta_s has {batch['delta_s'].shape[1]} entries, states have {want.states}")
 
-    def encode(self, states: Tensor, actions: Tensor, elevation: Tensor | None = None) -> Tensor:
-        """Features (B, F) of windows as logged."""
-        return self.project(self.encoder(states, actions, elevation))
+    def encode(self, states: Tensor, actions: Tensor, elevation: Tensor | None = None) -> Encoded:
+        """What is kept of windows as logged."""
+        features = self.project(self.encoder(states, actions, elevation))
+        if self.base is None:
+            return Encoded(features, states.new_zeros(len(states), self.density.width(None)))
+        return Encoded(features, self.base(self.encoder.fixed(states, actions)))
+
+    def sample(self, n: int, given: Encoded, blocks: int | None = None, **how: Any) -> Tensor:
+        """(B, n, width of the first `blocks` blocks) draws of what `targets` are; `how` goes to the density."""
+        y = self.density.sample(n, given.features, blocks, **how)
+        return y if self.base is None else self.base.colour(y, given.mean[:, None])
+
+    def log_prob(self, x: Tensor, given: Encoded, blocks: int | None = None, **how: Any) -> Tensor:
+        """(B, n) log density at x (B, n, width of the first `blocks` blocks)."""
+        if self.base is None:
+            return self.density.log_prob(x, given.features, blocks, **how)
+        y = self.base.whiten(x, given.mean[:, None])
+        return self.density.log_prob(y, given.features, blocks, **how) - self.base.log_scale(x.shape[-1])
 
     def targets(self, batch: Batch) -> Tensor:
         """(B, D) what the density is over: z of the free psi, then the standardised delta_s.
@@ -184,8 +214,10 @@ class Network(nn.Module):
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Mean loss of each head over a batch; their sum is what training brings down."""
-        features = self.encode(batch["states"], batch["actions"], batch.get("map"))
-        out = {"density": self.density.loss(self.targets(batch)[:, None], features).mean()}
+        given = self.encode(batch["states"], batch["actions"], batch.get("map"))
+        x = self.targets(batch)
+        y = x if self.base is None else self.base.whiten(x, given.mean)
+        out = {"density": self.density.loss(y[:, None], given.features).mean()}
         if self.structure is not None:
-            out["structure"] = cast(Structure, self.structure).loss(batch["family"], features).mean()
+            out["structure"] = cast(Structure, self.structure).loss(batch["family"], given.features).mean()
         return out

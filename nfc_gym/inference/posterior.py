@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.posterior import register_loader
 from nfc_gym.inference import checkpoint
-from nfc_gym.inference.network import Network
+from nfc_gym.inference.network import Encoded, Network
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import PriorBox
 
@@ -46,12 +45,12 @@ class NeuralPosterior:
 
     Args:
       network: trained.
-      features: (1, F) of the window it was given.
+      kept: of the window it was given, one row.
       notes: kept in its file.
     """
 
-    def __init__(self, network: Network, features: Tensor | None = None, notes: dict[str, Any] | None = None) -> None:
-        self.network, self.features, self.notes = network.eval(), features, dict(notes or {})
+    def __init__(self, network: Network, kept: Encoded | None = None, notes: dict[str, Any] | None = None) -> None:
+        self.network, self.kept, self.notes = network.eval(), kept, dict(notes or {})
 
     @property
     def prior(self) -> PriorBox:
@@ -67,11 +66,11 @@ class NeuralPosterior:
         """
         states, actions, elevation = self._checked(window)
         device = next(self.network.parameters()).device
-        features = self.network.encode(
+        kept = self.network.encode(
             *(torch.as_tensor(x, dtype=torch.float32, device=device)[None] for x in (states, actions)),
             None if elevation is None else torch.as_tensor(elevation, dtype=torch.float32, device=device)[None],
         )
-        return NeuralPosterior(self.network, features, self.notes)
+        return NeuralPosterior(self.network, kept, self.notes)
 
     def _checked(self, window: Window) -> tuple[Array, Array, Array | None]:
         size = self.network.sizes
@@ -96,12 +95,12 @@ class NeuralPosterior:
                 raise InputError(f"window: {name} holds {x[~np.isfinite(x)][0]:g}; every entry must be finite")
         return states, actions, elevation
 
-    def _window(self) -> Tensor:
-        if self.features is None:
+    def _window(self) -> Encoded:
+        if self.kept is None:
             raise InputError(
                 f"the posterior of {self.prior.robot!r} was given no window: use posterior.given(Window(states, actions))"
             )
-        return self.features
+        return self.kept
 
     @torch.no_grad()
     def sample(self, n: int, rng: np.random.Generator, **how: Any) -> Fidelity:
@@ -109,10 +108,10 @@ class NeuralPosterior:
 
         `how` goes to the density: `steps=` and `stochastic=True` of a score model.
         """
-        features = self._window()
+        kept = self._window()
         with seeded(rng):
             parts = [
-                self.network.density.sample(min(_ROWS, n - at), features, **how)[0] for at in range(0, n, _ROWS)
+                self.network.sample(min(_ROWS, n - at), kept, **how)[0] for at in range(0, n, _ROWS)
             ]  # fmt: skip
         x = torch.cat(parts).double().cpu().numpy() if parts else np.empty((0, self.network.density.width(None)))
         psi = self.prior.from_z(x[:, : self.prior.size])
@@ -137,7 +136,7 @@ class NeuralPosterior:
         Raises:
           InputError: x has no psi, holds what this network does not infer, or was not given a window.
         """
-        features = self._window()
+        kept = self._window()
         if x.psi is None:
             raise InputError("log_prob: the density is of psi, or of psi and delta_s together; x has no psi")
         extra = [p for p in x.given if p not in self.network.blocks]
@@ -155,9 +154,8 @@ class NeuralPosterior:
             points.append(np.where(varies, scaled, 0.0))
             # a constant entry is N(0, 1) noise to the network, taken out at 0 again
             change = change - np.log(spread[varies]).sum() + (~varies).sum() * np.log(2 * np.pi) / 2
-        at = torch.as_tensor(np.concatenate(points, 1), dtype=torch.float32, device=features.device)
-        blocks = len(points)
-        value = self.network.density.log_prob(at[:, None], features.expand(len(at), -1), blocks, **how)[:, 0]
+        at = torch.as_tensor(np.concatenate(points, 1), dtype=torch.float32, device=kept.mean.device)
+        value = self.network.log_prob(at[None], kept, len(points), **how)[0]
         return np.where(((u < 0) | (u > 1)).any(1), -np.inf, value.double().cpu().numpy() + change)
 
     @torch.no_grad()
@@ -169,17 +167,17 @@ class NeuralPosterior:
         """
         if self.network.structure is None:
             raise InputError("this network was trained without a structure head")
-        shares = self.network.structure(self._window())[0].tolist()
+        shares = self.network.structure(self._window().features)[0].tolist()
         return dict(zip(self.network.config.families, shares, strict=True))
 
     def to(self, device: str | torch.device) -> "NeuralPosterior":
         """The same on another device; the network moves."""
-        features = None if self.features is None else self.features.to(device)
+        features = None if self.kept is None else self.features.to(device)
         return NeuralPosterior(self.network.to(device), features, self.notes)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a checkpoint that `load` and `load_source` open; a given window is kept as its features."""
-        checkpoint.save(Path(path), self.network, given=self.features, notes=self.notes)
+        """Write a checkpoint that `load` and `load_source` open; of a given window what is kept of it."""
+        checkpoint.save(Path(path), self.network, given=self.kept, notes=self.notes)
 
 
 def load(path: str | os.PathLike[str], prior: PriorBox | None = None) -> NeuralPosterior:

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.inference.data import Batch, Windows
+from nfc_gym.inference.data import Batch, WindowSet
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.random import mixed, seeded
 from nfc_gym.inference.state import load_state, save_state
 
-_SCALE_WINDOWS = 8192  # windows from which the scales of inputs are taken
+_SCALE_WINDOWS = 16384  # windows from which the scales of inputs are taken
 _EVALUATION = 2**20  # stands for "held-out" in seeds, where training uses step numbers
 
 
@@ -65,21 +65,23 @@ class Outcome:
 
     Attributes:
       train: mean loss of each epoch.
+      start: held-out loss before the first step.
       held_out: held-out loss of each epoch, of the averaged weights.
-      best: epoch whose weights were kept.
+      best: epoch whose weights were kept, counted from 1; 0 is the start: training found nothing that generalises.
       stopped: why it ended: "epochs", "patience" or "diverged".
       seconds: that it took, the time before an interruption included.
     """
 
     train: list[float] = field(default_factory=list)
     held_out: list[float] = field(default_factory=list)
-    best: int = -1
+    start: float = math.nan
+    best: int = 0
     stopped: str = ""
     seconds: float = 0.0
 
 
 def train(
-    network: Network, windows: Windows, held_out: Windows, config: TrainConfig | None = None, *,
+    network: Network, windows: WindowSet, held_out: WindowSet, config: TrainConfig | None = None, *,
     folder: Path | None = None, device: str | torch.device = "cpu", report: Report = quiet,
 ) -> Outcome:  # fmt: skip
     """Train a network in place; it ends with the averaged weights of the best epoch.
@@ -121,7 +123,7 @@ class _Run:
     """A training run's whole state. All randomness is a function of (seed, step), so nothing else need be saved."""
 
     def __init__(
-        self, network: Network, windows: Windows, held_out: Windows, config: TrainConfig, device: torch.device
+        self, network: Network, windows: WindowSet, held_out: WindowSet, config: TrainConfig, device: torch.device
     ) -> None:  # fmt: skip
         if not len(windows) or not len(held_out):
             raise InputError(f"training: {len(windows)} windows to train on and {len(held_out)} held out; want both")
@@ -149,13 +151,15 @@ class _Run:
     def loop(self, file: Path | None, report: Report) -> None:
         """Steps, evaluations and saved states until an end is reached."""
         began, saved = monotonic() - self.outcome.seconds, monotonic()
+        if math.isnan(self.outcome.start):
+            self.outcome.start = self.evaluate()
         while not self.outcome.stopped:
             for batch in self.rest_of_epoch():
                 if not self.learn(batch):
                     self.outcome.stopped = "diverged"
                     report.message(
                         f"the loss diverged at step {self.step} of {self.total}: the weights of epoch "
-                        f"{self.outcome.best + 1} are kept; a smaller rate than {self.config.rate:g} may help"
+                        f"{self.outcome.best} are kept; a smaller rate than {self.config.rate:g} may help"
                     )
                     break
                 if file is not None and monotonic() - saved > self.config.save_every:
@@ -221,18 +225,18 @@ class _Run:
 
     def end_epoch(self, report: Report) -> None:
         """Compare, keep the best, and see whether it is over."""
-        out, epoch = self.outcome, len(self.outcome.train)
+        out = self.outcome
         out.train.append(self.loss_sum / self.epoch_steps)
         out.held_out.append(self.evaluate())
-        self.loss_sum = 0.0
+        self.loss_sum, epoch = 0.0, len(out.train)
         if not math.isfinite(out.held_out[-1]):
             out.stopped = "diverged"
-            report.message(f"the held-out loss of epoch {epoch + 1} is not finite: epoch {out.best + 1} is kept")
+            report.message(f"the held-out loss of epoch {epoch} is not finite: the weights of epoch {out.best} are kept")
             return
-        if out.best < 0 or out.held_out[-1] < out.held_out[out.best]:
+        if out.held_out[-1] < (out.held_out[out.best - 1] if out.best else out.start):
             out.best = epoch
             self.best.load_state_dict(self.average.state_dict())
-        report.epoch(epoch + 1, self.config.epochs, out.train[-1], out.held_out[-1])
+        report.epoch(epoch, self.config.epochs, out.train[-1], out.held_out[-1])
         if self.step >= self.total:
             out.stopped = "epochs"
         elif epoch - out.best >= self.config.patience:

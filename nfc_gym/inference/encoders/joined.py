@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.inference.encoders.base import Encoder
+from nfc_gym.inference.encoders.base import Encoder, SignalEncoder
 from nfc_gym.inference.encoders.kernels import FKS, RFF
 from nfc_gym.inference.encoders.mlp import MLP
 from nfc_gym.inference.encoders.resnet import ResNet18
@@ -48,8 +48,13 @@ class Joined(Encoder):
             parts.append(ENCODERS[name](horizon, states, actions))
         parts += [Summaries(horizon, states, actions, regressions)] if summaries else []
         parts += [ResNet18()] if elevation else []
-        if not parts:
-            raise InputError("an encoder 'none' needs summaries or a map beside it")
+        if name == "none" and not summaries:
+            raise InputError("an encoder 'none' needs summaries beside it")
+        self.summaries = next((p for p in parts if isinstance(p, Summaries)), None)
+        self.signals = next((p.signals for p in parts if isinstance(p, SignalEncoder)), None)
+        self.fixed_size = (
+            self.summaries.features if self.summaries else self.signals.channels * (horizon + 1) if self.signals else 0
+        )
         self.parts = nn.ModuleList(parts)
         self.elevation = elevation
         self.features = sum(p.features for p in parts)
@@ -68,3 +73,10 @@ class Joined(Encoder):
         if self.elevation and elevation is None:
             raise InputError("this network was trained with an elevation map: give one with every window")
         return torch.cat([part(states, actions, elevation) for part in self.parts], 1)
+
+    def fixed(self, states: Tensor, actions: Tensor) -> Tensor:
+        """(B, fixed_size) what no training changes: the summaries where they are on, else the window's signals."""
+        if self.summaries is not None:
+            return self.summaries(states, actions)
+        assert self.signals is not None  # the constructor refuses an encoder of neither
+        return self.signals(states, actions).flatten(1)

@@ -126,11 +126,6 @@ class Score(Density):
 
     def log_prob(self, x: Tensor, features: Tensor, blocks: int | None = None, *, steps: int = 20) -> Tensor:
         """(B, n) log density by the ODE."""
-        chunk = max(1, _ROOM // (x.shape[1] * x.shape[2] * self.hidden))
-        rows = [
-            diffusion.log_density(self.field(f, blocks), part, steps)
-            for part, f in zip(x.split(chunk), features.split(chunk), strict=True)
-        ]
-        return torch.cat(rows)
-
-
+        chunk = max(1, _ROOM // (x.shape[0] * x.shape[2] * self.hidden))
+        field = self.field(features, blocks)
+        return torch.cat([diffusion.log_density(field, part, steps) for part in x.split(chunk, 1)], 1)
