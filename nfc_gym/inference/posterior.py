@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
-from nfc_gym.core.posterior import register_loader
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.network import Encoded, Network
 from nfc_gym.inference.random import seeded
@@ -183,6 +182,3 @@ class NeuralPosterior:
 def load(path: str | os.PathLike[str], prior: PriorBox | None = None) -> NeuralPosterior:
     """Open a posterior's checkpoint; with `prior`, one of another robot or prior is refused (see `checkpoint.load`)."""
     return NeuralPosterior(*checkpoint.load(Path(path), prior))
-
-
-register_loader(".safetensors", load)

@@ -43,7 +43,9 @@ class Spoken:
     def epoch(self, done: int, of: int, train: float, held_out: float) -> None:
         """One line."""
         end = "\r" if self.console.is_terminal and done < of else "\n"
-        self.console.print(f"epoch {done:4}/{of}  loss {train:9.4f}  held out {held_out:9.4f}", end=end, highlight=False)
+        self.console.print(
+            f"epoch {done:4}/{of}  loss {train:9.4f}  held out {held_out:9.4f}", end=end, highlight=False
+        )
 
     def message(self, text: str) -> None:
         """One line."""

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
@@ -21,7 +20,7 @@ from nfc_gym.inference.data import Batch, TensorWindows
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
-from nfc_gym.inference.space import EDGE, PriorBox
+from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
 
 Array = NDArray[np.float64]
@@ -197,7 +196,3 @@ def _simulated(prior: PriorBox, simulate: Simulator, psi: Array, rng: np.random.
     batch: dict[str, Any] = dict(simulate(psi, rng))
     batch["psi"] = torch.as_tensor(prior.u_of(psi), dtype=torch.float32).clamp(0, 1)
     return TensorWindows(batch)
-
-
-def _probit_edges(u: Array) -> Array:
-    return ndtri(np.clip(u, EDGE, 1 - EDGE))

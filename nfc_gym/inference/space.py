@@ -82,7 +82,9 @@ class PriorBox:
         try:
             return cls(**{k: v if k == "robot" else tuple(v) for k, v in data.items()})
         except TypeError as e:
-            raise InputError(f"this is no description of a prior ({e}); it has {', '.join(cls.__match_args__)}") from None
+            raise InputError(
+                f"this is no description of a prior ({e}); it has {', '.join(cls.__match_args__)}"
+            ) from None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values that JSON holds."""

@@ -231,7 +231,9 @@ class _Run:
         self.loss_sum, epoch = 0.0, len(out.train)
         if not math.isfinite(out.held_out[-1]):
             out.stopped = "diverged"
-            report.message(f"the held-out loss of epoch {epoch} is not finite: the weights of epoch {out.best} are kept")
+            report.message(
+                f"the held-out loss of epoch {epoch} is not finite: the weights of epoch {out.best} are kept"
+            )
             return
         if out.held_out[-1] < (out.held_out[out.best - 1] if out.best else out.start):
             out.best = epoch

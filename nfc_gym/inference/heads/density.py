@@ -71,7 +71,9 @@ class Chain(Explicit):
         given = features[:, None].expand(b, n, -1).flatten(0, 1)
         total = x.new_zeros(b * n, 1)
         for link, size in zip(self.links[:blocks], self.sizes, strict=False):
-            total = total + cast(Density, link).log_prob(rows[..., at : at + size], torch.cat([given, rows[:, 0, :at]], 1))
+            total = total + cast(Density, link).log_prob(
+                rows[..., at : at + size], torch.cat([given, rows[:, 0, :at]], 1)
+            )
             at += size
         return total.view(b, n)
 

@@ -115,7 +115,7 @@ class Score(Density):
         return field
 
     def sample(
-        self, n: int, features: Tensor, blocks: int | None = None, *, steps: int = 10, stochastic: bool = False
+        self, n: int, features: Tensor, blocks: int | None = None, *, steps: int = 15, stochastic: bool = False
     ) -> Tensor:  # fmt: skip
         """(B, n, width) draws by the ODE, or by the reverse SDE in ten times the steps."""
         noise = torch.randn(len(features), n, self.width(blocks), device=features.device)
@@ -124,7 +124,7 @@ class Score(Density):
             return diffusion.reverse_sde(field, noise, 10 * steps)
         return diffusion.flow(field, noise, steps)
 
-    def log_prob(self, x: Tensor, features: Tensor, blocks: int | None = None, *, steps: int = 20) -> Tensor:
+    def log_prob(self, x: Tensor, features: Tensor, blocks: int | None = None, *, steps: int = 16) -> Tensor:
         """(B, n) log density by the ODE."""
         chunk = max(1, _ROOM // (x.shape[0] * x.shape[2] * self.hidden))
         field = self.field(features, blocks)
