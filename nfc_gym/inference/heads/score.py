@@ -1,6 +1,7 @@
 """The conditional score model of psi and delta_s: an adaLN residual network that predicts v of `diffusion`."""
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +11,7 @@ from nfc_gym.inference.heads.density import Density
 
 _WAVES = 8
 _ROOM = 2**24  # numbers that one chunk of `log_prob` may hold in a hidden layer's derivatives
+_WINDOWS = 256  # windows whose modulations are held at once
 
 
 def time_features(phi: Tensor) -> Tensor:
@@ -33,9 +35,9 @@ class Block(nn.Module):
         nn.init.zeros_(self.modulate.weight)
         nn.init.zeros_(self.modulate.bias)
 
-    def forward(self, h: Tensor, condition: Tensor) -> Tensor:
-        """The shape of h; the condition is broadcast against it."""
-        shift, scale, gate = self.modulate(condition).chunk(3, -1)
+    def forward(self, h: Tensor, modulation: Tensor) -> Tensor:
+        """The shape of h; the modulation (three times as wide) is broadcast against it."""
+        shift, scale, gate = modulation.chunk(3, -1)
         return h + gate * self.path(self.norm(h) * (1 + scale) + shift)
 
 
@@ -75,17 +77,24 @@ class Score(Density):
         starts = torch.cat([torch.full((s,), i) for i, s in enumerate(sizes)])
         self.register_buffer("block_of", starts, persistent=False)
 
-    def v(self, x: Tensor, phi: Tensor, condition: Tensor, blocks: Tensor) -> Tensor:
-        """v (..., d) at x; phi and the number of present blocks are broadcast against x's leading axes."""
-        here = (self.block_of < blocks[..., None]).to(x.dtype)  # type: ignore[operator]
-        flags = (torch.arange(len(self.sizes), device=x.device) < blocks[..., None]).to(x.dtype)
+    def modulations(self, phi: Tensor, condition: Tensor, blocks: Tensor) -> tuple[Tensor, ...]:
+        """What the window, the angle and the number of present blocks make of each layer; all three are broadcast."""
+        flags = (torch.arange(len(self.sizes), device=phi.device) < blocks[..., None]).to(phi.dtype)
         c = nn.functional.silu(condition + self.time(time_features(phi)) + self.present(flags))
+        return (*(cast(Block, b).modulate(c) for b in self.blocks), self.affine(c))
+
+    def v(self, x: Tensor, here: Tensor, modulations: Sequence[Tensor]) -> Tensor:
+        """v (..., d) at x; `here` is 1 for entries of blocks that are present."""
         x = x * here
         h = self.first(x)
-        for block in self.blocks:
-            h = block(h, c)
-        slope, offset = self.affine(c).chunk(2, -1)
+        for block, modulation in zip(self.blocks, modulations, strict=False):
+            h = block(h, modulation)
+        slope, offset = modulations[-1].chunk(2, -1)
         return (self.last(nn.functional.silu(h)) + slope * x + offset) * here
+
+    def here(self, blocks: Tensor) -> Tensor:
+        """(..., d) 1 for entries of the first `blocks` blocks, else 0."""
+        return (cast(Tensor, self.block_of) < blocks[..., None]).float()
 
     def loss(self, x: Tensor, features: Tensor) -> Tensor:
         """(B,) mean square error of v, over noise at stratified angles."""
@@ -99,33 +108,47 @@ class Score(Density):
             blocks[torch.rand(b, n, device=x.device) < 0.5] = 1
         noise = torch.randn_like(x)
         c, s = phi.cos()[..., None], phi.sin()[..., None]
-        guess = self.v(c * x + s * noise, phi, self.condition(features)[:, None], blocks)
-        wrong = (guess - (c * noise - s * x)).square() * (self.block_of < blocks[..., None])  # type: ignore[operator]
+        here = self.here(blocks)
+        modulations = self.modulations(phi, self.condition(features)[:, None], blocks)
+        wrong = (self.v(c * x + s * noise, here, modulations) - (c * noise - s * x)).square() * here
         return wrong.sum(-1).mean(1) / x.shape[-1]
 
-    def field(self, features: Tensor, blocks: int | None) -> diffusion.Field:
-        """v as a function of x (B, n, width of the blocks) and one angle."""
+    def field(self, features: Tensor, blocks: int | None) -> diffusion.On:
+        """v on a grid of angles, as a function of x (B, n, width of the blocks)."""
         condition = self.condition(features)[:, None]
         count = torch.tensor(len(self.sizes) if blocks is None else blocks, device=features.device)
+        here = self.here(count)
         width, rest = self.width(blocks), self.width(None) - self.width(blocks)
 
-        def field(x: Tensor, phi: Tensor) -> Tensor:
-            return self.v(nn.functional.pad(x, (0, rest)), phi, condition, count)[..., :width]
+        def on(grid: Tensor) -> diffusion.Field:
+            every = self.modulations(grid[:, None, None], condition, count)  # (angles, B, 1, ...)
 
-        return field
+            def field(x: Tensor, i: int) -> Tensor:
+                return self.v(nn.functional.pad(x, (0, rest)), here, [m[i] for m in every])[..., :width]
+
+            return field
+
+        return on
 
     def sample(
         self, n: int, features: Tensor, blocks: int | None = None, *, steps: int = 15, stochastic: bool = False
     ) -> Tensor:  # fmt: skip
         """(B, n, width) draws by the ODE, or by the reverse SDE in ten times the steps."""
-        noise = torch.randn(len(features), n, self.width(blocks), device=features.device)
-        field = self.field(features, blocks)
-        if stochastic:
-            return diffusion.reverse_sde(field, noise, 10 * steps)
-        return diffusion.flow(field, noise, steps)
+        out = []
+        for part in features.split(_WINDOWS):
+            noise = torch.randn(len(part), n, self.width(blocks), device=features.device)
+            field = self.field(part, blocks)
+            drawn = diffusion.reverse_sde(field, noise, 10 * steps) if stochastic else diffusion.flow(field, noise, steps)
+            out.append(drawn)
+        return torch.cat(out)
 
     def log_prob(self, x: Tensor, features: Tensor, blocks: int | None = None, *, steps: int = 16) -> Tensor:
         """(B, n) log density by the ODE."""
-        chunk = max(1, _ROOM // (x.shape[0] * x.shape[2] * self.hidden))
-        field = self.field(features, blocks)
-        return torch.cat([diffusion.log_density(field, part, steps) for part in x.split(chunk, 1)], 1)
+        each = x.shape[2] * self.hidden  # numbers in one hidden layer's derivatives at one point
+        points = max(1, min(x.shape[1], _ROOM // each))
+        rows = max(1, min(_WINDOWS, _ROOM // (each * points)))
+        out = []
+        for part, some in zip(x.split(rows), features.split(rows), strict=True):
+            field = self.field(some, blocks)
+            out.append(torch.cat([diffusion.log_density(field, p, steps) for p in part.split(points, 1)], 1))
+        return torch.cat(out)
