@@ -37,8 +37,9 @@ from nfc_gym.inference.train import TrainConfig, train
 
 Array = NDArray[np.float64]
 GOALS = {"linear_gaussian_5": 0.52, "linear_gaussian_10": 0.52, "two_moons": 0.53, "slcp": 0.66}
-NETWORK = NetworkConfig(encoder="nn", width=256, features=0, hidden=256, depth=4, draws=4)
-TRAINING = TrainConfig(epochs=300, batch=256, rate=1e-3, patience=40)
+NETWORK = NetworkConfig(encoder="nn", width=128, features=0, hidden=128, depth=4, draws=2)
+TRAINING = TrainConfig(epochs=100, batch=128, rate=1e-3, patience=25)
+STEPS = 20  # of the score model's sampler
 
 
 def windows_of(task: Task, n: int, seed: int) -> TensorWindows:
@@ -83,7 +84,8 @@ def known(table: Table, task: Task, density: str, linear: bool, args: argparse.N
         each, wrong = [], []
         for x, truth in zip(observed, exact, strict=True):
             given = posterior.given(seen(x))
-            drawn = given.sample(args.samples, np.random.default_rng(seed)).psi
+            how = {"steps": STEPS} if density == "score" else {}
+            drawn = given.sample(args.samples, np.random.default_rng(seed), **how).psi
             each.append(c2st(truth, drawn))
             if isinstance(task, LinearGaussian):
                 wrong.append((given.log_prob(Fidelity(truth[:500])) - task.log_prob(truth[:500], x)).mean())

@@ -36,7 +36,7 @@ def save(path: Path, network: Network, *, given: Encoded | None = None, notes: d
     }  # fmt: skip
     tensors = {k: t.detach().cpu().contiguous().clone() for k, t in network.state_dict().items()}
     if given is not None:
-        tensors |= {GIVEN + k: t.detach().cpu().contiguous() for k, t in given._asdict().items()}
+        tensors |= {GIVEN + k: t.detach().cpu().contiguous() for k, t in given._asdict().items() if t is not None}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part:
         save_file(tensors, part, {"format": FORMAT, "about": json.dumps(about)})

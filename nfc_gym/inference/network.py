@@ -17,6 +17,7 @@ from nfc_gym.inference.heads.flow import Flow
 from nfc_gym.inference.heads.mixture import Mixture
 from nfc_gym.inference.heads.score import Score
 from nfc_gym.inference.heads.structure import Structure
+from nfc_gym.inference.heads.terrain import CELLS, Terrain
 from nfc_gym.inference.linear import LinearBase
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import EDGE, PriorBox
@@ -37,6 +38,7 @@ class NetworkConfig:
       linear: densities start from what a ridge regression tells (`LinearBase`): on the physics summaries where they are
         on, else on the window itself. False starts from the prior.
       delta_s: infer the residual dynamics too.
+      delta_e: infer the residual terrain too; needs `elevation` and the score model.
       families: names of the families of effects, the first "none", where a structure head is wanted.
       features: width of the layer that the encoders' features are mapped to; 0 hands them on as they are.
       hidden: width of the heads' layers.
@@ -53,6 +55,7 @@ class NetworkConfig:
     elevation: bool = False
     linear: bool = False
     delta_s: bool = False
+    delta_e: bool = False
     families: tuple[str, ...] = ()
     features: int = 1024
     hidden: int = 256
@@ -65,6 +68,9 @@ class NetworkConfig:
         object.__setattr__(self, "families", tuple(self.families))
         if self.density not in DENSITIES:
             raise InputError(f"no density named {self.density!r}; there are: {', '.join(DENSITIES)}")
+        if self.delta_e and not (self.elevation and self.density == "score"):
+            raise InputError("network: delta_e is inferred from an elevation map, by the score model: "
+                             f"want elevation=True, density='score', got {self.elevation}, {self.density!r}")
         if len(self.families) == 1:
             raise InputError(f"structure head: two families or more, the first 'none', got {self.families}")
         for name in ("hidden", "depth", "draws", "components"):
@@ -93,10 +99,14 @@ class Sizes:
 
 
 class Encoded(NamedTuple):
-    """What a network keeps of B windows: `features` (B, F), and the linear base's `mean` (B, D), else zeros."""
+    """What a network keeps of B windows: `features` (B, F), and the linear base's `mean` (B, D), else zeros.
+
+    `elevation` (B, 128, 128) is the scaled map, where delta_e is inferred.
+    """
 
     features: Tensor
     mean: Tensor
+    elevation: Tensor | None = None
 
 
 class Network(nn.Module):
@@ -110,6 +120,7 @@ class Network(nn.Module):
 
     Attributes:
       blocks: names of what the density is over: psi, and delta_s where it is inferred.
+      parts: those, and delta_e where it is sampled too.
     """
 
     varies: Tensor
@@ -118,6 +129,7 @@ class Network(nn.Module):
         super().__init__()
         self.config, self.sizes, self.prior = config, sizes, prior
         self.blocks = ("psi", "delta_s") if config.delta_s else ("psi",)
+        self.parts = (*self.blocks, "delta_e") if config.delta_e else self.blocks
         with seeded(seed):
             plan = Regressions.of(sizes.layout, sizes.states, sizes.actions) if config.summaries else None
             self.encoder = Joined(
@@ -130,6 +142,8 @@ class Network(nn.Module):
             self.register_buffer("varies", torch.ones(sizes.states, dtype=torch.bool))
             self.density = self._density(width)
             size = self.density.width(None)
+            self.terrain = Terrain(width, size, config.hidden) if config.delta_e else None
+            self.map_scales = nn.ModuleList([Standard(1), Standard(1)] if config.delta_e else [])
             self.base = LinearBase(self.encoder.fixed_size, size) if config.linear else None
             self.structure = Structure(width, len(config.families), config.hidden) if config.families else None
 
@@ -155,6 +169,9 @@ class Network(nn.Module):
             self.delta_scale.fit(batch["delta_s"])
             flat = batch["delta_s"]
             self.varies.copy_(flat.std(0, correction=0) > TINY * (1 + flat.mean(0).abs()))
+        if self.terrain is not None:
+            for scale, name in zip(self.map_scales, ("map", "delta_e"), strict=True):
+                cast(Standard, scale).fit(batch[name][..., None])
         if self.base is not None:
             self.base.fit(self.encoder.fixed(batch["states"], batch["actions"]), self.targets(batch))
 
@@ -174,24 +191,39 @@ class Network(nn.Module):
                 f"{len(self.prior)}: {', '.join(self.prior.names)}"
             )
         for name, wanted in (
-            ("delta_s", self.config.delta_s), ("map", self.config.elevation), ("family", self.structure is not None)
+            ("delta_s", self.config.delta_s), ("map", self.config.elevation), ("family", self.structure is not None),
+            ("delta_e", self.config.delta_e),
         ):  # fmt: skip
             if wanted and name not in batch:
                 raise InputError(f"windows: the network needs {name!r}; the set has: {', '.join(batch)}")
         if self.config.delta_s and batch["delta_s"].shape[1] != want.states:
             raise InputError(f"windows: delta_s has {batch['delta_s'].shape[1]} entries, states have {want.states}")
+        for name in ("map", "delta_e") if self.config.elevation else ():
+            if name in batch and batch[name].shape[1:] != (CELLS, CELLS):
+                raise InputError(f"windows: {name} has shape {tuple(batch[name].shape)}, want (n, {CELLS}, {CELLS})")
 
     def encode(self, states: Tensor, actions: Tensor, elevation: Tensor | None = None) -> Encoded:
         """What is kept of windows as logged."""
         features = self.project(self.encoder(states, actions, elevation))
+        seen = None
+        if self.terrain is not None and elevation is not None:
+            seen = self.map_scales[0](elevation[..., None])[..., 0].clamp(-10, 10)
         if self.base is None:
-            return Encoded(features, states.new_zeros(len(states), self.density.width(None)))
-        return Encoded(features, self.base(self.encoder.fixed(states, actions)))
+            return Encoded(features, states.new_zeros(len(states), self.density.width(None)), seen)
+        return Encoded(features, self.base(self.encoder.fixed(states, actions)), seen)
 
     def sample(self, n: int, given: Encoded, blocks: int | None = None, **how: Any) -> Tensor:
         """(B, n, width of the first `blocks` blocks) draws of what `targets` are; `how` goes to the density."""
         y = self.density.sample(n, given.features, blocks, **how)
         return y if self.base is None else self.base.colour(y, given.mean[:, None])
+
+    def sample_terrain(self, n: int, given: Encoded, **how: Any) -> tuple[Tensor, Tensor]:
+        """Joint draws given one window: (n, D) of what `targets` are, and delta_e (n, 128, 128) in m."""
+        assert self.terrain is not None  # the caller has asked whether delta_e is inferred
+        assert given.elevation is not None
+        y, m = self.terrain.sample(n, given.features, given.elevation, cast(Score, self.density), **how)
+        x = y if self.base is None else self.base.colour(y, given.mean)
+        return x, cast(Standard, self.map_scales[1]).inverse(m[..., None])[..., 0]
 
     def log_prob(self, x: Tensor, given: Encoded, blocks: int | None = None, **how: Any) -> Tensor:
         """(B, n) log density at x (B, n, width of the first `blocks` blocks)."""
@@ -218,6 +250,10 @@ class Network(nn.Module):
         x = self.targets(batch)
         y = x if self.base is None else self.base.whiten(x, given.mean)
         out = {"density": self.density.loss(y[:, None], given.features).mean()}
+        if self.terrain is not None and given.elevation is not None:
+            m = self.map_scales[1](batch["delta_e"][..., None])[..., 0]
+            score = cast(Score, self.density)
+            out["terrain"] = self.terrain.loss(y, m, given.features, given.elevation, score).mean()
         if self.structure is not None:
             out["structure"] = cast(Structure, self.structure).loss(batch["family"], given.features).mean()
         return out

@@ -17,7 +17,7 @@ from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import PriorBox
 
 Array = NDArray[np.float64]
-_ROWS = 65536  # samples that are drawn in one batch
+_ROWS, _MAPS = 65536, 64  # samples that are drawn in one batch, without maps and with
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,14 @@ class NeuralPosterior:
       network: trained.
       kept: of the window it was given, one row.
       notes: kept in its file.
+      parts: of a fidelity that its draws speak of; default all that the network infers.
     """
 
-    def __init__(self, network: Network, kept: Encoded | None = None, notes: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self, network: Network, kept: Encoded | None = None, notes: dict[str, Any] | None = None,
+        parts: tuple[str, ...] = (),
+    ) -> None:  # fmt: skip
+        self.parts = parts or network.parts
         self.network, self.kept, self.notes = network.eval(), kept, dict(notes or {})
 
     @property
@@ -69,7 +74,7 @@ class NeuralPosterior:
             *(torch.as_tensor(x, dtype=torch.float32, device=device)[None] for x in (states, actions)),
             None if elevation is None else torch.as_tensor(elevation, dtype=torch.float32, device=device)[None],
         )
-        return NeuralPosterior(self.network, kept, self.notes)
+        return NeuralPosterior(self.network, kept, self.notes, self.parts)
 
     def _checked(self, window: Window) -> tuple[Array, Array, Array | None]:
         size = self.network.sizes
@@ -101,23 +106,41 @@ class NeuralPosterior:
             )
         return self.kept
 
+    def of(self, *parts: str) -> "NeuralPosterior":
+        """The same, speaking of some parts alone: psi is drawn in milliseconds, delta_e in seconds.
+
+        Raises:
+          InputError: a part that the network does not infer, or psi is left out.
+        """
+        wrong = [p for p in parts if p not in self.network.parts]
+        if wrong or "psi" not in parts:
+            raise InputError(f"posterior: parts are psi and others of {', '.join(self.network.parts)}, got {parts}")
+        return NeuralPosterior(self.network, self.kept, self.notes, parts)
+
     @torch.no_grad()
     def sample(self, n: int, rng: np.random.Generator, **how: Any) -> Fidelity:
-        """`n` draws of psi in physical units, and of delta_s where it is inferred.
+        """`n` draws of psi in physical units, and of the other `parts`.
 
         `how` goes to the density: `steps=` and `stochastic=True` of a score model.
         """
-        kept = self._window()
+        if n < 1:
+            raise InputError(f"sample: n must be 1 or more, got {n}")
+        kept, maps = self._window(), None
+        blocks = 2 if "delta_s" in self.parts else 1
         with seeded(rng):
-            parts = [
-                self.network.sample(min(_ROWS, n - at), kept, **how)[0] for at in range(0, n, _ROWS)
-            ]  # fmt: skip
-        x = torch.cat(parts).double().cpu().numpy() if parts else np.empty((0, self.network.density.width(None)))
-        psi = self.prior.from_z(x[:, : self.prior.size])
-        if "delta_s" not in self.network.blocks:
-            return Fidelity(psi)
-        mean, spread, varies = self._delta()
-        return Fidelity(psi, mean + np.where(varies, spread * x[:, self.prior.size :], 0.0))
+            if "delta_e" in self.parts:
+                drawn = [self.network.sample_terrain(min(_MAPS, n - at), kept, **how) for at in range(0, n, _MAPS)]
+                x = torch.cat([d[0] for d in drawn])
+                maps = torch.cat([d[1] for d in drawn]).double().cpu().numpy()
+            else:
+                counts = [min(_ROWS, n - at) for at in range(0, n, _ROWS)]
+                x = torch.cat([self.network.sample(k, kept, blocks, **how)[0] for k in counts])
+        x = x.double().cpu().numpy()
+        psi, delta = self.prior.from_z(x[:, : self.prior.size]), None
+        if blocks == 2:
+            mean, spread, varies = self._delta()
+            delta = mean + np.where(varies, spread * x[:, self.prior.size :], 0.0)
+        return Fidelity(psi, delta, maps)
 
     def _delta(self) -> tuple[Array, Array, NDArray[np.bool_]]:
         scale = self.network.delta_scale
