@@ -1,7 +1,7 @@
 """Simulators whose posterior is known in closed form, or can be sampled exactly.
 
-Two moons and SLCP are those of the simulation-based inference benchmark (Lueckmann et al. 2021, appendix T), written from
-its description. Each task says psi's box, simulates, and draws from the posterior of an observation.
+Two moons and SLCP are those of the simulation-based inference benchmark (Lueckmann et al. 2021, appendix T),
+written from its description. Each task says psi's box, simulates, and draws from the posterior of an observation.
 """
 
 from typing import Protocol

@@ -1,1 +1,1 @@
-"""Neural inference of a simulator's fidelity: training data, encoders, posteriors, anomaly detection. No MuJoCo here."""
+"""Neural inference of a simulator's fidelity: data, encoders, posteriors, anomaly detection. No MuJoCo here."""

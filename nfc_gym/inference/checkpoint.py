@@ -11,7 +11,8 @@ from safetensors.torch import save_file
 from nfc_gym import __version__
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
-from nfc_gym.inference.network import Encoded, Network, NetworkConfig, Sizes
+from nfc_gym.inference.config import NetworkConfig, Sizes
+from nfc_gym.inference.network import Encoded, Network
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.state import read
 

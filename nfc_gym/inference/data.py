@@ -135,7 +135,8 @@ def require_batch(tensors: Batch) -> None:
         raise InputError(f"windows: the tensors hold different numbers of windows, or none: {rows}")
     if tensors["states"].shape[1] != tensors["actions"].shape[1] + 1:
         raise InputError(
-            f"windows: H + 1 states go with H actions, got {tensors['states'].shape[1]} and {tensors['actions'].shape[1]}"
+            f"windows: H + 1 states go with H actions, got {tensors['states'].shape[1]} and "
+            f"{tensors['actions'].shape[1]}"
         )
     low, high = float(tensors["psi"].min()), float(tensors["psi"].max())
     if low < 0 or high > 1:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
@@ -70,10 +71,11 @@ class NeuralPosterior:
         """
         states, actions, elevation = self._checked(window)
         device = next(self.network.parameters()).device
-        kept = self.network.encode(
-            *(torch.as_tensor(x, dtype=torch.float32, device=device)[None] for x in (states, actions)),
-            None if elevation is None else torch.as_tensor(elevation, dtype=torch.float32, device=device)[None],
-        )
+
+        def row(x: Array) -> Tensor:
+            return torch.as_tensor(x, dtype=torch.float32, device=device)[None]
+
+        kept = self.network.encode(row(states), row(actions), None if elevation is None else row(elevation))
         return NeuralPosterior(self.network, kept, self.notes, self.parts)
 
     def _checked(self, window: Window) -> tuple[Array, Array, Array | None]:
@@ -102,7 +104,8 @@ class NeuralPosterior:
     def _window(self) -> Encoded:
         if self.kept is None:
             raise InputError(
-                f"the posterior of {self.prior.robot!r} was given no window: use posterior.given(Window(states, actions))"
+                f"the posterior of {self.prior.robot!r} was given no window: "
+                "call posterior.given(Window(states, actions))"
             )
         return self.kept
 

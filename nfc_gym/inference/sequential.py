@@ -2,8 +2,8 @@
 
 Each round draws psi from the prior restricted to where the present posterior's density exceeds its own 5e-4 quantile
 (truncated sequential posterior estimation: Deistler et al. 2022; for scores, Sharrock et al. 2024), simulates,
-appends to all earlier rounds and trains on. Inside the truncated region the proposal is proportional to the prior, so the
-loss needs no correction; the posterior of the *given* window stays right, that of others does not.
+appends to all earlier rounds and trains on. Inside the truncated region the proposal is proportional to the prior, so
+the loss needs no correction; the posterior of the *given* window stays right, that of others does not.
 """
 
 from collections.abc import Callable
@@ -84,9 +84,9 @@ class Rounds:
 class TruncatedPrior:
     """The uniform prior, where a posterior's density exceeds a quantile of its own draws' densities.
 
-    Plain rejection from the prior accepts one in e^gain: never, in 37 dimensions. Two ways are tried and the one that is
-    sharper is used: rejection inside the bounding box of the posterior's draws, and importance resampling, where
-    posterior draws above the threshold are resampled with weights prior / posterior.
+    Plain rejection from the prior accepts one in e^gain: never, in 37 dimensions. Rejection inside the bounding box of
+    the posterior's draws is exact and used where it accepts enough; elsewhere posterior draws above the threshold are
+    resampled with weights prior / posterior.
 
     Args:
       posterior: given a window.

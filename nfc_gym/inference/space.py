@@ -70,7 +70,8 @@ class PriorBox:
     @classmethod
     def of(cls, space: Any, robot: str) -> "PriorBox":
         """The box of a `ParameterSpace`, or of anything with its `names`, `units`, `low`, `high`, `nominal`, `free`."""
-        return cls(robot, *(tuple(getattr(space, k)) for k in ("names", "units", "low", "high", "nominal", "free")))
+        parts: dict[str, Any] = {k: getattr(space, k) for k in cls.__match_args__ if k != "robot"}
+        return cls.from_dict({"robot": robot} | parts)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "PriorBox":
@@ -79,8 +80,9 @@ class PriorBox:
         Raises:
           InputError: an entry is missing or unknown.
         """
+        values: dict[str, Any] = {k: v if k == "robot" else tuple(v) for k, v in data.items()}
         try:
-            return cls(**{k: v if k == "robot" else tuple(v) for k, v in data.items()})
+            return cls(**values)
         except TypeError as e:
             raise InputError(
                 f"this is no description of a prior ({e}); it has {', '.join(cls.__match_args__)}"

@@ -4,8 +4,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import TensorWindows
-from nfc_gym.inference.network import Network, NetworkConfig, Sizes
+from nfc_gym.inference.network import Network
 from nfc_gym.inference.space import PriorBox
 
 NOISE = 0.5

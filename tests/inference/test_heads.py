@@ -73,11 +73,11 @@ def test_samples_follow_the_density(name: str) -> None:
 def test_many_pairs_at_once_are_the_same_as_one_by_one() -> None:
     for model in densities((2, 1), 4).values():
         shaken(model)
-        x, f = torch.randn(3, 4, 3), torch.randn(3, 4)
+        x, f = torch.randn(2, 3, 3), torch.randn(2, 4)
         with torch.no_grad():
             together = model.log_prob(x, f)
             alone = torch.stack([torch.stack([model.log_prob(x[i : i + 1, j : j + 1], f[i : i + 1])[0, 0]
-                                              for j in range(4)]) for i in range(3)])  # fmt: skip
+                                              for j in range(3)]) for i in range(2)])  # fmt: skip
         torch.testing.assert_close(together, alone, atol=1e-4, rtol=1e-4)
 
 

@@ -51,7 +51,7 @@ def test_the_truth_is_hardly_ever_cut_off() -> None:
 
 
 def test_rounds_close_in_and_end_where_they_no_longer_narrow() -> None:
-    net = network(linear_windows(200))
+    net = network(linear_windows(200), linear=True)
     heard: list[str] = []
 
     class Heard:
@@ -61,8 +61,8 @@ def test_rounds_close_in_and_end_where_they_no_longer_narrow() -> None:
             heard.append(text)
 
     out = sequential(
-        net, simulate, OBSERVED, SequentialConfig(rounds=3, simulations=400, samples=200, oversampling=4),
-        TrainConfig(epochs=8, batch=64, rate=5e-3, warmup=10, average=0.95), report=Heard(),
+        net, simulate, OBSERVED, SequentialConfig(rounds=2, simulations=400, samples=200, oversampling=4),
+        TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95), report=Heard(),
     )  # fmt: skip
     assert len(out.entropy) == len(out.outcomes) == len(out.kept) >= 2
     assert out.entropy[-1] < out.entropy[0] < 0

@@ -8,10 +8,10 @@ import torch
 from problems import motion_windows, network
 
 from nfc_gym.core import Fidelity, InputError
+from nfc_gym.inference.config import NetworkConfig
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.heads.score import Score
 from nfc_gym.inference.heads.terrain import Terrain
-from nfc_gym.inference.network import NetworkConfig
 from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 
 

@@ -83,9 +83,10 @@ class RFF(KernelFeatures):
 class FKS(KernelFeatures):
     """Kernel slicing: the one-dimensional basis function of the sliced Gaussian along directions on the sphere.
 
-    exp(-|x - y|^2 / 2) is the mean over directions xi of f(<xi, x - y>), where f(t) = E cos(r t) = 1F1(d/2; 1/2; -t^2/2)
-    and r is distributed as the norm of a Gaussian vector in R^d (Hertrich 2024, table 1). The paper's features f(<xi, x>)
-    are even and cannot tell x from -x; the slices here are signed: each direction gives f and its odd partner E sin(r t).
+    exp(-|x - y|^2 / 2) is the mean over directions xi of f(<xi, x - y>), where f(t) = E cos(r t) =
+    1F1(d/2; 1/2; -t^2/2) and r is distributed as the norm of a Gaussian vector in R^d (Hertrich 2024). The paper's
+    features f(<xi, x>) are even and cannot tell x from -x; the slices here are signed: each direction gives f and its
+    odd partner E sin(r t).
     """
 
     radii: Tensor

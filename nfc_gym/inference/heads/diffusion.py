@@ -15,7 +15,9 @@ import torch
 from torch import Tensor, nn
 
 Field = Callable[[Tensor, int], Tensor]  # (x, i) -> v of x's shape at the i-th angle of a grid
-On = Callable[[Tensor], Field]  # a grid of angles (n,) -> the field on it; what depends on angles alone is computed once
+On = Callable[
+    [Tensor], Field
+]  # a grid of angles (n,) -> the field on it; what depends on angles alone is computed once
 FLOOR = 2e-3  # smallest angle: detail of that size of the prior's spread is left as it is
 MOST = math.pi / 2
 
@@ -100,8 +102,8 @@ def divergence(field: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Te
     axes = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
 
     def along(axis: Tensor) -> tuple[Tensor, Tensor]:
-        v, dv = torch.func.jvp(field, (x,), (axis.expand_as(x),))
+        v, dv = torch.func.jvp(field, (x,), (axis.expand_as(x),))  # type: ignore[misc] (no auxiliary output)
         return v, (dv * axis).sum(-1)
 
-    v, parts = torch.func.vmap(along, out_dims=(None, 0))(axes)
-    return v, parts.sum(0)
+    v, parts = torch.func.vmap(along)(axes)
+    return v[0], parts.sum(0)

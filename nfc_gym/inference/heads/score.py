@@ -15,7 +15,7 @@ _WINDOWS = 256  # windows whose modulations are held at once
 
 
 def time_features(phi: Tensor) -> Tensor:
-    """(..., 32) waves of the angle and of its log signal-to-noise ratio, from which a network reads phi at any scale."""
+    """(..., 32) waves of the angle and of its log signal-to-noise ratio: a network reads phi from them at any scale."""
     scales = 2.0 ** torch.arange(_WAVES, device=phi.device, dtype=phi.dtype)
     ratio = phi.tan().clamp(1e-4, 1e4).log()[..., None] * scales / 32
     phase = torch.cat([phi[..., None] * scales, ratio], -1)
@@ -23,7 +23,7 @@ def time_features(phi: Tensor) -> Tensor:
 
 
 class Block(nn.Module):
-    """A residual block whose normalisation the condition scales, shifts and gates (adaLN-zero: Peebles and Xie 2023)."""
+    """A residual block that the condition scales, shifts and gates (adaLN-zero: Peebles and Xie 2023)."""
 
     def __init__(self, hidden: int, dropout: float) -> None:
         super().__init__()
@@ -46,8 +46,8 @@ class Score(Density):
 
     With more than one block, half of the training draws see the first block alone (the others absent and flagged so),
     so that one network holds the joint density of (psi, delta_s) and that of psi, both exactly evaluated.
-    The output is a network's plus a linear map of each coordinate, a(c, phi) x + b(c, phi): of a Gaussian posterior v is
-    linear, and the network is left with what is not. All of it starts at 0, which is the prior.
+    The output is a network's plus a linear map of each coordinate, a(c, phi) x + b(c, phi): of a Gaussian posterior v
+    is linear, and the network is left with what is not. All of it starts at 0, which is the prior.
 
     Args:
       sizes: width of each block.
@@ -59,7 +59,8 @@ class Score(Density):
     """
 
     def __init__(
-        self, sizes: Sequence[int], features: int, hidden: int = 256, depth: int = 4, dropout: float = 0.0, draws: int = 4
+        self, sizes: Sequence[int], features: int, hidden: int = 256, depth: int = 4, dropout: float = 0.0,
+        draws: int = 4,
     ) -> None:  # fmt: skip
         super().__init__(sizes, features)
         self.draws, self.hidden = draws, hidden
@@ -138,7 +139,9 @@ class Score(Density):
         for part in features.split(_WINDOWS):
             noise = torch.randn(len(part), n, self.width(blocks), device=features.device)
             field = self.field(part, blocks)
-            drawn = diffusion.reverse_sde(field, noise, 10 * steps) if stochastic else diffusion.flow(field, noise, steps)
+            drawn = (
+                diffusion.reverse_sde(field, noise, 10 * steps) if stochastic else diffusion.flow(field, noise, steps)
+            )
             out.append(drawn)
         return torch.cat(out)
 

@@ -13,8 +13,8 @@ CELLS = 128
 class Terrain(nn.Module):
     """The score of the residual terrain, and what the noised terrain tells the score of the vector.
 
-    The joint density of y = (psi, delta_s) and the map m diffuses as one: at angle phi the U-Net sees the noised map, the
-    perceived elevation, the features and the noised y; the vector's score model sees the noised y and a summary of
+    The joint density of y = (psi, delta_s) and the map m diffuses as one: at angle phi the U-Net sees the noised map,
+    the perceived elevation, the features and the noised y; the vector's score model sees the noised y and a summary of
     the noised map, added to its condition. Without the summary that score is the one of y alone, whose
     density stays exact; m is sampled and has no density.
 

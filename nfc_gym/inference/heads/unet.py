@@ -51,10 +51,12 @@ class UNet(nn.Module):
         pairs = list(zip(CHANNELS[:-1], others, strict=True))[::-1]
         self.grow = nn.ModuleList([nn.Conv2d(b, a, 1) for a, b in pairs])
         self.up = nn.ModuleList([Conditioned(2 * a, a, condition) for a, _ in pairs])
-        self.leave = nn.Sequential(nn.GroupNorm(8, first), nn.SiLU(), nn.Conv2d(first, _PATCH**2, 3, padding=1))
+        last = nn.Conv2d(first, _PATCH**2, 3, padding=1)
+        self.leave = nn.Sequential(nn.GroupNorm(8, first), nn.SiLU(), last)
         self.weights = nn.Linear(condition, maps)
-        for layer in (self.leave[-1], self.weights):
+        for layer in (last, self.weights):
             nn.init.zeros_(layer.weight)
+            assert layer.bias is not None
             nn.init.zeros_(layer.bias)
 
     def forward(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
