@@ -21,6 +21,8 @@ from nfc_gym.inference.linear import LinearBase
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import EDGE, PriorBox
 
+_CHUNK = 1024  # windows whose fixed features are computed at once
+
 
 class Encoded(NamedTuple):
     """What a network keeps of B windows: `features` (B, F), and the linear base's `mean` (B, D), else zeros.
@@ -97,7 +99,8 @@ class Network(nn.Module):
             for scale, name in zip(self.map_scales, ("map", "delta_e"), strict=True):
                 cast(Standard, scale).fit(batch[name][..., None])
         if self.base is not None:
-            self.base.fit(self.encoder.fixed(batch["states"], batch["actions"]), self.targets(batch))
+            parts = zip(batch["states"].split(_CHUNK), batch["actions"].split(_CHUNK), strict=True)
+            self.base.fit(torch.cat([self.encoder.fixed(s, a) for s, a in parts]), self.targets(batch))
 
     def require(self, batch: Batch) -> None:
         """Refuse windows that are not this network's.
@@ -134,7 +137,8 @@ class Network(nn.Module):
             seen = self.map_scales[0](elevation[..., None])[..., 0].clamp(-10, 10)
         if self.base is None:
             return Encoded(features, states.new_zeros(len(states), self.density.width(None)), seen)
-        return Encoded(features, self.base(self.encoder.fixed(states, actions)), seen)
+        with torch.autocast(states.device.type, enabled=False):  # a narrow posterior's mean needs all its digits
+            return Encoded(features, self.base(self.encoder.fixed(states, actions)), seen)
 
     def sample(self, n: int, given: Encoded, blocks: int | None = None, **how: Any) -> Tensor:
         """(B, n, width of the first `blocks` blocks) draws of what `targets` are; `how` goes to the density."""

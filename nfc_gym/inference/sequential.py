@@ -147,7 +147,7 @@ class TruncatedPrior:
 
 def sequential(
     network: Network, simulate: Simulator, window: Window, config: SequentialConfig | None = None,
-    training: TrainConfig | None = None, *, report: Report = quiet,
+    training: TrainConfig | None = None, *, device: str | torch.device = "cpu", report: Report = quiet,
 ) -> Rounds:  # fmt: skip
     """Infer psi from one window in rounds of simulations that close in on it.
 
@@ -157,6 +157,7 @@ def sequential(
       window: what was observed.
       config: see `SequentialConfig`.
       training: of each round, on all windows so far.
+      device: to train on.
       report: is told of the progress.
 
     Raises:
@@ -179,7 +180,7 @@ def sequential(
         first, last = new.split(config.held_out)
         train_set = first if train_set is None else train_set.append(first)
         held_out = last if held_out is None else held_out.append(last)
-        out.outcomes.append(train(network, train_set, held_out, training, report=report))
+        out.outcomes.append(train(network, train_set, held_out, training, device=device, report=report))
         out.posterior = NeuralPosterior(network).given(window)
         out.entropy.append(-float(TruncatedPrior(out.posterior, config, rng)._draws(config.samples, rng)[1].mean()))
         report.message(f"round {r + 1}: {len(train_set)} windows, posterior entropy {out.entropy[-1]:.3f} nats")

@@ -18,7 +18,7 @@ from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.random import mixed, seeded
 from nfc_gym.inference.state import load_state, save_state
 
-_SCALE_WINDOWS = 16384  # windows from which the scales of inputs are taken
+_SCALE_WINDOWS, _SCALE_MAPS = 16384, 1024  # windows from which scales are taken, without maps (64 kB each) and with
 _EVALUATION = 2**20  # stands for "held-out" in seeds, where training uses step numbers
 
 
@@ -131,8 +131,10 @@ class _Run:
         self.epoch_steps = math.ceil(len(windows) / config.batch)
         self.total = self.epoch_steps * config.epochs
         with torch.random.fork_rng():
-            first = next(iter(windows.batches(min(len(windows), _SCALE_WINDOWS), mixed(config.seed, _EVALUATION))))
-        network.fit_scales({k: t.cpu() for k, t in first.items()})
+            most = _SCALE_MAPS if network.config.elevation else _SCALE_WINDOWS
+            first = next(iter(windows.batches(min(len(windows), most), mixed(config.seed, _EVALUATION))))
+        now = next(network.parameters()).device
+        network.fit_scales({k: t.to(now) for k, t in first.items()})
         self.network = network.to(device)
         self.average = deepcopy(self.network).eval().requires_grad_(False)
         self.best = deepcopy(self.average)

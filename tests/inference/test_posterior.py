@@ -2,17 +2,19 @@
 
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from problems import box, gaussian, linear_windows, motion_windows, network
 from safetensors.torch import save_file
 
-import nfc_gym  # noqa: F401 (registers the loader)
+import nfc_gym  # noqa: F401 (registers the loader and the environments)
 from nfc_gym.core import Fidelity, InputError, Posterior, load_source
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 from nfc_gym.inference.space import PriorBox
+from nfc_gym.wrappers import RandomizePsi
 
 
 def rng() -> np.random.Generator:
@@ -128,6 +130,23 @@ def test_bad_windows_are_refused() -> None:
         posterior.given(window).log_prob(Fidelity(np.ones((1, 2)), None, np.zeros((1, 4, 4))))
     with pytest.raises(InputError, match="x has no psi"):
         posterior.given(window).log_prob(Fidelity(None, np.zeros((1, 2))))
+
+
+def test_a_robots_psi_is_drawn_from_a_file(tmp_path: Path) -> None:
+    with gymnasium.make("nfc_gym/JackalFlat-v0", context=["psi"]) as env:
+        prior = PriorBox.of(env.unwrapped.psi_space, "jackal")
+        windows = motion_windows(50)
+        windows.tensors["psi"] = torch.rand(50, len(prior))
+        t = windows.tensors
+        given = NeuralPosterior(network(windows, prior)).given(Window(t["states"][0], t["actions"][0]))
+        given.save(tmp_path / "given.safetensors")
+        randomised = RandomizePsi(env, str(tmp_path / "given.safetensors"))
+        randomised.reset(seed=0)
+        first = randomised.psi
+        randomised.reset(seed=1)
+        assert (first >= prior.low).all()
+        assert (first <= prior.high).all()
+        assert (first != randomised.psi).any()
 
 
 @pytest.mark.parametrize("density", ["score", "mixture", "flow"])

@@ -60,8 +60,9 @@ class KernelFeatures(SignalEncoder):
             self.width.copy_(torch.pdist(x).median().clamp(min=1e-3))
 
     def projections(self, x: Tensor) -> Tensor:
-        """(B, p) in units of the kernel's width."""
-        return x.flatten(1) @ self.directions.T / self.width
+        """(B, p) in units of the kernel's width; phases, which bfloat16 would spoil."""
+        with torch.autocast(x.device.type, enabled=False):
+            return x.flatten(1) @ self.directions.T / self.width
 
 
 class RFF(KernelFeatures):

@@ -10,6 +10,7 @@ from torch import Tensor
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.encoders.base import Encoder, Standard
 
+_CHUNK = 1024
 RIDGE = 1e-3  # of the regressors' mean square: what the window does not excite gets a coefficient near 0
 
 
@@ -80,7 +81,8 @@ class Summaries(Encoder):
             raise InputError("physics summaries: a window needs at least one step")
         self.inputs.fit(torch.cat([states[:, :-1], actions], -1))
         self.outputs.fit(states.diff(dim=1))
-        self.scale.fit(self.raw(states, actions))
+        parts = zip(states.split(_CHUNK), actions.split(_CHUNK), strict=True)  # regressors take H times the room
+        self.scale.fit(torch.cat([self.raw(s, a) for s, a in parts]))
 
     def forward(self, states: Tensor, actions: Tensor, elevation: Tensor | None = None) -> Tensor:
         """(B, features)."""
