@@ -60,6 +60,13 @@ class LinearBase(nn.Module):
         ridge = 1e-6 * covariance.diagonal().mean() * torch.eye(len(covariance), device=x.device)
         self.factor.copy_(torch.linalg.cholesky(covariance + ridge))
 
+    @torch.no_grad()
+    def leave(self, entries: Tensor) -> None:
+        """Take some entries of x (D,) bool out again: they stay as they are, and touch no other."""
+        for part in (self.weight, self.offset, self.factor, self.factor.mT):
+            part[entries] = 0
+        self.factor.diagonal()[entries] = 1
+
     def _inputs(self, r: Tensor) -> Tensor:
         return self.scale(r).clamp(-10, 10)
 

@@ -100,7 +100,11 @@ class Network(nn.Module):
                 cast(Standard, scale).fit(batch[name][..., None])
         if self.base is not None:
             parts = zip(batch["states"].split(_CHUNK), batch["actions"].split(_CHUNK), strict=True)
-            self.base.fit(torch.cat([self.encoder.fixed(s, a) for s, a in parts]), self.targets(batch))
+            with seeded(0):
+                self.base.fit(torch.cat([self.encoder.fixed(s, a) for s, a in parts]), self.targets(batch))
+            if self.config.delta_s:
+                psi = torch.zeros(self.prior.size, dtype=torch.bool, device=self.varies.device)
+                self.base.leave(torch.cat([psi, ~self.varies]))
 
     def require(self, batch: Batch) -> None:
         """Refuse windows that are not this network's.
