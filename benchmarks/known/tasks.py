@@ -110,7 +110,7 @@ class SLCP:
     """
 
     name, box = "slcp", box("slcp", 5, -3.0, 3.0)
-    _PRIOR = 4_000_000
+    _CHUNK, _CHUNKS = 2_000_000, 10
 
     @staticmethod
     def spread(psi: Array) -> tuple[Array, Array, Array]:
@@ -131,24 +131,32 @@ class SLCP:
         Raises:
           InputError: fewer distinct draws than asked for carry the weight.
         """
-        points = x.reshape(4, 2)
-        middle, psi = points.mean(0), rng.uniform(-3, 3, (self._PRIOR, 5))
-        a, b, c = self.spread(psi)
-        e = rng.normal(size=(self._PRIOR, 2)) / 2  # the mean of four draws has half their spread
-        psi[:, 0] = middle[0] + a * e[:, 0]
-        psi[:, 1] = middle[1] + b * (c * e[:, 0] + np.sqrt(1 - c**2) * e[:, 1])
-        away = points - middle
-        left = np.sqrt(np.maximum(1 - c**2, 1e-12))
-        square = np.zeros(self._PRIOR)
-        for first, second in away:
-            square += (first / a) ** 2 + ((second / b - c * first / a) / left) ** 2
-        # integrated over the mean, three of the four draws' scales remain
-        weight = -square / 2 - 3 * np.log(a * b * left)
-        weight = np.where((np.abs(psi[:, :2]) <= 3).all(1), np.exp(weight - weight.max()), 0.0)
+        found, weights, top = [], [], -np.inf
+        for _ in range(self._CHUNKS):
+            psi, weight = self.proposed(x.reshape(4, 2), self._CHUNK, rng)
+            top = max(top, weight.max())
+            likely = weight > top - 16  # the others' share is below 1e-6
+            found.append(psi[likely])
+            weights.append(weight[likely])
+        psi, weight = np.concatenate(found), np.exp(np.concatenate(weights) - top)
         weight /= weight.sum()
-        if 1 / (weight**2).sum() < n:
-            raise InputError(f"slcp: {1 / (weight**2).sum():.0f} effective draws for {n}: take fewer")
-        return psi[rng.choice(self._PRIOR, n, p=weight)]
+        effective = 1 / (weight**2).sum()
+        if effective < n:
+            raise InputError(f"slcp: {effective:.0f} effective draws for {n}: take fewer")
+        return psi[rng.choice(len(psi), n, p=weight)]
+
+    def proposed(self, points: Array, n: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """(n, 5) draws, p0 and p1 given the rest, and their log weights (n,); minus infinity outside the prior."""
+        middle, psi = points.mean(0), rng.uniform(-3, 3, (n, 5))
+        a, b, c = self.spread(psi)
+        left = np.sqrt(np.maximum(1 - c**2, 1e-12))
+        e = rng.normal(size=(n, 2)) / 2  # the mean of four draws has half their spread
+        psi[:, 0] = middle[0] + a * e[:, 0]
+        psi[:, 1] = middle[1] + b * (c * e[:, 0] + left * e[:, 1])
+        square = sum((p / a) ** 2 + ((q / b - c * p / a) / left) ** 2 for p, q in points - middle)
+        # integrated over the mean, the scales of three of the four draws remain
+        weight = -square / 2 - 3 * np.log(a * b * left)
+        return psi, np.where((np.abs(psi[:, :2]) <= 3).all(1), weight, -np.inf)
 
 
 TASKS: dict[str, tuple[Task, ...]] = {

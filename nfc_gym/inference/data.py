@@ -8,7 +8,7 @@ A batch is a dict of named tensors with a leading axis of windows:
   family   (B,) int16, index of the injected effect's family, 0 for none (where the structure head is trained)
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -93,13 +93,21 @@ class StoredWindows:
     Args:
       stored: has `manifest`, a length and `batches(size, seed, rows, names)`, which gives dicts of arrays.
       rows: (k,) which windows; default all.
-      names: which arrays; default those that training knows.
+      maps: read the elevation maps too: `perceived` becomes `map`, and `true` less `perceived` becomes `delta_e`.
+
+    Raises:
+      InputError: the set holds no maps and they are asked for.
     """
 
-    def __init__(self, stored: Any, rows: NDArray[np.integer] | None = None, names: Sequence[str] = ()) -> None:
-        self.stored, self.manifest = stored, stored.manifest
+    def __init__(self, stored: Any, rows: NDArray[np.integer] | None = None, maps: bool = False) -> None:
+        self.stored, self.manifest, self.maps = stored, stored.manifest, maps
         self.rows = np.arange(len(stored)) if rows is None else rows
-        self.names = tuple(names) or tuple(n for n in stored.names if n in _AXES)
+        self.names = tuple(n for n in stored.names if n in _AXES)
+        if maps:
+            missing = sorted({"perceived", "true"} - set(stored.names))
+            if missing:
+                raise InputError(f"windows: the set holds no maps ({missing[0]!r} is missing); simulate with them")
+            self.names += ("perceived", "true")
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -107,12 +115,16 @@ class StoredWindows:
     def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
         """See `WindowSet.batches`; None is an order of its own, the same each time."""
         for arrays in self.stored.batches(size, 0 if seed is None else seed, self.rows, self.names):
-            yield {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+            batch = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+            if self.maps:
+                batch["map"] = batch.pop("perceived").float()
+                batch["delta_e"] = batch.pop("true").float() - batch["map"]
+            yield batch
 
     def split(self, share: float) -> tuple["StoredWindows", "StoredWindows"]:
         """The first windows, and the last `share` of them: to train on and to hold out."""
         cut = len(self) - max(1, round(share * len(self)))
-        first, last = (StoredWindows(self.stored, rows, self.names) for rows in (self.rows[:cut], self.rows[cut:]))
+        first, last = (StoredWindows(self.stored, rows, self.maps) for rows in (self.rows[:cut], self.rows[cut:]))
         return first, last
 
 

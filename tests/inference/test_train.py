@@ -203,6 +203,17 @@ class Stored:
             yield {n: self.arrays[n][order[i : i + size]] for n in names}
 
 
+def test_stored_maps_become_map_and_delta_e() -> None:
+    perceived = torch.randn(8, 128, 128).half()
+    stored = Stored(motion_windows(8, perceived=perceived, true=perceived + 1))
+    (batch,) = StoredWindows(stored, maps=True).batches(8, None)
+    assert "map" not in next(StoredWindows(stored).batches(8, None))
+    torch.testing.assert_close(batch["delta_e"], torch.ones(8, 128, 128), atol=2e-3, rtol=0)
+    assert batch["map"].dtype == torch.float32
+    with pytest.raises(InputError, match="the set holds no maps"):
+        StoredWindows(Stored(motion_windows(8)), maps=True)
+
+
 def test_windows_on_disk_train_as_those_in_memory_do() -> None:
     stored = StoredWindows(Stored(motion_windows(500)))
     windows, held_out = stored.split(0.2)
