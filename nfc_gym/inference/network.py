@@ -10,7 +10,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import Batch
 from nfc_gym.inference.encoders import Joined, Regressions
-from nfc_gym.inference.encoders.base import TINY, Standard
+from nfc_gym.inference.encoders.base import TINY, Standard, Tamed
 from nfc_gym.inference.heads.density import Chain, Density
 from nfc_gym.inference.heads.flow import Flow
 from nfc_gym.inference.heads.mixture import Mixture
@@ -64,7 +64,7 @@ class Network(nn.Module):
             )  # fmt: skip
             width = config.features or self.encoder.features
             self.project = nn.Linear(self.encoder.features, width) if config.features else nn.Identity()
-            self.delta_scale = Standard(sizes.states)
+            self.delta_scale = Tamed(sizes.states)
             self.register_buffer("varies", torch.ones(sizes.states, dtype=torch.bool))
             self.density = self._density(width)
             size = self.density.width(None)
@@ -165,7 +165,7 @@ class Network(nn.Module):
         return self.density.log_prob(y, given.features, blocks, **how) - self.base.log_scale(x.shape[-1])
 
     def targets(self, batch: Batch) -> Tensor:
-        """(B, D) what the density is over: z of the free psi, then the standardised delta_s.
+        """(B, D) what the density is over: z of the free psi, then delta_s on its tamed scale.
 
         Entries of delta_s that never vary in training are N(0, 1) noise here, and come back as the constant they are.
         """

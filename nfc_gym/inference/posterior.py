@@ -132,23 +132,17 @@ class NeuralPosterior:
         blocks = 2 if "delta_s" in self.parts else 1
         with seeded(rng):
             if "delta_e" in self.parts:
-                drawn = [self.network.sample_terrain(min(_MAPS, n - at), kept, **how) for at in range(0, n, _MAPS)]
-                x = torch.cat([d[0] for d in drawn])
-                maps = torch.cat([d[1] for d in drawn]).double().cpu().numpy()
+                pairs = [self.network.sample_terrain(min(_MAPS, n - at), kept, **how) for at in range(0, n, _MAPS)]
+                drawn = torch.cat([p[0] for p in pairs])
+                maps = torch.cat([p[1] for p in pairs]).double().cpu().numpy()
             else:
                 counts = [min(_ROWS, n - at) for at in range(0, n, _ROWS)]
-                x = torch.cat([self.network.sample(k, kept, blocks, **how)[0] for k in counts])
-        x = x.double().cpu().numpy()
-        psi, delta = self.prior.from_z(x[:, : self.prior.size]), None
+                drawn = torch.cat([self.network.sample(k, kept, blocks, **how)[0] for k in counts])
+        psi, delta = self.prior.from_z(drawn[:, : self.prior.size].double().cpu().numpy()), None
         if blocks == 2:
-            mean, spread, varies = self._delta()
-            delta = mean + np.where(varies, spread * x[:, self.prior.size :], 0.0)
+            y = torch.where(self.network.varies, drawn[:, self.prior.size :], 0.0)
+            delta = self.network.delta_scale.inverse(y).double().cpu().numpy()
         return Fidelity(psi, delta, maps)
-
-    def _delta(self) -> tuple[Array, Array, NDArray[np.bool_]]:
-        scale = self.network.delta_scale
-        mean, spread = (t.double().cpu().numpy() for t in (scale.mean, scale.spread))
-        return mean, spread, self.network.varies.cpu().numpy()
 
     @torch.no_grad()
     def log_prob(self, x: Fidelity, **how: Any) -> Array:
@@ -172,14 +166,15 @@ class NeuralPosterior:
         u = self.prior.u_of(psi)[:, free]
         # density in u is that in z over N(z; 0, I)
         change = (z**2 + np.log(2 * np.pi)).sum(1) / 2 - self.prior.log_volume
-        points = [z]
+        points = [torch.as_tensor(z, dtype=torch.float32, device=kept.mean.device)]
         if x.delta_s is not None:
-            mean, spread, varies = self._delta()
-            scaled = (np.atleast_2d(x.delta_s) - mean) / spread
-            points.append(np.where(varies, scaled, 0.0))
+            scale, varies = self.network.delta_scale, self.network.varies
+            delta = torch.as_tensor(np.atleast_2d(x.delta_s), dtype=torch.float32, device=kept.mean.device)
+            points.append(torch.where(varies, scale(delta), 0.0))
             # a constant entry is N(0, 1) noise to the network, taken out at 0 again
-            change = change - np.log(spread[varies]).sum() + (~varies).sum() * np.log(2 * np.pi) / 2
-        at = torch.as_tensor(np.concatenate(points, 1), dtype=torch.float32, device=kept.mean.device)
+            slope = torch.where(varies, scale.log_slope(delta), np.log(2 * np.pi) / 2).sum(1)
+            change = change + slope.double().cpu().numpy()
+        at = torch.cat(points, 1)
         value = self.network.log_prob(at[None], kept, len(points), **how)[0]
         return np.where(((u < 0) | (u > 1)).any(1), -np.inf, value.double().cpu().numpy() + change)
 

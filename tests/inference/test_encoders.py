@@ -7,6 +7,7 @@ from scipy.special import hyp1f1
 
 from nfc_gym.core import InputError
 from nfc_gym.inference.encoders import ENCODERS, Joined, Regressions, Summaries
+from nfc_gym.inference.encoders.base import Tamed
 from nfc_gym.inference.encoders.kernels import FKS, RFF, chi_quantiles
 from nfc_gym.inference.encoders.resnet import ResNet18
 from nfc_gym.inference.encoders.tcn import TCN
@@ -16,6 +17,20 @@ S, A, H = 3, 2, 8
 
 def windows(n: int = 64) -> tuple[torch.Tensor, torch.Tensor]:
     return 5 + 2 * torch.randn(n, H + 1, S), torch.randn(n, H, A)
+
+
+def test_tails_are_tamed_and_come_back() -> None:
+    x = torch.randn(5000, 2).double() * torch.tensor([0.01, 3.0])
+    x[::2, 0] = 0  # half of the windows have no residual
+    x[7] = torch.tensor([5.0, -900.0])
+    tamed = Tamed(2).double()
+    tamed.fit(x)
+    y = tamed(x)
+    torch.testing.assert_close(tamed.inverse(y), x)
+    torch.testing.assert_close(y.std(0), torch.ones(2).double(), atol=0.02, rtol=0)
+    assert y.abs().max() < 12
+    slope = (tamed(x + 1e-6) - tamed(x - 1e-6)) / 2e-6
+    torch.testing.assert_close(slope.log(), tamed.log_slope(x), atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ENCODERS)

@@ -59,6 +59,42 @@ class Standard(nn.Module):
         return x * self.spread + self.mean
 
 
+class Tamed(nn.Module):
+    """asinh(x / scale), standardised: linear for sizes that are usual, logarithmic in the tails, and invertible.
+
+    Residuals of dynamics have tails (an impact, a slip) that would otherwise set the scale of everything else.
+
+    Args:
+      size: of the last axis.
+    """
+
+    scale: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("scale", torch.ones(size))
+        self.standard = Standard(size)
+
+    def fit(self, x: Tensor) -> None:
+        """From samples (n, size); the scale is the median size of those that are not zero."""
+        sizes = x.abs()
+        there = sizes > TINY * sizes.amax(0)
+        self.scale.copy_(sizes.where(there, torch.nan).nanmedian(0).values.nan_to_num(1.0))
+        self.standard.fit((x / self.scale).asinh())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The same shape."""
+        return self.standard((x / self.scale).asinh())
+
+    def inverse(self, y: Tensor) -> Tensor:
+        """Undo `forward`."""
+        return self.scale * self.standard.inverse(y).clamp(-20, 20).sinh()
+
+    def log_slope(self, x: Tensor) -> Tensor:
+        """log of the derivative of each entry, the shape of x."""
+        return -(self.scale.log() + (x / self.scale).square().log1p() / 2 + self.standard.spread.log())
+
+
 class Signals(nn.Module):
     """States, their steps and actions as one standardised series (B, H+1, 2 s + a), clipped at 10 spreads.
 
