@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "2")  # latency is stated for two cores
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its core whenever another process has it
 
 import numpy as np
 import torch

@@ -58,7 +58,7 @@ class Terrain(nn.Module):
         return wrong[0] + wrong[1]
 
     def sample(
-        self, n: int, features: Tensor, elevation: Tensor, score: Score, *, steps: int = 15, stochastic: bool = False
+        self, n: int, features: Tensor, elevation: Tensor, score: Score, *, steps: int = 12, stochastic: bool = False
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Draws (n, D) of y and (n, 128, 128) of m given one window: features (1, F), elevation (1, 128, 128)."""
         d = score.width(None)
