@@ -46,7 +46,7 @@ def test_the_reverse_sde_draws_the_gaussian() -> None:
 
 
 def test_the_density_is_the_gaussians() -> None:
-    x = MEAN + SPREAD * torch.randn(200, 3, dtype=torch.float64)
+    x = MEAN + SPREAD * torch.randn(60, 3, dtype=torch.float64)
     exact = torch.distributions.Normal(MEAN, SPREAD).log_prob(x).sum(-1)
     errors = [float((diffusion.log_density(field, x, n) - exact).abs().mean()) for n in (6, 12, 16)]
     assert errors[0] / errors[1] > 8  # fourth order

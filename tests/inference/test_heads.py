@@ -42,7 +42,7 @@ def test_an_untrained_score_model_is_exactly_the_prior() -> None:
 def test_densities_integrate_to_one_jointly_and_for_psi_alone(name: str) -> None:
     model = shaken(densities((1, 1), 3)[name])
     f = torch.randn(1, 3)
-    line = torch.linspace(-9, 9, 121)
+    line = torch.linspace(-9, 9, 81)
     grid = torch.stack(torch.meshgrid(line, line, indexing="ij"), -1).reshape(1, -1, 2)
     cell = float(line[1] - line[0])
     with torch.no_grad():
@@ -51,7 +51,7 @@ def test_densities_integrate_to_one_jointly_and_for_psi_alone(name: str) -> None
     assert float(joint.sum()) * cell**2 == pytest.approx(1, abs=0.03)
     assert float(alone.sum()) * cell == pytest.approx(1, abs=0.03)
     if name != "score":  # a chain's first factor is its marginal; a score model learns both
-        torch.testing.assert_close(joint.view(121, 121).sum(1) * cell, alone[0], atol=0.02, rtol=0.05)
+        torch.testing.assert_close(joint.view(81, 81).sum(1) * cell, alone[0], atol=0.02, rtol=0.05)
 
 
 @pytest.mark.parametrize("name", ["score", "mixture", "flow"])
@@ -71,12 +71,13 @@ def test_samples_follow_the_density(name: str) -> None:
 
 
 def test_many_pairs_at_once_are_the_same_as_one_by_one() -> None:
-    for model in densities((2, 1), 4).values():
+    for name, model in densities((2, 1), 4).items():
         shaken(model)
+        how = {"steps": 3} if name == "score" else {}
         x, f = torch.randn(2, 3, 3), torch.randn(2, 4)
         with torch.no_grad():
-            together = model.log_prob(x, f)
-            alone = torch.stack([torch.stack([model.log_prob(x[i : i + 1, j : j + 1], f[i : i + 1])[0, 0]
+            together = model.log_prob(x, f, **how)
+            alone = torch.stack([torch.stack([model.log_prob(x[i : i + 1, j : j + 1], f[i : i + 1], **how)[0, 0]
                                               for j in range(3)]) for i in range(2)])  # fmt: skip
         torch.testing.assert_close(together, alone, atol=1e-4, rtol=1e-4)
 

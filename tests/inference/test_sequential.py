@@ -61,7 +61,7 @@ def test_rounds_close_in_and_end_where_they_no_longer_narrow() -> None:
             heard.append(text)
 
     out = sequential(
-        net, simulate, OBSERVED, SequentialConfig(rounds=2, simulations=400, samples=200, oversampling=4),
+        net, simulate, OBSERVED, SequentialConfig(rounds=2, simulations=400, samples=150, oversampling=4),
         TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95), report=Heard(),
     )  # fmt: skip
     assert len(out.entropy) == len(out.outcomes) == len(out.kept) >= 2

@@ -17,11 +17,11 @@ QUICK = TrainConfig(epochs=4, batch=64, rate=2e-3, warmup=10, average=0.98)
 
 def divergence_from_truth(net: torch.nn.Module, size: int) -> float:
     """Mean of log p - log q over pairs, nats: KL of the network's posterior from the exact one."""
-    x = linear_windows(100, size, seed=9).tensors["states"][:, 0]
+    x = linear_windows(50, size, seed=9).tensors["states"][:, 0]
     exact = gaussian(x)
-    z = exact.sample((30,)).transpose(0, 1).contiguous()
+    z = exact.sample((20,)).transpose(0, 1).contiguous()
     with torch.no_grad():
-        kept = net.encode(x[:, None], torch.zeros(100, 0, 0))  # type: ignore[operator]
+        kept = net.encode(x[:, None], torch.zeros(50, 0, 0))  # type: ignore[operator]
         return float((exact.log_prob(z.transpose(0, 1)).T - net.log_prob(z, kept)).mean())  # type: ignore[operator]
 
 
