@@ -55,7 +55,7 @@ def test_it_learns() -> None:
     bump = 2 * torch.exp(-4 * (line[:, None] ** 2 + line[None] ** 2)).expand(2, 128, 128)
     optimiser = torch.optim.Adam([*score.parameters(), *terrain.parameters()], 2e-3)
     losses = []
-    for i in range(16):
+    for i in range(24):
         torch.manual_seed(i % 4)  # the same noise again
         loss = terrain.loss(torch.zeros(2, 1), bump, torch.ones(2, 1), torch.zeros(2, 128, 128), score).mean()
         losses.append(loss.item())
