@@ -3,11 +3,34 @@
 Importing this package needs the core dependencies alone: neither torch nor a plotting or table library is loaded.
 """
 
-from nfc_gym.core import Channel, InputError, Log, MissingExtra, NfcError, SimulationUnstable
+from pathlib import Path
+
+from nfc_gym.core import (
+    Channel,
+    InputError,
+    Log,
+    MissingExtra,
+    NfcError,
+    Sampler,
+    SimulationUnstable,
+    register_loader,
+)
 from nfc_gym.envs import registry
 
 __version__ = "0.1.0"
 
 registry.register()  # `import nfc_gym` is what makes `gymnasium.make("nfc_gym/...")` know the ids
+
+
+def _open_posterior(path: Path) -> Sampler:
+    """A neural posterior's checkpoint; torch is loaded only now."""
+    try:
+        from nfc_gym.inference.posterior import load
+    except ImportError as e:
+        raise MissingExtra(f"{path}: a posterior needs {e.name}: pip install 'nfc_gym[inference]'") from None
+    return load(path)
+
+
+register_loader(".safetensors", _open_posterior)  # wherever a source may be a path, it may be a posterior
 
 __all__ = ["Channel", "InputError", "Log", "MissingExtra", "NfcError", "SimulationUnstable", "__version__"]

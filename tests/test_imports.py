@@ -16,7 +16,7 @@ ALLOWED: dict[str, set[str]] = {
     "physics": {"core"},
     "terrain": {"core"},
     "assets": {"core"},
-    "inference": {"core"},
+    "inference": {"", "core"},
     "envs": {"core", "physics", "terrain", "assets"},
     "wrappers": {"core", "physics", "terrain"},
     "measured": {"", "core", "physics", "terrain", "assets"},
@@ -36,7 +36,7 @@ ALLOWED: dict[str, set[str]] = {
         "simulate",
         "adaptation",
     },
-    "": {"core", "envs"},
+    "": {"core", "envs", "inference"},
 }
 # package -> all that it may import from outside the standard library
 ALLOWED_OUTSIDE: dict[str, set[str]] = {

@@ -33,11 +33,11 @@ class Table:
 
     def add(
         self, name: str, value: float, unit: str, *, baseline: float | None = None, at_least: float | None = None,
-        at_most: float | None = None,
+        at_most: float | None = None, seeds: tuple[int, ...] = (SEED,),
     ) -> None:  # fmt: skip
         goal = f">= {at_least:g}" if at_least is not None else f"<= {at_most:g}" if at_most is not None else None
         holds = None if goal is None else bool(value >= at_least if at_least is not None else value <= at_most)
-        self.rows.append(Row(name, float(value), unit, baseline, goal, holds))
+        self.rows.append(Row(name, float(value), unit, baseline, goal, holds, seeds))
         compared = "" if baseline is None else f"   (baseline {baseline:.4g})"
         verdict = "" if goal is None else f"   goal {goal}: {'holds' if holds else 'FALLS SHORT'}"
         print(f"{name:68} {value:10.4g} {unit}{compared}{verdict}", flush=True)

@@ -1,0 +1,162 @@
+"""Neural posteriors on problems whose posterior is known, and how long they take.
+
+    python benchmarks/inference.py [--quick] [--tasks linear_gaussian two_moons slcp] [--densities score mixture flow]
+                                   [--seeds 0 1 2] [--simulations N] [--observations N] [--samples N] [--json FILE]
+                                   [--no-latency] [--clock wall|cpu]
+
+C2ST is the accuracy of a classifier between posterior draws and exact ones, 0.5 being perfect; its baseline column is
+the same classifier between two sets of exact draws. Every seed is a network and simulations of its own,
+and judged on the same observations, drawn from the prior predictive. `--quick` ends within a minute and says little.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its core whenever another process has it
+
+import numpy as np
+import torch
+from known.c2st import c2st
+from known.tasks import TASKS, LinearGaussian, Task
+from numpy.typing import NDArray
+from timing import Table, race, use_clock
+
+from nfc_gym.core import Fidelity
+from nfc_gym.inference.config import NetworkConfig, Sizes
+from nfc_gym.inference.data import TensorWindows
+from nfc_gym.inference.network import Network
+from nfc_gym.inference.posterior import NeuralPosterior, Window
+from nfc_gym.inference.progress import Spoken, quiet
+from nfc_gym.inference.random import mixed
+from nfc_gym.inference.space import PriorBox
+from nfc_gym.inference.train import TrainConfig, train
+
+Array = NDArray[np.float64]
+GOALS = {"linear_gaussian_5": 0.52, "linear_gaussian_10": 0.52, "two_moons": 0.53, "slcp": 0.66}
+NETWORK = NetworkConfig(encoder="nn", width=128, features=0, hidden=128, depth=4, draws=2)
+TRAINING = TrainConfig(epochs=100, batch=128, rate=1e-3, patience=25)
+STEPS = 20  # of the score model's sampler
+
+
+def windows_of(task: Task, n: int, seed: int) -> TensorWindows:
+    """`n` simulations: an observation is a window of one state and no action."""
+    rng = np.random.default_rng(mixed(seed, 1))
+    u = rng.uniform(size=(n, len(task.box)))
+    x = task.simulate(task.box.psi_of(u), rng)
+    state, psi = torch.as_tensor(x[:, None], dtype=torch.float32), torch.as_tensor(u, dtype=torch.float32)
+    return TensorWindows({"states": state, "actions": torch.zeros(n, 0, 0), "psi": psi})
+
+
+def seen(x: Array) -> Window:
+    """One observation as a window."""
+    return Window(x[None], np.zeros((0, 0)))
+
+
+def posterior_of(task: Task, density: str, linear: bool, n: int, epochs: int, seed: int) -> NeuralPosterior:
+    """A network trained on `n` simulations, a twentieth of them held out."""
+    every = windows_of(task, n, seed)
+    config = NetworkConfig(**{**NETWORK.to_dict(), "density": density, "linear": linear})
+    network = Network(config, Sizes.of(every.tensors), task.box, seed)
+    training = TrainConfig(**{**asdict(TRAINING), "seed": seed, "epochs": epochs})
+    report = Spoken() if sys.stderr.isatty() else quiet
+    outcome = train(network, *every.split(0.05), training, report=report)
+    print(f"{task.name}: {density}, seed {seed}: {outcome.stopped} after {len(outcome.train)} epochs, "
+          f"best {outcome.best}, {outcome.seconds:.0f} s", flush=True)  # fmt: skip
+    return NeuralPosterior(network)
+
+
+def known(table: Table, task: Task, density: str, linear: bool, args: argparse.Namespace) -> None:
+    """One task and one density: C2ST of every seed, and of the seeds' mean."""
+    rng = np.random.default_rng(12345)
+    observed = task.simulate(task.box.psi_of(rng.uniform(size=(args.observations, len(task.box)))), rng)
+    exact = [task.posterior(x, args.samples, rng) for x in observed]
+    floor = statistics.mean(
+        c2st(a, task.posterior(x, args.samples, rng)) for a, x in zip(exact[:2], observed, strict=False)
+    )
+    name = f"{task.name}, {density}{' on the linear base' if linear else ''}, {args.simulations} simulations"
+    scores, misses = [], []
+    for seed in args.seeds:
+        posterior = posterior_of(task, density, linear, args.simulations, args.epochs, seed)
+        each, wrong = [], []
+        for x, truth in zip(observed, exact, strict=True):
+            given = posterior.given(seen(x))
+            how = {"steps": STEPS} if density == "score" else {}
+            drawn = given.sample(args.samples, np.random.default_rng(seed), **how).psi
+            each.append(c2st(truth, drawn))
+            if isinstance(task, LinearGaussian):
+                away = given.log_prob(Fidelity(truth[:500])) - task.log_prob(truth[:500], x)
+                wrong.append((away.mean(), np.abs(away).mean()))
+        scores.append(statistics.mean(each))
+        table.add(f"{name}: C2ST, seed {seed}", scores[-1], "accuracy", baseline=floor, seeds=(seed,))
+        if wrong:
+            signed, absolute = (statistics.mean(w) for w in zip(*wrong, strict=True))
+            misses.append(abs(signed))
+            table.add(f"{name}: log_prob less the closed form, mean, seed {seed}", signed, "nats", seeds=(seed,))
+            table.add(f"{name}: the same, mean size at a point, seed {seed}", absolute, "nats", seeds=(seed,))
+    goal = GOALS[task.name] if density == "score" and args.simulations == 10_000 else None
+    seeds = tuple(args.seeds)
+    table.add(f"{name}: C2ST, mean", statistics.mean(scores), "accuracy", baseline=floor, at_most=goal, seeds=seeds)
+    if misses:
+        table.add(f"{name}: log_prob less the closed form, mean, worst seed", max(misses), "nats",
+                  at_most=0.05 if goal else None, seeds=seeds)  # fmt: skip
+
+
+def latency(table: Table, turns: int, clock: str) -> None:
+    """From a window of a Jackal's size (H = 50, s = 15, a = 2, d = 17) to 100 samples of psi, encoder included."""
+    names = tuple(f"p{i}" for i in range(17))
+    box = PriorBox("latency", names, ("1",) * 17, (0.0,) * 17, (1.0,) * 17)
+    rng = np.random.default_rng(0)
+    window = Window(rng.normal(size=(51, 15)), rng.normal(size=(50, 2)))
+    contestants: dict[str, Callable[[], object]] = {}
+    for config in (NetworkConfig(), NetworkConfig(summaries=True, linear=True), NetworkConfig(density="flow")):
+        posterior = NeuralPosterior(Network(config, Sizes(50, 15, 2), box))
+        name = f"{config.encoder}{' + summaries' if config.summaries else ''}, {config.density}"
+        contestants[name] = lambda posterior=posterior: posterior.given(window).sample(100, rng)
+    for name, seconds in race(contestants, turns).items():
+        what = f"latency, 100 samples of 17 psi, batch 1, {torch.get_num_threads()} threads, {clock} time: {name}"
+        table.add(what, 1e3 * seconds, "ms", at_most=40.0 if "score" in name else None)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="*", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--densities", nargs="+", choices=("score", "mixture", "flow"), default=["score"])
+    parser.add_argument("--base", choices=("linear", "prior", "both"), default="both", help="where densities start")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--simulations", type=int, default=10_000)
+    parser.add_argument("--observations", type=int, default=10)
+    parser.add_argument("--samples", type=int, default=10_000)
+    parser.add_argument("--epochs", type=int, default=TRAINING.epochs)
+    parser.add_argument("--latency", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument(
+        "--clock", choices=("wall", "cpu"), default="wall", help="of the latency; cpu on a busy machine"
+    )
+    parser.add_argument("--quick", action="store_true", help="one seed, few simulations and observations: a minute")
+    parser.add_argument("--json", type=Path, help="write the rows here")
+    args = parser.parse_args()
+    use_clock(args.clock)
+    if args.quick:
+        args.seeds, args.simulations, args.observations, args.samples, args.epochs = [0], 2000, 1, 1000, 5
+        args.base = "linear"
+    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
+    table = Table()
+    for key in args.tasks:
+        for task in TASKS[key]:
+            for density in args.densities:
+                for linear in {"linear": (True,), "prior": (False,), "both": (True, False)}[args.base]:
+                    known(table, task, density, linear, args)
+    if args.latency:
+        latency(table, 10 if args.quick else 25, args.clock)
+    if args.json:
+        args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Tasks whose posterior is known, and how far samples are from it."""

@@ -1,0 +1,75 @@
+"""A trained network as one safetensors file: weights and scales, and in the metadata all that rebuilds it."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+
+from nfc_gym import __version__
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import replacing
+from nfc_gym.inference.config import NetworkConfig, Sizes
+from nfc_gym.inference.network import Encoded, Network
+from nfc_gym.inference.space import PriorBox
+from nfc_gym.inference.state import read
+
+FORMAT = "nfc_gym-posterior-1"
+GIVEN = "given/"  # before the names of the encoded window's tensors, in the file of a posterior that was given one
+
+
+def save(path: Path, network: Network, *, given: Encoded | None = None, notes: dict[str, Any] | None = None) -> None:
+    """Write a network; with `given`, also what is kept of the window that its posterior was given.
+
+    Args:
+      path: ends in `.safetensors`.
+      network: trained.
+      given: see above.
+      notes: plain values kept beside it: how it was trained, on what.
+    """
+    if path.suffix.lower() != ".safetensors":
+        raise InputError(f"{path}: a posterior is kept in a file that ends in .safetensors")
+    about = {
+        "nfc_gym": __version__, "torch": str(torch.__version__), "network": network.config.to_dict(),
+        "sizes": asdict(network.sizes), "prior": network.prior.to_dict(), "notes": notes or {},
+    }  # fmt: skip
+    tensors = {k: t.detach().cpu().contiguous().clone() for k, t in network.state_dict().items()}
+    if given is not None:
+        tensors |= {GIVEN + k: t.detach().cpu().contiguous() for k, t in given._asdict().items() if t is not None}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part:
+        save_file(tensors, part, {"format": FORMAT, "about": json.dumps(about)})
+
+
+def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | None, dict[str, Any]]:
+    """A network, what is kept of the window it was given (or None), and the notes kept beside it.
+
+    Args:
+      path: of the file.
+      prior: what its prior must be; default any.
+
+    Raises:
+      InputError: the file is damaged, of another format, or of another robot or prior than asked for.
+    """
+    tensors, metadata = read(path)
+    if metadata.get("format") != FORMAT:
+        raise InputError(
+            f"{path}: format {metadata.get('format')!r}; this version of nfc_gym ({__version__}) reads {FORMAT!r}"
+        )
+    try:
+        about = json.loads(metadata["about"])
+        own = PriorBox.from_dict(about["prior"])
+        config, sizes = NetworkConfig(**about["network"]), Sizes(**about["sizes"])
+    except (KeyError, TypeError, ValueError) as e:
+        raise InputError(f"{path}: its metadata describe no network that this version knows ({e})") from None
+    if prior is not None:
+        prior.require_same(own, str(path))
+    kept = {k.removeprefix(GIVEN): tensors.pop(k) for k in list(tensors) if k.startswith(GIVEN)}
+    network = Network(config, sizes, own)
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as e:
+        raise InputError(f"{path}: its weights are not those of the network that it describes ({e})") from None
+    return network.eval(), Encoded(**kept) if kept else None, about["notes"]

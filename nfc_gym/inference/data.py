@@ -1,0 +1,155 @@
+"""What training needs of a set of windows, and such a set from tensors in memory.
+
+A batch is a dict of named tensors with a leading axis of windows:
+  states   (B, H+1, s) and actions (B, H, a), float32, as the robot's log holds them
+  psi      (B, d) float32, positions u in [0, 1] in the prior's box
+  delta_s  (B, s) float32, residual of one control step (where it is inferred)
+  delta_e  (B, 128, 128) float32, m, and `map` (B, 128, 128), the perceived elevation (where they are used)
+  family   (B,) int16, index of the injected effect's family, 0 for none (where the structure head is trained)
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfc_gym.core.errors import InputError
+
+Batch = dict[str, Tensor]
+_AXES = {"states": 3, "actions": 3, "psi": 2, "delta_s": 2, "delta_e": 3, "map": 3, "family": 1}
+
+
+class WindowSet(Protocol):
+    """A set of windows to train on, wherever it lies."""
+
+    @property
+    def manifest(self) -> Any:
+        """What is known of the whole set."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        ...
+
+    def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
+        """Every window once, in batches of `size` (the last may be smaller).
+
+        The order is a function of `seed` alone; None is the order in which they are stored.
+        """
+        ...
+
+
+class TensorWindows:
+    """Windows held in memory, on any device.
+
+    Args:
+      tensors: a batch as above that holds all windows.
+      manifest: what is known of them.
+
+    Raises:
+      InputError: a tensor has another number of axes or windows, states and actions do not belong together, or a
+        value is not finite.
+    """
+
+    def __init__(self, tensors: Batch, manifest: Mapping[str, Any] | None = None) -> None:
+        require_batch(tensors)
+        self.tensors = tensors
+        self.manifest: Mapping[str, Any] = dict(manifest or {})
+
+    def __len__(self) -> int:
+        return len(self.tensors["psi"])
+
+    def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
+        """See `WindowSet.batches`."""
+        order = torch.arange(len(self))
+        if seed is not None:
+            order = order[torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))]
+        order = order.to(self.tensors["psi"].device)
+        for rows in order.split(size):
+            yield {name: t[rows] for name, t in self.tensors.items()}
+
+    def split(self, share: float) -> tuple["TensorWindows", "TensorWindows"]:
+        """The first windows, and the last `share` of them: to train on and to hold out."""
+        cut = len(self) - max(1, round(share * len(self)))
+        first, last = ({k: t[part] for k, t in self.tensors.items()} for part in (slice(cut), slice(cut, None)))
+        return TensorWindows(first, self.manifest), TensorWindows(last, self.manifest)
+
+    def append(self, other: "TensorWindows") -> "TensorWindows":
+        """Both sets as one; they hold the same tensors."""
+        joined = {k: torch.cat([t, other.tensors[k].to(t.device)]) for k, t in self.tensors.items()}
+        return TensorWindows(joined, self.manifest)
+
+    def to(self, device: str | torch.device) -> "TensorWindows":
+        """The same on another device."""
+        return TensorWindows({k: t.to(device) for k, t in self.tensors.items()}, self.manifest)
+
+
+class StoredWindows:
+    """Some rows of a stored set, read as they are needed: numpy batches made tensors.
+
+    Args:
+      stored: has `manifest`, a length and `batches(size, seed, rows, names)`, which gives dicts of arrays.
+      rows: (k,) which windows; default all.
+      maps: read the elevation maps too: `perceived` becomes `map`, and `true` less `perceived` becomes `delta_e`.
+
+    Raises:
+      InputError: the set holds no maps and they are asked for.
+    """
+
+    def __init__(self, stored: Any, rows: NDArray[np.integer] | None = None, maps: bool = False) -> None:
+        self.stored, self.manifest, self.maps = stored, stored.manifest, maps
+        self.rows = np.arange(len(stored)) if rows is None else rows
+        self.names = tuple(n for n in stored.names if n in _AXES)
+        if maps:
+            missing = sorted({"perceived", "true"} - set(stored.names))
+            if missing:
+                raise InputError(f"windows: the set holds no maps ({missing[0]!r} is missing); simulate with them")
+            self.names += ("perceived", "true")
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
+        """See `WindowSet.batches`; None is an order of its own, the same each time."""
+        for arrays in self.stored.batches(size, 0 if seed is None else seed, self.rows, self.names):
+            batch = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+            if self.maps:
+                batch["map"] = batch.pop("perceived").float()
+                batch["delta_e"] = batch.pop("true").float() - batch["map"]
+            yield batch
+
+    def split(self, share: float) -> tuple["StoredWindows", "StoredWindows"]:
+        """The first windows, and the last `share` of them: to train on and to hold out."""
+        cut = len(self) - max(1, round(share * len(self)))
+        first, last = (StoredWindows(self.stored, rows, self.maps) for rows in (self.rows[:cut], self.rows[cut:]))
+        return first, last
+
+
+def require_batch(tensors: Batch) -> None:
+    """Refuse what is no batch of windows, naming what is wrong.
+
+    Raises:
+      InputError: see `TensorWindows`.
+    """
+    missing = sorted({"states", "actions", "psi"} - set(tensors))
+    if missing:
+        raise InputError(f"windows: {missing[0]!r} is missing; a batch has {', '.join(_AXES)}, the first three always")
+    for name, tensor in tensors.items():
+        if name in _AXES and tensor.ndim != _AXES[name]:
+            raise InputError(f"windows: {name} must have {_AXES[name]} axes, got shape {tuple(tensor.shape)}")
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise InputError(f"windows: {name} holds NaN or infinity; every entry must be finite")
+    rows = {name: len(tensor) for name, tensor in tensors.items()}
+    if len(set(rows.values())) > 1 or not rows["psi"]:
+        raise InputError(f"windows: the tensors hold different numbers of windows, or none: {rows}")
+    if tensors["states"].shape[1] != tensors["actions"].shape[1] + 1:
+        raise InputError(
+            f"windows: H + 1 states go with H actions, got {tensors['states'].shape[1]} and "
+            f"{tensors['actions'].shape[1]}"
+        )
+    low, high = float(tensors["psi"].min()), float(tensors["psi"].max())
+    if low < 0 or high > 1:
+        raise InputError(f"windows: psi holds positions in the prior's box, in [0, 1], got [{low:g}, {high:g}]")

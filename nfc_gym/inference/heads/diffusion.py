@@ -1,0 +1,107 @@
+"""The variance-preserving diffusion with a cosine schedule, as rotations by an angle.
+
+At diffusion time k in [0, 1] the angle is phi = pi k / 2, and x_phi = cos(phi) x + sin(phi) noise (Nichol and Dhariwal
+2021; Salimans and Ho 2022). A network predicts v = cos(phi) noise - sin(phi) x, which is d x_phi / d phi: the
+probability-flow ODE of Song et al. 2021 is dx / dphi = E[v | x_phi] =: v(x, phi). What follows from it:
+    x = cos(phi) x_phi - sin(phi) v      noise = sin(phi) x_phi + cos(phi) v      score = -x_phi - v / tan(phi)
+For x ~ N(0, I), v is 0: a network that starts at 0 starts at the prior, exactly.
+"""
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+Field = Callable[[Tensor, int], Tensor]  # (x, i) -> v of x's shape at the i-th angle of a grid
+On = Callable[
+    [Tensor], Field
+]  # a grid of angles (n,) -> the field on it; what depends on angles alone is computed once
+FLOOR = 2e-3  # smallest angle: detail of that size of the prior's spread is left as it is
+MOST = math.pi / 2
+
+
+def angles(steps: int) -> Tensor:
+    """(steps + 1,) from pi / 2 down to `FLOOR`, denser towards the end, where narrow posteriors take shape."""
+    return FLOOR + (MOST - FLOOR) * torch.linspace(1, 0, steps + 1, dtype=torch.float64).pow(3)
+
+
+def clean(x: Tensor, v: Tensor, phi: Tensor) -> Tensor:
+    """The mean of the clean x given x_phi."""
+    return phi.cos() * x - phi.sin() * v
+
+
+def integrate(rate: Field, x: Tensor, grid: Tensor) -> Tensor:
+    """Solve dx / dphi = rate(x, phi) along a grid of angles: Adams and Bashforth's method of second order.
+
+    One evaluation a step, after one step of Heun's method. At 20 evaluations it is two to four times as accurate as
+    Heun's method throughout, on Gaussians a tenth to a hundredth as wide as the prior.
+    """
+    before: tuple[Tensor, Tensor] | None = None
+    for i, step in enumerate(grid.diff()):
+        now = rate(x, i)
+        if before is None:
+            x = x + step / 2 * (now + rate(x + step * now, i + 1))
+        else:
+            last, past = before
+            x = x + step * (now + step / last / 2 * (now - past))
+        before = step, now
+    return x
+
+
+def flow(field_on: On, noise: Tensor, steps: int = 12) -> Tensor:
+    """Noise to samples by the probability-flow ODE, in steps + 1 evaluations; noise of `FLOOR` is left in them."""
+    grid = angles(steps).to(noise.dtype).to(noise.device)
+    return integrate(field_on(grid), noise, grid)
+
+
+def reverse_sde(field_on: On, noise: Tensor, steps: int = 150) -> Tensor:
+    """Noise to samples by the reverse SDE, in its exact transitions given the mean of the clean x (Ho et al. 2020)."""
+    x = noise
+    grid = angles(steps).to(noise.dtype).to(noise.device)
+    field = field_on(grid)
+    for i, (a, b) in enumerate(pairwise(grid)):
+        v = field(x, i)
+        kept = (a.cos() / b.cos()) ** 2  # signal that the forward step from b to a leaves
+        fresh = (b.sin() / a.sin()) * (1 - kept).clamp(min=0).sqrt()
+        rest = (b.sin().square() - fresh.square()).clamp(min=0).sqrt()
+        x = b.cos() * clean(x, v, a) + rest * (a.sin() * x + a.cos() * v) + fresh * torch.randn_like(x)
+    return clean(x, field(x, steps), grid[-1])
+
+
+def log_density(field_on: On, x: Tensor, steps: int = 16) -> Tensor:
+    """(...,) log density of x (..., d) by the same ODE run backwards, with the exact trace of dv / dx.
+
+    log p(x) = log N(x_end) + integral of div v dphi (Song et al. 2021, equation 39), by Runge and Kutta's method of
+    fourth order: a bias here would be one of every density reported, so it is held to a hundredth of a nat.
+    """
+    ends = angles(steps).flip(0)
+    middles = (ends[:-1] + ends[1:]) / 2
+    grid = torch.cat([ends, middles]).sort().values.to(x.dtype).to(x.device)  # the odd ones are middles
+    field = field_on(grid)
+
+    def rate(both: Tensor, i: int) -> Tensor:
+        v, trace = divergence(lambda y: field(y, i), both[..., :-1])
+        return torch.cat([v, trace[..., None]], -1)
+
+    end = nn.functional.pad(x, (0, 1))
+    for i in range(0, 2 * steps, 2):
+        step = grid[i + 2] - grid[i]
+        k1 = rate(end, i)
+        k2 = rate(end + step / 2 * k1, i + 1)
+        k3 = rate(end + step / 2 * k2, i + 1)
+        end = end + step / 6 * (k1 + 2 * k2 + 2 * k3 + rate(end + step * k3, i + 2))
+    return end[..., -1] - (end[..., :-1].square() + math.log(2 * math.pi)).sum(-1) / 2
+
+
+def divergence(field: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
+    """v and its exact divergence (...,): forward derivatives along each axis, all axes and points in one batch."""
+    axes = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+
+    def along(axis: Tensor) -> tuple[Tensor, Tensor]:
+        v, dv = torch.func.jvp(field, (x,), (axis.expand_as(x),))  # type: ignore[misc] (no auxiliary output)
+        return v, (dv * axis).sum(-1)
+
+    v, parts = torch.func.vmap(along)(axes)
+    return v[0], parts.sum(0)

@@ -1,0 +1,70 @@
+"""A training run's state as one safetensors file: tensors by name, the rest as JSON in its metadata."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import replacing
+
+FORMAT = "nfc_gym-training-1"
+
+
+def save_state(path: Path, run: Any, description: dict[str, Any]) -> None:
+    """Write what `run` would need to go on; the old file stays until the new one is whole."""
+    tensors: dict[str, Tensor] = {}
+    for name in ("network", "average", "best"):
+        tensors |= {f"{name}/{k}": t for k, t in getattr(run, name).state_dict().items()}
+    for i, entry in run.optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser/{i}/{k}": t for k, t in entry.items()}
+    plain = {"step": run.step, "loss_sum": run.loss_sum, "outcome": asdict(run.outcome), "of": description}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {k: t.detach().cpu().contiguous().clone() for k, t in tensors.items()}
+    with replacing(path) as part:
+        save_file(tensors, part, {"format": FORMAT, "state": json.dumps(plain)})
+
+
+def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
+    """Set `run` to where the file left off.
+
+    Raises:
+      InputError: the file is damaged, or of a run with another network, prior, data or configuration.
+    """
+    tensors, metadata = read(path)
+    if metadata.get("format") != FORMAT:
+        raise InputError(f"{path}: format {metadata.get('format')!r}, want {FORMAT!r}: remove it to train anew")
+    plain = json.loads(metadata["state"])
+    differ = [k for k, v in json.loads(json.dumps(description)).items() if plain["of"].get(k) != v]
+    if differ:
+        raise InputError(
+            f"{path} is of another run (another {', '.join(differ)}): remove it to train anew, or use another folder"
+        )
+    for name in ("network", "average", "best"):
+        own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
+        getattr(run, name).load_state_dict(own)
+    state = run.optimiser.state_dict()
+    for key, tensor in tensors.items():
+        if key.startswith("optimiser/"):
+            _, i, name = key.split("/")
+            state["state"].setdefault(int(i), {})[name] = tensor
+    run.optimiser.load_state_dict(state)
+    run.step, run.loss_sum = plain["step"], plain["loss_sum"]
+    run.outcome = type(run.outcome)(**plain["outcome"])
+
+
+def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file.
+
+    Raises:
+      InputError: it is truncated, or no such file.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            return {k: file.get_tensor(k) for k in file.keys()}, file.metadata() or {}  # noqa: SIM118 (no dict)
+    except (SafetensorError, OSError, ValueError) as e:
+        raise InputError(f"{path}: truncated, or no safetensors file ({e})") from None

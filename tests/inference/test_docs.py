@@ -1,0 +1,32 @@
+"""The programs of docs/inference.md run as they stand, on the processor and for one epoch."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from problems import motion_windows
+
+import nfc_gym  # noqa: F401 (registers the environments)
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "inference.md").read_text(encoding="utf-8")
+
+
+def test_train_then_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    programs = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    assert len(programs) == 2
+    monkeypatch.chdir(tmp_path)
+    t = motion_windows(60).tensors
+    env = gymnasium.make("nfc_gym/JackalFlat-v0", context=["psi"])
+    names: dict[str, Any] = {"env": env, "states": t["states"], "actions": t["actions"], "u": torch.rand(60, 17)}
+    exec(programs[0].replace('"cuda"', '"cpu"').replace("TrainConfig()", "TrainConfig(epochs=1)"), names)
+    exec(programs[1], names)
+    assert names["outcome"].stopped == "epochs"
+    assert names["psi"].shape == (100, 17)
+    assert np.isfinite(names["told"]).all()
+    names["env"].reset(seed=0)
+    assert {p.name for p in tmp_path.iterdir()} == {"run", "jackal.safetensors", "today.safetensors"}
+    env.close()

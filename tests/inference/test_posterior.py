@@ -1,0 +1,192 @@
+"""`NeuralPosterior`: core's protocol, densities in physical units, checkpoints and what is refused."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from problems import box, gaussian, linear_windows, motion_windows, network
+from safetensors.torch import save_file
+
+import nfc_gym  # noqa: F401 (registers the loader and the environments)
+from nfc_gym.core import Fidelity, InputError, Posterior, load_source
+from nfc_gym.inference import checkpoint
+from nfc_gym.inference.posterior import NeuralPosterior, Window, load
+from nfc_gym.inference.space import PriorBox
+from nfc_gym.wrappers import RandomizePsi
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(3)
+
+
+def shaken(net: torch.nn.Module) -> torch.nn.Module:
+    with torch.no_grad():
+        for p in net.parameters():
+            p.add_(0.1 * torch.randn_like(p))
+    return net
+
+
+def cart(**config: object) -> tuple[NeuralPosterior, Window]:
+    windows = motion_windows(200)
+    net = shaken(network(windows, delta_s=True, families=("none", "force"), **config))
+    return NeuralPosterior(net), Window(windows.tensors["states"][0].numpy(), windows.tensors["actions"][0].numpy())
+
+
+@pytest.mark.parametrize("density", ["score", "mixture", "flow"])
+def test_it_is_a_posterior_of_the_core(density: str) -> None:
+    posterior, window = cart(density=density, linear=True)
+    given = posterior.given(window)
+    assert isinstance(given, Posterior)
+    drawn = given.sample(50, rng())
+    assert drawn.given == ("psi", "delta_s")
+    assert drawn.psi.shape == drawn.delta_s.shape == (50, 2)
+    assert ((drawn.psi >= posterior.prior.low) & (drawn.psi <= posterior.prior.high)).all()
+    np.testing.assert_array_equal(given.sample(50, rng()).psi, drawn.psi)
+    assert (given.sample(50, np.random.default_rng(4)).psi != drawn.psi).any()
+    assert given.log_prob(drawn).shape == given.log_prob(Fidelity(drawn.psi)).shape == (50,)
+    assert sum(given.families().values()) == pytest.approx(1)
+
+
+def test_sampling_leaves_torchs_generator_alone() -> None:
+    posterior, window = cart()
+    torch.manual_seed(1)
+    expected = torch.rand(3)
+    torch.manual_seed(1)
+    posterior.given(window).sample(5, rng())
+    torch.testing.assert_close(torch.rand(3), expected)
+
+
+def test_on_the_linear_base_draws_and_densities_are_the_closed_form() -> None:
+    windows = linear_windows(8000)
+    posterior = NeuralPosterior(network(windows, linear=True))
+    x = windows.tensors["states"][0]
+    given, exact = posterior.given(Window(x, np.zeros((0, 0)))), gaussian(x[0])
+    prior = posterior.prior
+    z = prior.to_z(given.sample(20000, rng()).psi)
+    sd = exact.covariance_matrix.diagonal().sqrt().numpy()
+    np.testing.assert_allclose((z.mean(0) - exact.mean.numpy()) / sd, 0, atol=0.08)
+    np.testing.assert_allclose(np.cov(z.T), exact.covariance_matrix, atol=0.01, rtol=0.05)
+    # in physical units: density in z over that of the prior, and 1 over the box's volume
+    truth = exact.sample((200,))
+    expected = exact.log_prob(truth) + (truth**2 + np.log(2 * np.pi)).sum(1) / 2 - prior.log_volume
+    wrong = given.log_prob(Fidelity(prior.from_z(truth.double().numpy()))) - expected.double().numpy()
+    assert abs(wrong.mean()) < 0.02
+
+
+def test_an_untrained_posterior_is_the_prior_in_physical_units() -> None:
+    windows = linear_windows(100)
+    given = NeuralPosterior(network(windows)).given(Window(windows.tensors["states"][0], np.zeros((0, 0))))
+    psi = given.sample(500, rng()).psi
+    np.testing.assert_allclose(given.log_prob(Fidelity(psi)), -given.prior.log_volume, atol=0.01)
+    outside = np.add(given.prior.high, [[0.1, 0, 0]])
+    assert given.log_prob(Fidelity(outside)) == -np.inf
+
+
+def test_the_density_of_psi_integrates_to_one_over_the_box() -> None:
+    windows = linear_windows(300, 1)
+    prior = PriorBox("toy", ("p",), ("m",), (2.0,), (7.0,))
+    given = NeuralPosterior(shaken(network(windows, prior))).given(Window([[0.3]], np.zeros((0, 0))))
+    psi = np.linspace(2, 7, 2001)[1:-1, None]
+    assert np.exp(given.log_prob(Fidelity(psi))).sum() * 5 / 2000 == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_constant_entry_of_delta_s_stays_that_constant(linear: bool) -> None:
+    windows = motion_windows(300)
+    windows.tensors["delta_s"][:, 0] = 0.25
+    seen = Window(windows.tensors["states"][0], windows.tensors["actions"][0])
+    given = NeuralPosterior(shaken(network(windows, delta_s=True, linear=linear))).given(seen)
+    drawn = given.sample(100, rng())
+    np.testing.assert_allclose(drawn.delta_s[:, 0], 0.25, rtol=1e-6)
+    assert drawn.delta_s[:, 1].std() > 0
+    # such an entry has no part in the density: untrained and without the base, the other's integrates to one
+    plain = NeuralPosterior(network(windows, delta_s=True)).given(seen)
+    line = np.linspace(-1, 1, 4001) * 40 * windows.tensors["delta_s"][:, 1].std().item()
+    psi = np.repeat(drawn.psi[:1], len(line), 0)
+    density = np.exp(plain.log_prob(Fidelity(psi, np.stack([np.full(len(line), 0.25), line], 1))))
+    volume = np.exp(plain.prior.log_volume)
+    assert density.sum() * (line[1] - line[0]) * volume == pytest.approx(1, abs=0.02)
+
+
+def test_longer_windows_count_from_their_end() -> None:
+    posterior, window = cart()
+    longer = Window(np.concatenate([np.ones((3, 2)), window.states]), np.concatenate([np.ones((3, 1)), window.actions]))
+    a, b = posterior.given(window).sample(5, rng()), posterior.given(longer).sample(5, rng())
+    np.testing.assert_array_equal(a.psi, b.psi)
+
+
+def test_bad_windows_are_refused() -> None:
+    posterior, window = cart()
+    states, actions = np.array(window.states), np.array(window.actions)
+    nan = states.copy()
+    nan[4, 1] = np.nan
+    for bad, message in (
+        (Window(states[:6], actions[:5]), "5 steps; this network was trained on windows of 10"),
+        (Window(nan, actions), "states holds nan"),
+        (Window(states[:, :1], actions), r"states must have shape \(time, 2\)"),
+        (Window(states[:-1], actions), r"n \+ 1 states go with n actions"),
+    ):
+        with pytest.raises(InputError, match=message):
+            posterior.given(bad)
+    with pytest.raises(InputError, match="was given no window"):
+        posterior.sample(3, rng())
+    with pytest.raises(InputError, match="delta_e has no density"):
+        posterior.given(window).log_prob(Fidelity(np.ones((1, 2)), None, np.zeros((1, 4, 4))))
+    with pytest.raises(InputError, match="x has no psi"):
+        posterior.given(window).log_prob(Fidelity(None, np.zeros((1, 2))))
+
+
+def test_a_robots_psi_is_drawn_from_a_file(tmp_path: Path) -> None:
+    with gymnasium.make("nfc_gym/JackalFlat-v0", context=["psi"]) as env:
+        prior = PriorBox.of(env.unwrapped.psi_space, "jackal")
+        windows = motion_windows(50)
+        windows.tensors["psi"] = torch.rand(50, len(prior))
+        t = windows.tensors
+        given = NeuralPosterior(network(windows, prior)).given(Window(t["states"][0], t["actions"][0]))
+        given.save(tmp_path / "given.safetensors")
+        randomised = RandomizePsi(env, str(tmp_path / "given.safetensors"))
+        randomised.reset(seed=0)
+        first = randomised.psi
+        randomised.reset(seed=1)
+        assert (first >= prior.low).all()
+        assert (first <= prior.high).all()
+        assert (first != randomised.psi).any()
+
+
+@pytest.mark.parametrize("density", ["score", "mixture", "flow"])
+def test_checkpoints_hold_all_that_rebuilds_it(tmp_path: Path, density: str) -> None:
+    posterior, window = cart(density=density, encoder="tcn", summaries=True, linear=True)
+    posterior.save(tmp_path / "p.safetensors")
+    again = load(tmp_path / "p.safetensors", posterior.prior)
+    expected = posterior.given(window).sample(20, rng())
+    np.testing.assert_array_equal(again.given(window).sample(20, rng()).psi, expected.psi)
+    np.testing.assert_array_equal(again.given(window).sample(20, rng()).delta_s, expected.delta_s)
+    # with its window inside, it is a source that any wrapper opens by its path
+    posterior.given(window).save(tmp_path / "g.safetensors")
+    np.testing.assert_array_equal(load_source(tmp_path / "g.safetensors").sample(20, rng()).psi, expected.psi)
+    assert [p.name for p in sorted(tmp_path.iterdir())] == ["g.safetensors", "p.safetensors"]
+
+
+def test_a_checkpoint_of_something_else_is_refused(tmp_path: Path) -> None:
+    posterior, _ = cart()
+    path = tmp_path / "p.safetensors"
+    posterior.save(path)
+    with pytest.raises(InputError, match=r"p.safetensors is of the robot 'toy', not of 'arm'"):
+        load(path, box(2, "arm"))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="truncated"):
+        load(path)
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="truncated, or no safetensors file"):
+        load_source(path)
+    save_file({"a": torch.zeros(1)}, path, {"format": "nfc_gym-posterior-99"})
+    with pytest.raises(InputError, match=r"'nfc_gym-posterior-99'; this version .* reads 'nfc_gym-posterior-1'"):
+        load(path)
+    save_file({"a": torch.zeros(1)}, path, {"format": checkpoint.FORMAT, "about": "{}"})
+    with pytest.raises(InputError, match="describe no network"):
+        load(path)
+    with pytest.raises(InputError, match=r"ends in \.safetensors"):
+        posterior.save(tmp_path / "p.pt")

@@ -1,0 +1,86 @@
+"""Truncated proposals on a posterior that is known."""
+
+import numpy as np
+import pytest
+import torch
+from problems import NOISE, box, gaussian, linear_windows, mix, network
+
+from nfc_gym.core import Fidelity, InputError
+from nfc_gym.inference.posterior import NeuralPosterior, Window
+from nfc_gym.inference.sequential import SequentialConfig, TruncatedPrior, sequential
+from nfc_gym.inference.train import TrainConfig
+
+X = torch.tensor([[0.8, -0.5, 0.3]])
+OBSERVED = Window(X, np.zeros((0, 0)))
+
+
+def given() -> NeuralPosterior:
+    """Close to exact, without training: the linear base; a mixture of one, whose density costs little."""
+    return NeuralPosterior(network(linear_windows(5000), linear=True, density="mixture", components=1)).given(OBSERVED)
+
+
+def simulate(psi: np.ndarray, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    z = box(3).to_z(psi)
+    x = z @ mix(3).numpy().T + NOISE * rng.normal(size=z.shape)
+    return {"states": torch.as_tensor(x[:, None], dtype=torch.float32), "actions": torch.zeros(len(x), 0, 0)}
+
+
+@pytest.mark.parametrize("way", ["_rejected", "_resampled"])
+def test_proposals_are_the_prior_where_the_posterior_has_mass(way: str) -> None:
+    proposal = TruncatedPrior(given(), SequentialConfig(oversampling=64), np.random.default_rng(0))
+    psi = getattr(proposal, way)(400, np.random.default_rng(1))
+    assert psi.shape == (400, 3)
+    # all above the threshold
+    assert (proposal._gain(psi) > proposal.threshold).all()
+    # and as the prior is there: the same means and spreads as brute rejection from it
+    rng, prior = np.random.default_rng(2), given().prior
+    brute = prior.psi_of(rng.uniform(size=(40000, 3)))
+    brute = brute[proposal._gain(brute) > proposal.threshold]
+    assert proposal.kept == pytest.approx(len(brute) / 40000, rel=0.2)
+    u, v = prior.u_of(psi), prior.u_of(brute)
+    tolerance = 0.02 if way == "_rejected" else 0.05  # resampled draws thin out at the edge
+    np.testing.assert_allclose(u.mean(0), v.mean(0), atol=tolerance)
+    np.testing.assert_allclose(u.std(0), v.std(0), atol=tolerance)
+
+
+def test_the_truth_is_hardly_ever_cut_off() -> None:
+    proposal = TruncatedPrior(given(), SequentialConfig(), np.random.default_rng(0))
+    truths = gaussian(X[0]).sample((4000,)).double().numpy()
+    inside = proposal._gain(box(3).from_z(truths)) > proposal.threshold
+    assert inside.mean() > 0.995
+
+
+def test_rounds_close_in_and_end_where_they_no_longer_narrow() -> None:
+    net = network(linear_windows(200), linear=True)
+    heard: list[str] = []
+
+    class Heard:
+        def epoch(self, *args: object) -> None: ...
+
+        def message(self, text: str) -> None:
+            heard.append(text)
+
+    out = sequential(
+        net, simulate, OBSERVED, SequentialConfig(rounds=2, simulations=400, samples=150, oversampling=4),
+        TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95), report=Heard(),
+    )  # fmt: skip
+    assert len(out.entropy) == len(out.outcomes) == len(out.kept) >= 2
+    assert out.entropy[-1] < out.entropy[0] < 0
+    assert out.kept[0] == 1
+    assert out.kept[-1] < 0.8
+    assert len(out.windows) == 400 * len(out.entropy)
+    assert sum(t.startswith("round") for t in heard) == len(out.entropy)
+    if out.stopped == "no longer narrows":
+        assert out.entropy[-2] - out.entropy[-1] < 0.05
+    exact = gaussian(X[0])
+    z = box(3).to_z(out.posterior.sample(4000, np.random.default_rng(0)).psi)
+    sd = exact.covariance_matrix.diagonal().sqrt().numpy()
+    assert np.abs((z.mean(0) - exact.mean.numpy()) / sd).max() < 0.5
+    assert np.isfinite(out.posterior.log_prob(Fidelity(box(3).from_z(z[:5])))).all()
+
+
+def test_bad_settings_are_refused() -> None:
+    with pytest.raises(InputError, match="rounds >= 1"):
+        SequentialConfig(rounds=0)
+    with pytest.raises(InputError, match="quantile"):
+        SequentialConfig(quantile=0.0)

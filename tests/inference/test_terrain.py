@@ -1,0 +1,93 @@
+"""delta_e beside (psi, delta_s): the joint diffusion of vector and map."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from problems import motion_windows, network
+
+from nfc_gym.core import Fidelity, InputError
+from nfc_gym.inference.config import NetworkConfig
+from nfc_gym.inference.data import TensorWindows
+from nfc_gym.inference.heads.score import Score
+from nfc_gym.inference.heads.terrain import Terrain
+from nfc_gym.inference.posterior import NeuralPosterior, Window, load
+
+
+def with_maps(n: int) -> TensorWindows:
+    """delta_e is a bump whose height is the first of psi; the map is a slope."""
+    windows = motion_windows(n)
+    line = torch.linspace(-1, 1, 128)
+    bump = torch.exp(-4 * (line[:, None] ** 2 + line[None] ** 2))
+    height = windows.tensors["psi"][:, 0] - 0.5
+    slope = torch.randn(n, 1, 1, generator=torch.Generator().manual_seed(1)) * line[None, :, None].expand(n, 128, 128)
+    return TensorWindows({**windows.tensors, "delta_e": height[:, None, None] * bump, "map": slope})
+
+
+def test_untrained_it_is_the_prior_of_both() -> None:
+    score, terrain = Score((2, 2), 4, 16, 1), Terrain(4, 4, 16)
+    with torch.no_grad():
+        y, m = terrain.sample(6, torch.randn(1, 4), torch.randn(1, 128, 128), score, steps=3)
+    assert (y.shape, m.shape) == ((6, 4), (6, 128, 128))
+    assert float(m.mean()) == pytest.approx(0, abs=0.02)
+    assert float(m.std()) == pytest.approx(1, abs=0.02)
+
+
+def test_each_block_sees_the_others_noise() -> None:
+    score, terrain = Score((2,), 4, 16, 1), Terrain(4, 2, 16)
+    with torch.no_grad():
+        for p in (*score.parameters(), *terrain.parameters()):
+            p.add_(0.1 * torch.randn_like(p))
+    phi, features, elevation = torch.tensor([0.5]), torch.randn(1, 4), torch.randn(1, 128, 128)
+    y, m = torch.randn(1, 2), torch.randn(1, 128, 128)
+    of_y, of_m = terrain.v((y, m), phi, features, elevation, score)
+    other_y, _ = terrain.v((y, m + 1), phi, features, elevation, score)
+    _, other_m = terrain.v((y + 1, m), phi, features, elevation, score)
+    assert not torch.allclose(of_y, other_y)
+    assert not torch.allclose(of_m, other_m)
+
+
+def test_it_learns() -> None:
+    """The same map every time: v is then known from the noised map alone."""
+    score, terrain = Score((1,), 1, 16, 1), Terrain(1, 1, 16)
+    line = torch.linspace(-1, 1, 128)
+    bump = 2 * torch.exp(-4 * (line[:, None] ** 2 + line[None] ** 2)).expand(2, 128, 128)
+    optimiser = torch.optim.Adam([*score.parameters(), *terrain.parameters()], 2e-3)
+    losses = []
+    for i in range(24):
+        torch.manual_seed(i % 4)  # the same noise again
+        loss = terrain.loss(torch.zeros(2, 1), bump, torch.ones(2, 1), torch.zeros(2, 128, 128), score).mean()
+        losses.append(loss.item())
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert sum(losses[-4:]) < 0.7 * sum(losses[:4]), losses
+
+
+def test_draws_are_fidelities_and_go_through_files(tmp_path: Path) -> None:
+    windows = with_maps(6)
+    net = network(windows, delta_s=True, elevation=True, delta_e=True)
+    t = windows.tensors
+    given = NeuralPosterior(net).given(Window(t["states"][0], t["actions"][0], t["map"][0]))
+    drawn = given.sample(2, np.random.default_rng(0), steps=3)
+    assert drawn.given == ("psi", "delta_s", "delta_e")
+    assert drawn.delta_e.shape == (2, 128, 128)
+    # untrained: the training set's own spread, in m
+    assert drawn.delta_e.std() == pytest.approx(float(t["delta_e"].std()), rel=0.1)
+    assert given.of("psi").sample(3, np.random.default_rng(0)).given == ("psi",)
+    assert given.log_prob(Fidelity(drawn.psi, drawn.delta_s)).shape == (2,)
+    given.save(tmp_path / "p.safetensors")
+    again = load(tmp_path / "p.safetensors").sample(2, np.random.default_rng(0), steps=3)
+    np.testing.assert_array_equal(again.delta_e, drawn.delta_e)
+    with pytest.raises(InputError, match="give `elevation`"):
+        NeuralPosterior(net).given(Window(t["states"][0], t["actions"][0]))
+    with pytest.raises(InputError, match="parts are psi and others of psi, delta_s, delta_e"):
+        given.of("delta_e")
+
+
+def test_it_needs_a_map_and_the_score_model() -> None:
+    with pytest.raises(InputError, match="want elevation=True, density='score'"):
+        NetworkConfig(delta_e=True)
+    with pytest.raises(InputError, match="needs 'map'"):
+        network(motion_windows(10), elevation=True)

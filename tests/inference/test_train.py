@@ -1,0 +1,223 @@
+"""The training loop: it learns what is known in closed form, goes on after a kill, and keeps what was good."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from problems import box, gaussian, linear_windows, motion_windows, network
+
+from nfc_gym.core import InputError
+from nfc_gym.inference.data import StoredWindows, TensorWindows
+from nfc_gym.inference.train import TrainConfig, train
+
+QUICK = TrainConfig(epochs=4, batch=64, rate=2e-3, warmup=10, average=0.98)
+
+
+def divergence_from_truth(net: torch.nn.Module, size: int) -> float:
+    """Mean of log p - log q over pairs, nats: KL of the network's posterior from the exact one."""
+    x = linear_windows(50, size, seed=9).tensors["states"][:, 0]
+    exact = gaussian(x)
+    z = exact.sample((20,)).transpose(0, 1).contiguous()
+    with torch.no_grad():
+        kept = net.encode(x[:, None], torch.zeros(50, 0, 0))  # type: ignore[operator]
+        return float((exact.log_prob(z.transpose(0, 1)).T - net.log_prob(z, kept)).mean())  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("density", ["score", "mixture", "flow"])
+def test_each_density_learns_the_posterior_of_a_linear_gaussian(density: str) -> None:
+    every = linear_windows(4000)
+    windows, held_out = every.split(0.1)
+    net = network(windows, density=density, components=1, depth=2, draws=2)
+    before = divergence_from_truth(net, 3)
+    out = train(net, windows, held_out, replace(QUICK, epochs=9, batch=128, rate=5e-3))
+    after = divergence_from_truth(net, 3)
+    assert after < 0.15 * before
+    assert after < 0.12
+    assert out.held_out[out.best - 1] < out.start
+
+
+def test_on_the_linear_base_it_is_the_closed_form() -> None:
+    every = linear_windows(4000)
+    net = network(every, linear=True)
+    train(net, *every.split(0.1), replace(QUICK, epochs=2))
+    assert abs(divergence_from_truth(net, 3)) < 0.02  # 18 coefficients and covariances from 4000 pairs: 0.003 nats
+
+
+def test_a_killed_run_ends_as_an_unbroken_one(tmp_path: Path) -> None:
+    class Killed(TensorWindows):
+        """Stops everything in the middle of an epoch."""
+
+        left = 27
+
+        def batches(self, size: int, seed: int | None) -> Iterator[dict[str, torch.Tensor]]:
+            for batch in super().batches(size, seed):
+                Killed.left -= 1
+                if Killed.left == 0:
+                    raise KeyboardInterrupt
+                yield batch
+
+    windows, held_out = linear_windows(1000).split(0.1)
+    config = replace(QUICK, save_every=0.0)  # a state after every step
+    whole = network(windows, dropout=0.1)
+    expected = train(whole, windows, held_out, config)
+    broken = network(windows, dropout=0.1)
+    with pytest.raises(KeyboardInterrupt):
+        train(broken, Killed(windows.tensors), held_out, config, folder=tmp_path)
+    again = network(windows, dropout=0.1, seed=5)  # a new process: weights of its own
+    out = train(again, windows, held_out, config, folder=tmp_path)
+    assert (out.train, out.held_out, out.best) == (expected.train, expected.held_out, expected.best)
+    for name, tensor in whole.state_dict().items():
+        assert torch.equal(tensor, again.state_dict()[name]), name
+    finished = train(network(windows, dropout=0.1), windows, held_out, config, folder=tmp_path)
+    assert finished.held_out == out.held_out  # nothing is left to do
+
+
+def test_a_state_of_something_else_is_refused(tmp_path: Path) -> None:
+    windows, held_out = linear_windows(300).split(0.1)
+    train(network(windows), windows, held_out, replace(QUICK, epochs=1), folder=tmp_path)
+    with pytest.raises(InputError, match=r"of another run \(another config\)"):
+        train(network(windows), windows, held_out, QUICK, folder=tmp_path)
+    file = tmp_path / "training.safetensors"
+    file.write_bytes(file.read_bytes()[:-1000])
+    with pytest.raises(InputError, match="truncated"):
+        train(network(windows), windows, held_out, replace(QUICK, epochs=1), folder=tmp_path)
+
+
+def test_a_run_that_diverges_keeps_its_last_good_weights() -> None:
+    class Poisoned(TensorWindows):
+        """From the third epoch on, its states are beyond float32's squares."""
+
+        epochs = 0
+
+        def batches(self, size: int, seed: int | None) -> Iterator[dict[str, torch.Tensor]]:
+            Poisoned.epochs += 1
+            for batch in super().batches(size, seed):
+                yield {**batch, "delta_s": batch["delta_s"] * (torch.inf if Poisoned.epochs > 3 else 1)}
+
+    said: list[str] = []
+
+    class Heard:
+        def epoch(self, *args: object) -> None: ...
+
+        def message(self, text: str) -> None:
+            said.append(text)
+
+    windows, held_out = motion_windows(400).split(0.2)
+    net = network(windows, delta_s=True, density="mixture")
+    out = train(net, Poisoned(windows.tensors), held_out, QUICK, report=Heard())
+    assert out.stopped == "diverged"
+    assert len(out.train) == 2  # the first pass over the windows took the scales
+    assert "diverged" in said[-1]
+    assert f"epoch {out.best} are kept" in said[-1]
+    assert all(torch.isfinite(t).all() for t in net.state_dict().values())
+    assert out.best > 0
+    with torch.no_grad():  # a mixture's loss has no noise: these are the weights of the best epoch
+        assert float(net.losses(held_out.tensors)["density"]) == pytest.approx(out.held_out[out.best - 1], rel=1e-5)
+
+
+def test_it_stops_where_nothing_more_generalises() -> None:
+    windows, held_out = linear_windows(60).split(0.5)
+    out = train(network(windows), windows, held_out, TrainConfig(epochs=500, batch=30, rate=2e-2, warmup=1, patience=5,
+                                                                 average=0.5))  # fmt: skip
+    assert out.stopped == "patience"
+    assert len(out.train) - out.best == 5
+    assert min([out.start, *out.held_out]) == ([out.start, *out.held_out][out.best])
+
+
+def test_all_heads_learn_together() -> None:
+    every = motion_windows(3000)
+    windows, held_out = every.split(0.2)
+    net = network(windows, summaries=True, delta_s=True, families=("none", "force"))
+    before = {k: float(v.detach()) for k, v in net.losses(held_out.tensors).items()}
+    train(net, windows, held_out, replace(QUICK, epochs=8, rate=5e-3))
+    after = {k: float(v.detach()) for k, v in net.losses(held_out.tensors).items()}
+    assert set(before) == {"density", "structure"}
+    assert after["density"] < 0.9 * before["density"]
+    assert after["structure"] < 0.6
+
+
+@pytest.mark.parametrize("encoder", ["tcn", "qmc-rff", "qmc-fks"])
+def test_mixed_precision_loses_little_and_the_base_nothing(encoder: str) -> None:
+    t = motion_windows(300).tensors
+    net = network(TensorWindows(t), encoder=encoder, summaries=True, linear=True)
+    exact, expected = net.encode(t["states"], t["actions"]), net.losses(t)
+    with torch.autocast("cpu", torch.bfloat16):
+        rough = net.encode(t["states"], t["actions"])
+        torch.manual_seed(0)
+        losses = net.losses(t)
+    torch.testing.assert_close(rough.mean, exact.mean)
+    assert (rough.features - exact.features).abs().mean() < 0.02 * exact.features.abs().mean()
+    assert float(losses["density"].detach()) == pytest.approx(float(expected["density"].detach()), rel=0.1)
+
+
+def test_no_memory_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
+    windows, held_out = linear_windows(300).split(0.2)
+    net = network(windows)
+
+    def full(batch: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    net.losses = full  # type: ignore[method-assign]
+    with pytest.raises(InputError, match=r"no memory for 64 windows a step on cpu: use batch=32; it goes on from"):
+        train(net, windows, held_out, QUICK, folder=tmp_path)
+
+
+def test_bad_windows_are_refused() -> None:
+    good = motion_windows(50)
+    net = network(good, delta_s=True)
+    for change, message in (
+        ({"psi": good.tensors["psi"] + 1}, r"in \[0, 1\]"),
+        ({"states": good.tensors["states"] * torch.nan}, "states holds NaN"),
+        ({"states": good.tensors["states"][:, :5]}, r"H \+ 1 states go with H actions, got 5 and 10"),
+        ({"family": good.tensors["family"][:7]}, "different numbers"),
+    ):
+        with pytest.raises(InputError, match=message):
+            TensorWindows({**good.tensors, **change})
+    short = {**good.tensors, "states": good.tensors["states"][:, :5], "actions": good.tensors["actions"][:, :4]}
+    with pytest.raises(InputError, match="horizon is 4, the network's is 10"):
+        train(net, TensorWindows(short), good)
+    without = {k: v for k, v in good.tensors.items() if k != "delta_s"}
+    with pytest.raises(InputError, match="needs 'delta_s'"):
+        train(net, TensorWindows(without), good)
+    with pytest.raises(InputError, match="psi has 2 entries; the prior of 'toy' has 3"):
+        network(good, box(3))
+    with pytest.raises(InputError, match="held out"):
+        train(net, good, StoredWindows(Stored(good), rows=good.tensors["family"][:0].numpy()))
+
+
+class Stored:
+    """A stored set: numpy batches of the rows asked for."""
+
+    def __init__(self, windows: TensorWindows) -> None:
+        self.arrays = {k: t.numpy() for k, t in windows.tensors.items()}
+        self.names, self.manifest = (*self.arrays, "pose"), {"robot": "toy"}
+
+    def __len__(self) -> int:
+        return len(self.arrays["psi"])
+
+    def batches(self, size, seed, rows, names):
+        order = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed % 2**60)).numpy()]
+        for i in range(0, len(order), size):
+            yield {n: self.arrays[n][order[i : i + size]] for n in names}
+
+
+def test_stored_maps_become_map_and_delta_e() -> None:
+    perceived = torch.randn(8, 128, 128).half()
+    stored = Stored(motion_windows(8, perceived=perceived, true=perceived + 1))
+    (batch,) = StoredWindows(stored, maps=True).batches(8, None)
+    assert "map" not in next(StoredWindows(stored).batches(8, None))
+    torch.testing.assert_close(batch["delta_e"], torch.ones(8, 128, 128), atol=2e-3, rtol=0)
+    assert batch["map"].dtype == torch.float32
+    with pytest.raises(InputError, match="the set holds no maps"):
+        StoredWindows(Stored(motion_windows(8)), maps=True)
+
+
+def test_windows_on_disk_train_as_those_in_memory_do() -> None:
+    stored = StoredWindows(Stored(motion_windows(500)))
+    windows, held_out = stored.split(0.2)
+    assert (len(windows), len(held_out), windows.manifest["robot"]) == (400, 100, "toy")
+    net = network(motion_windows(500), delta_s=True)
+    out = train(net, windows, held_out, replace(QUICK, epochs=3))
+    assert out.held_out[-1] < out.start
