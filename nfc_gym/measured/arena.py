@@ -192,17 +192,20 @@ class Arena:
 
     def worth(self, j: Judged, share: float) -> bool:
         """Whether a gain holds on unseen logs and is a share of the misfit worth naming."""
-        return j.lower > 0 and j.gain > 0 and j.total > share * self._misfit
+        return j.lower > 0 and j.gain > 0 and j.total > share * self.misfit
 
     @property
-    def _misfit(self) -> float:
+    def misfit(self) -> float:
         """Loss of the model to beat on both sets of logs."""
         return float(self.base.sum()) + float(self.current.losses.sum())
 
     def asked(self, found: Screened, share: float) -> float:
         """What a screened candidate must gain on both sets of logs: its price, and a share worth naming."""
-        price_of = price(self._numbers, len(found.effect.params), dispersion(self.current))
-        return price_of + share * self._misfit
+        return self.cost(len(found.effect.params)) + share * self.misfit
+
+    def cost(self, parameters: int) -> float:
+        """Of so many more parameters."""
+        return price(self._numbers, parameters, dispersion(self.current))
 
     def promises(self, found: Screened) -> float:
         """What a screened candidate would gain on both sets of logs if screening were right."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.halved import artefacts
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.remainder import CLEARLY, SILENT, LawSearch, Remainder
@@ -133,6 +134,9 @@ class Search:
                 break
             state = State(better.plant, better.x, tuple(rounds), frozenset(self.lookout.hopeless))
             keep(state)
+        confirmed = self._confirmed(arena, rounds)
+        if confirmed is not arena:
+            arena, screen = confirmed, Screen(self.fit_data.problem, confirmed.under, confirmed.current)
         dropped: list[str] = []
         generic = self._generic(arena, screen, outcome) if arena.leftover > SILENT else None
         label = None if generic is None else arena.label(generic)
@@ -154,6 +158,16 @@ class Search:
         out = laws.run(arena, found.calibrated)
         out.dropped = out.dropped or found.dropped
         return out
+
+    def _confirmed(self, arena: Arena, rounds: list[Round]) -> Arena:
+        """The arena without the effects that do not outlive half the physics step."""
+        while found := artefacts(arena, self.options.worth):
+            reason = f"dropped {found[0].id}: at half the physics step it explains nothing worth naming"
+            self.say(reason)
+            rounds.append(Round([], 0.0, reason=reason))
+            bare = arena.without(found[0]).current
+            arena = self.settle(bare.plant, bare.x, polished=True)
+        return arena
 
     def _exchange(self, arena: Arena, rounds: list[Round]) -> Fit | None:
         """A model in which another law took the place of an earlier one, if that is clearly better."""

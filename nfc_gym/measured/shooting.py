@@ -261,7 +261,17 @@ class RolloutProblem(Problem):
 
     def _halved(self, plant: Plant, x: Array, segments: Segments, copies: int = 1) -> Array:
         """The same with the physics step halved."""
-        return self._again(_finer(plant), x, refine(segments), copies, finer=2)
+        return self._again(finer(plant), x, refine(segments), copies, finer=2)
+
+    def halved(self) -> "RolloutProblem":
+        """The same segments at half the physics step, for plants that are `finer`."""
+        out = object.__new__(RolloutProblem)
+        out.__dict__.update(self.__dict__)
+        layout = self._kit.layout
+        out._kit = replace(self._kit, layout=replace(layout, dt=layout.dt / 2))
+        out._where = replace(self._where, step=self._where.step * 2)
+        out.segments = refine(self.segments)
+        return out
 
     def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
         """See `Problem`."""
@@ -278,7 +288,7 @@ class RolloutProblem(Problem):
 
     def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "RolloutProblem":
         """The model's own motion from the measured starts at half the step, with fresh start and sensor noise."""
-        values, traj = self.predict(_finer(plant), x[None], refine(self.segments), self._observers)
+        values, traj = self.predict(finer(plant), x[None], refine(self.segments), self._observers)
         out = self.take(np.flatnonzero(traj.stable[0]))
         stable, step = traj.stable[0], self._where.step * 2
         measured = []
@@ -300,7 +310,7 @@ class RolloutProblem(Problem):
         return out
 
 
-def _finer(plant: Plant) -> Plant:
+def finer(plant: Plant) -> Plant:
     """The same plant with half the physics step."""
     model = copy.copy(plant.model)
     model.opt.timestep = plant.model.opt.timestep / 2

@@ -101,6 +101,15 @@ class SpringOffset(_OnJoint):
         Param("rest", "rad", -10.0, 10.0, probes=(0.0,), shape=True),
     )
 
+    def chart(self, theta: Array) -> Array:
+        """Stiffness and stiffness times rest: a spring's force is a straight line in these."""
+        return np.concatenate([theta[..., :1], theta[..., :1] * theta[..., 1:]], -1)
+
+    def unchart(self, coordinates: Array) -> Array:
+        stiffness = coordinates[..., :1]
+        least = 1e-6 * self.params[0].high
+        return np.concatenate([stiffness, coordinates[..., 1:] / np.maximum(stiffness, least)], -1)
+
     def bind(self, model: mujoco.MjModel) -> None:
         super().bind(model)
         self.joints = model.dof_jntid[self.dofs].astype(np.intp)
