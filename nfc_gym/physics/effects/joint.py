@@ -156,14 +156,17 @@ class SpringOffset(_OnJoint):
 
 
 def _rests(model: mujoco.MjModel, where: tuple[str, ...], scales: Scales) -> tuple[tuple[float, ...], float]:
-    """Rest positions to try, and the joint's typical excursion."""
+    """Rest positions to try, the joint's own and those about where it moves, and its typical excursion."""
     coordinate = int(rows_of(model, "qpos_spring", where[:1])[0])
     joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, where[0])
     own = float(model.qpos_spring[coordinate])
     spread = scales.channels.get(f"joint:{where[0]}:pos", (0.0, 0.0))[0]
     low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (own - 1.0, own + 1.0)
     reach = max(spread, 0.1 * (high - low), 1e-3)
-    return (own, own - reach, own + reach), reach
+    middle = own
+    if scales.low is not None and scales.high is not None:
+        middle = float(scales.low[coordinate] + scales.high[coordinate]) / 2
+    return (own, middle - reach, middle + reach), reach
 
 
 class Cogging(_OnJoint):
