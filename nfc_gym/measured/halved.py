@@ -1,4 +1,4 @@
-"""Claims that do not outlive half the physics step.
+"""What half the physics step says: claims that do not outlive it, and by how much parameters are off for the step.
 
 A model at a coarse step is off in the same way in every segment, and a small effect may make up for that: the noise of
 the discretisation, taken segment by segment, is no bound for what adds up over all of them. What a machine really does
@@ -6,14 +6,19 @@ gains as much at half the step; what stands in for the error of a first-order st
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.contest import losses
 from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.metric import Metric
+from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.shooting import RolloutProblem, finer
 from nfc_gym.physics.effects.base import Effect
 
+Array = NDArray[np.float64]
 _KEPT = 0.35  # share of its gain that an effect must keep at half the step
+_BOUND = 1.96  # standard deviations within which 95 % lie
 _ROUNDS = 8  # iterations of the fits at half the step, which reuse the slopes of the whole one
 
 
@@ -40,6 +45,21 @@ def artefacts(arena: Arena, worth: float) -> list[Effect]:
         if gain < max(arena.cost(len(effect.params)) + worth * left, _KEPT * coarse):
             found.append((gain, effect))
     return [e for _, e in sorted(found, key=lambda pair: pair[0])]
+
+
+def step_error(problem: Problem, under: Metric, fitted: Fit) -> Array:
+    """(size,) standard deviation that the physics step adds to a fit's parameters; 0 where no roll-outs are made.
+
+    Parameters make up for the step's error too: the best servo gain at 5 ms is not the machine's. A first-order step is
+    off by twice what halving it changes, and that whole change counts as 95 % bound.
+    """
+    if not isinstance(problem, RolloutProblem):
+        return np.zeros(len(fitted.x))
+    known = fitted.jacobian
+    # Both fits go on from one point with the same slopes, so that they differ by the step alone.
+    coarse = fit(problem, under, fitted.plant, fitted.x, _ROUNDS, known=known)
+    fine = fit(problem.halved(), under, finer(fitted.plant), fitted.x, _ROUNDS, known=known)
+    return np.abs(fine.x - coarse.x) / problem.reach(fitted.plant) / _BOUND
 
 
 def _halved(data: Data) -> RolloutProblem | None:

@@ -24,6 +24,7 @@ from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, stand
+from nfc_gym.measured.halved import step_error
 from nfc_gym.measured.identify import table
 from nfc_gym.measured.kept import pack_state, unpack_state
 from nfc_gym.measured.metric import metric
@@ -189,10 +190,11 @@ def _fold(
     work = bench.problem(fitting, most=max(40, int(_WORK / steps)))
     select = bench.problem(selecting, most=max(40, int(_WORK / steps)))
     found = _search(run, fitting, work, select)
-    final = _final(run, found, whole)
+    calibrated, extended, step = _final(run, found, whole)
+    final = calibrated, extended
     pool = candidates(bench, [*fitting, *selecting])
     known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
-    outcome = report(bench, fold, found, final, bench.problem(verifying), whole, seed, tell)
+    outcome = report(bench, fold, found, final, step, bench.problem(verifying), whole, seed, tell)
     outcome["identifiability"] = table(known.lens, pool, known.stakes)
     advice = advise(bench, [*fitting, *selecting], outcome, known, tell, seed)
     outcome["identifiability"] = advice.rows
@@ -261,9 +263,9 @@ def _keep_found(stages: Stages, found: Found) -> None:
     stages.put("found", pack_state(state) | {"slack": found.slack.tolist()} | names)
 
 
-def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
-    """Calibrated and extended model refitted on every fit segment."""
-    out = []
+def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit, Array]:
+    """Calibrated and extended model refitted on every fit segment; the physics step's error in the latter's numbers."""
+    out, under = [], None
     assert found.rest is not None
     for name, start in (("calibrated", found.calibrated), ("extended", found.rest.fitted)):
         sigma = whole.covariance(start.plant, start.x)
@@ -272,8 +274,10 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit]:
             fitted, _, extra = settle(whole, sigma, start.plant, start.x)
             run.stages.put(f"final {name}", {"x": fitted.x.tolist(), "slack": extra.tolist()})
         kept = {k: np.array(v, float) for k, v in run.stages.get(f"final {name}").items()}
-        out.append(stand(whole, metric(whole, sigma, kept["slack"]), start.plant, kept["x"]))
-    return out[0], out[1]
+        under = metric(whole, sigma, kept["slack"])
+        out.append(stand(whole, under, start.plant, kept["x"]))
+    assert under is not None
+    return out[0], out[1], step_error(whole, under, out[1])
 
 
 def _identify(

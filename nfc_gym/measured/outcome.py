@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from nfc_gym.core.files import write_together
 from nfc_gym.measured import verdict as say
@@ -25,6 +26,7 @@ from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import digest
 from nfc_gym.measured.unexplained import unexplained
 
+Array = NDArray[np.float64]
 _REPLICAS = 6  # of a machine that is exactly the extended model
 
 
@@ -33,6 +35,7 @@ def report(
     fold: Fold,
     found: Found,
     final: tuple[Fit, Fit],
+    step: Array,
     verifying: Problem,
     fitting: Problem,
     seed: int,
@@ -44,6 +47,7 @@ def report(
       bench: the mapping made ready.
       found: what the search found.
       final: calibrated and extended model.
+      step: (size,) what the physics step adds to the standard deviations of the extended model's parameters.
       verifying, fitting: the logs that nobody saw, and those that the final models were fitted to.
       seed: of the draws.
       tell: progress.
@@ -55,13 +59,14 @@ def report(
     tell(f"verifying on {len(verifying)} segments")
     v = say.verify(verifying, models, _REPLICAS, rng)
     shares = say.excess_shares(v, verifying, extended, models.calibrated)
-    rows = say.effect_rows(extended, found.rounds, fitting, shares)
+    sd = say.spread(extended, fitting, step)
+    rows = say.effect_rows(extended, found.rounds, sd, shares)
     laws = {e.id for e in extended.plant.effects if e.generic}
     claimed, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
     verdict = say.verdict(v, len(claimed), found.generic is not None or bool(proposed))
     left = verdict in ("unexplained", "partly explained")
     assert found.rest is not None
-    parameters = say.parameter_rows(extended, nominal[1], fitting)
+    parameters = say.parameter_rows(extended, nominal[1], sd)
     splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
     return {
         "schema": 1,

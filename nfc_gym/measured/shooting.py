@@ -212,14 +212,14 @@ class RolloutProblem(Problem):
             moved, discretised = self._drawn(plant, x, base)
             carried = np.concatenate([carried, moved]) * np.sqrt(0.5)  # two estimates of one covariance: their mean
         else:
-            discretised = (self._halved(plant, x, self.segments) - base) / self._reach(plant)
+            discretised = (self._halved(plant, x, self.segments) - base) / self.reach(plant)
         for column in (*carried, *discretised):
             column = np.where(np.isfinite(column), column, 0.0)
             sigma += column[:, :, None] * column[:, None, :]
         return sigma
 
     @staticmethod
-    def _reach(plant: Plant) -> float:
+    def reach(plant: Plant) -> float:
         """Share of a step's whole error that halving it shows: of a first-order integrator, half."""
         order = 4 if plant.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else 1
         return 1 - 0.5**order
@@ -236,7 +236,7 @@ class RolloutProblem(Problem):
         )
         coarse = self._again(plant, x, repeated, _DRAWS)
         fine = self._halved(plant, x, repeated, _DRAWS)
-        return (coarse - base) / np.sqrt(_DRAWS), (fine - coarse) / self._reach(plant) / np.sqrt(_DRAWS)
+        return (coarse - base) / np.sqrt(_DRAWS), (fine - coarse) / self.reach(plant) / np.sqrt(_DRAWS)
 
     def _carried(self, plant: Plant, x: Array, base: Array) -> Array:
         """(n, S, m) change of the residual for one standard deviation of each of n start coordinates."""

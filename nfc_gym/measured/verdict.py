@@ -127,10 +127,14 @@ def null_bound(v: Verified) -> float:
     return float(v.null.mean()) + factor * spread
 
 
-def parameter_rows(fitted: Fit, nominal: Array, problem: Problem) -> list[dict[str, Any]]:
-    """Psi with intervals: estimate, 95 % bounds, whether the data show it, whether it left its prior."""
+def spread(fitted: Fit, problem: Problem, step: Array) -> Array:
+    """(size,) standard deviations of a fit's parameters: what the data leave open, and what the physics step adds."""
+    return np.hypot(uncertainty(fitted, clusters(problem)), step)
+
+
+def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any]]:
+    """Psi with intervals: estimate, 95 % bounds, whether the data show it, whether it left its prior; sd (size,)."""
     space = fitted.plant.space
-    sd = uncertainty(fitted, clusters(problem))
     rows = []
     for i, p in enumerate(space.parameters):
         value, width = float(fitted.x[i]), p.high - p.low
@@ -149,23 +153,20 @@ def parameter_rows(fitted: Fit, nominal: Array, problem: Problem) -> list[dict[s
     return rows
 
 
-def effect_rows(
-    fitted: Fit, rounds: Sequence[Round], problem: Problem, shares: dict[str, float]
-) -> list[dict[str, Any]]:
-    """Accepted effects with sentences, intervals and equivalents."""
-    sd = uncertainty(fitted, clusters(problem))
+def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[str, float]) -> list[dict[str, Any]]:
+    """Accepted effects with sentences, intervals and equivalents; sd (size,) of all parameters."""
     at = len(fitted.plant.space)
     equivalents = {i: r.equivalents for r in rounds for i in r.accepted}
     rows = []
     for effect, theta in zip(fitted.plant.effects, fitted.plant.split(fitted.x)[1], strict=True):
-        spread = sd[at : at + len(theta)]
+        own = sd[at : at + len(theta)]
         at += len(theta)
         rows.append(
             {
                 "id": effect.id,
                 "family": effect.family,
                 "where": effect.where[0] if len(effect.where) == 1 else list(effect.where),
-                "sentence": effect.say(theta, spread),
+                "sentence": effect.say(theta, own),
                 "share_of_excess": shares.get(effect.id, 0.0),
                 "equivalents": equivalents.get(effect.id, []),
                 "own_values": isinstance(effect, Each),
@@ -177,7 +178,7 @@ def effect_rows(
                         "high": float(min(p.high, t + 1.96 * s)),
                         "unit": p.unit,
                     }
-                    for p, t, s in zip(effect.params, theta, spread, strict=True)
+                    for p, t, s in zip(effect.params, theta, own, strict=True)
                 },
             }
         )

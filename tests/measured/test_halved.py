@@ -6,8 +6,9 @@ import pytest
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.arena import Arena, Data
-from nfc_gym.measured.fit import fit
-from nfc_gym.measured.halved import artefacts
+from nfc_gym.measured.contest import clusters
+from nfc_gym.measured.fit import fit, uncertainty
+from nfc_gym.measured.halved import artefacts, step_error
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.shooting import RolloutProblem, finer
@@ -66,6 +67,16 @@ def test_an_effect_must_outlive_half_the_step(gain: float, real: bool) -> None:
     bare = contest.without(contest.current.plant.effects[0])
     assert bare.worth(bare.judge(contest.current), 0.02)
     assert bool(artefacts(contest, 0.02)) != real
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.6])
+def test_the_step_widens_the_interval_until_it_holds_the_truth(gain: float) -> None:
+    contest = arena(gain)
+    problem, fitted = contest.fit_data.problem, contest.current
+    sd, step = uncertainty(fitted, clusters(problem)), step_error(problem, contest.under, fitted)
+    off = np.abs(fitted.x - gain / 0.5)
+    assert 1.96 * sd < off < 1.96 * np.hypot(sd, step)
+    assert step < off
 
 
 def test_a_halved_problem_is_the_same_experiment_at_half_the_step() -> None:
