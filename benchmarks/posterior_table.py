@@ -2,7 +2,7 @@
 
     python benchmarks/posterior_table.py --out DIR [--robots Jackal Ant ...] [--terrain Flat Rough] [--windows 100000]
         [--methods mdn-rff mdn-tcn sde-nn sde-rff sde-fks sde-tcn sbi-npe sbi-npse] [--inputs window summaries]
-        [--seeds 0] [--epochs 100] [--budget SECONDS] [--extras ceiling residuals axle rounds latency plots]
+        [--seeds 0] [--epochs 100] [--budget SECONDS] [--extras ceiling residuals axle rounds plots]
     python benchmarks/posterior_table.py --quick
 
 Windows are simulated once into DIR and used by every method; a cell (robot, ground, method, inputs, seed) that is finished is kept
@@ -27,7 +27,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its core whenever another process has it
 
 import torch
-from posteriors import report
+from posteriors import extras, report
 from posteriors.ceilings import ceiling_of
 from posteriors.fit import Plan, fit
 from posteriors.judge import judge, latency
@@ -51,6 +51,10 @@ class Run:
     plan: Plan
     device: torch.device
     ends: float
+
+    def folder(self, name: str) -> Path:
+        """Where the training of that name keeps its state."""
+        return self.kept.folder(name)
 
     @property
     def over(self) -> bool:
@@ -95,8 +99,6 @@ def robot_on(run: Run, robot: str, terrain: str) -> None:
                 if not run.over and not possible(METHODS[method], inputs):
                     run.kept.once(f"{robot}{terrain}_{method}_{inputs}_{seed}", lambda m=method, i=inputs, s=seed: cell(
                         run, env, m, i, s, windows, judges))  # fmt: skip
-    from posteriors import extras
-
     for extra in args.extras:
         if extra != "ceiling" and not run.over:
             extras.EXTRAS[extra](run, robot, terrain, windows, judges)
@@ -104,7 +106,7 @@ def robot_on(run: Run, robot: str, terrain: str) -> None:
 
 def cell(run: Run, env: str, method: str, inputs: str, seed: int, windows: Held, judges: Held) -> dict[str, Any]:
     """Train and judge one method; a peer that is not installed says so instead, and is tried again."""
-    prior, folder = prior_of(env), run.kept.folder(f"{env[8:-3]}_{method}_{inputs}_{seed}")
+    prior, folder = prior_of(env), run.folder(f"{env[8:-3]}_{method}_{inputs}_{seed}")
     spoken = Spoken()
     spoken.message(f"{env}: {METHODS[method].name}, {inputs}, seed {seed}")
     try:
@@ -146,6 +148,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--ceiling-draws", nargs=2, type=int, default=[256, 32], metavar=("CLOUD", "PAIRS"))
     parser.add_argument("--truths", type=int, default=20, help="of the sequential rounds")
     parser.add_argument("--round", type=int, default=10_000, help="simulations a round")
+    parser.add_argument("--few", type=int, default=200, help="windows that are replayed, or whose maps are drawn")
+    parser.add_argument("--axles", type=int, default=100, help="windows with a lost axle")
     parser.add_argument("--quick", action="store_true", help="a toy: Jackal on flat ground, in a minute")
     args = parser.parse_args()
     if args.out is None and not args.quick:

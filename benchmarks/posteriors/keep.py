@@ -40,6 +40,10 @@ class Kept:
         write(file, make())
         return json.loads(file.read_text())
 
+    def keep(self, name: str, found: dict[str, Any]) -> None:
+        """Write a result, over an earlier one of that name."""
+        write(self.cells / f"{name}.json", found)
+
     def folder(self, name: str) -> Path:
         """Where training keeps its state."""
         return self.out / "training" / name

@@ -77,7 +77,8 @@ class Peer:
                 with torch.no_grad():
                     value = self.estimator.log_prob(at[None], condition=some)[0]
             else:
-                value = self.posterior.log_prob_batched(at[None], x=some)[0].detach()
+                each = (self.posterior.log_prob(a[None], x=s[None]).detach() for a, s in zip(at, some, strict=True))
+                value = torch.cat(list(each))
             out.append(gain_of(at, value).double())
         return torch.cat(out)
 
