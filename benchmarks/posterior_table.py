@@ -36,7 +36,7 @@ from posteriors.methods import INPUTS, METHODS, possible
 from posteriors.paper import ROBOTS, TERRAINS
 from posteriors.sets import JUDGE, TRAIN, Held, environment, prior_of, stored
 
-from nfc_gym.core.errors import MissingExtra
+from nfc_gym.core.errors import InputError, MissingExtra
 from nfc_gym.inference.progress import Spoken
 
 EXTRAS = ("ceiling", "residuals", "axle", "rounds", "plots")
@@ -66,6 +66,7 @@ def main() -> None:
     args = _arguments()
     with tempfile.TemporaryDirectory() as folder:
         args.out = args.out or Path(folder)
+        args.data = args.data or args.out
         device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device
                               if args.device != "auto" else "cpu")  # fmt: skip
         plan = Plan(args.epochs, args.budget, args.batch, args.rate, args.small)
@@ -87,12 +88,12 @@ def robot_on(run: Run, robot: str, terrain: str) -> None:
     """Every cell of one environment, then what else was asked for."""
     args, env = run.args, environment(robot, terrain)
     maps = "map" in args.inputs or "residuals" in args.extras
-    train_on = stored(args.out, env, args.windows, TRAIN, args.jobs, maps)
-    judged = stored(args.out, env, args.judges, JUDGE, args.jobs, maps)
+    train_on = stored(args.data, env, args.windows, TRAIN, args.jobs, maps)
+    judged = stored(args.data, env, args.judges, JUDGE, args.jobs, maps)
     windows, judges = (Held.of(w, run.device, maps) for w in (train_on, judged))
     if "ceiling" in args.extras:
         run.kept.once(f"{robot}{terrain}_ceiling", lambda: ceiling_of(
-            args.out, env, judged, args.ceiling_windows, args.jobs, *args.ceiling_draws))  # fmt: skip
+            args.data, env, judged, args.ceiling_windows, args.jobs, *args.ceiling_draws))  # fmt: skip
     for seed in args.seeds:
         for inputs in args.inputs:
             for method in args.methods:
@@ -126,6 +127,7 @@ def cell(run: Run, env: str, method: str, inputs: str, seed: int, windows: Held,
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="folder for windows, cells and tables")
+    parser.add_argument("--data", type=Path, help="folder for windows and ceilings, where several DIR share them")
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
     parser.add_argument("--terrain", nargs="+", choices=TERRAINS, default=list(TERRAINS))
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS))
@@ -162,4 +164,7 @@ def _arguments() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        main()
+    except InputError as e:
+        sys.exit(str(e))

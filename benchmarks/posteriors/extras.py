@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def _residuals(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> None:
     name, env, args = f"{robot}{terrain}_residuals", environment(robot, terrain), run.args
-    judged = stored(args.out, env, args.judges, JUDGE, args.jobs, maps=True)
+    judged = stored(args.data, env, args.judges, JUDGE, args.jobs, maps=True)
     run.kept.once(name, lambda: residuals.heads(
         env, windows, judged, judges, prior_of(env), run.plan, run.folder(name), run.device, args.samples, args.few,
         Spoken())[1])  # fmt: skip

@@ -54,7 +54,6 @@ def fit(
     device: torch.device, report: Report,
 ) -> Cell:  # fmt: skip
     """Train, or go on where an earlier command was killed; the posterior is kept in the folder too."""
-    folder.mkdir(parents=True, exist_ok=True)
     if METHODS[method].peer:
         from posteriors.peers import fit_peer
 
@@ -68,6 +67,7 @@ def fit_network(
     report: Report,
 ) -> Cell:  # fmt: skip
     """The same for a network of any configuration."""
+    folder.mkdir(parents=True, exist_ok=True)
     network = Network(config, Sizes.of(windows.tensors), prior, seed).to(device)
     first, held_out = windows.split(HELD_OUT)
     training = TrainConfig(epochs=plan.epochs, batch=plan.batch, rate=plan.rate, seed=seed)

@@ -47,6 +47,7 @@ def judge(fitted: Fitted, judges: Held, prior: PriorBox, samples: int, most: int
         "windows": len(truth),
         "samples": samples,
         "gain": metrics.mean(gain / d),
+        "gains": [round(float(g) / d, 5) for g in gain],  # of each window: methods are compared window by window
         "gain_without_effect": metrics.mean(gain[clean] / d),
         "log_posterior": metrics.mean(gain - d * math.log(2)),
         "worst": float(gain.min() / d),

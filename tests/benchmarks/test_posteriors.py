@@ -156,18 +156,19 @@ def test_what_is_finished_is_kept_and_what_is_missing_tried_again(tmp_path: Path
 def test_the_tables_print_what_there_is() -> None:
     from posteriors import report
 
-    one = {"gain": [0.3, 0.01], "gain_without_effect": [0.4, 0.02], "log_posterior": [-1.0, 0.1], "marginal":
+    one = {"gain": [0.3, 0.01], "gain_without_effect": [0.4, 0.02], "log_posterior": [-1.0, 0.1], "gains":
+           [0.2, 0.3, 0.4], "marginal":
            {"mass": [0.1, 0.01]}, "coverage": {k: [float(k), 0.01] for k in ("0.5", "0.9", "0.95")}, "width": [0.5, 0.1],
            "ranks": 0.02, "tarp": 0.03, "distance_95": 0.04, "epochs": 5, "best": 4, "seconds": 9.0,
            "latency_ms": 12.0}  # fmt: skip
-    less = one | {"gain": [0.1, 0.01]}
+    less = one | {"gain": [0.1, 0.01], "gains": [0.0, 0.1, 0.2]}
     ceiling = {"windows": 3, "apart": 0, "cloud": 8, "pairs": 2, "joint": [0.8, 0.1], "groups": {"mass": [0.2, 0.1]}}
     text = report.table({
         "JackalFlat_sde-tcn_window_0": one, "JackalFlat_mdn-rff_window_0": less, "JackalFlat_ceiling": ceiling,
         "JackalFlat_sbi-npe_window_0": {"missing": "sbi is not installed"},
     })  # fmt: skip
     assert "0.50" in text  # efficiency: 0.4 of 0.8
-    assert "+0.200 (+14.1 se)" in text
+    assert "+0.200 ± 0.000" in text  # window by window
     assert "sbi is not installed" in text
     assert "-1.00 ± 0.10 / 1.21" in text  # beside the paper's
 
