@@ -76,6 +76,7 @@ def ground(folder: Path, place: str, network: Network, batch: dict[str, torch.Te
         shown = axis.imshow(value, vmin=low, vmax=high, origin="lower", extent=(-6.4, 6.4, -6.4, 6.4))
         axis.set_title(name)
         axis.set_xlabel("to the left [m]")
+        axis.invert_xaxis()
     axes[0].set_ylabel("forward [m]")
     figure.colorbar(shown, ax=axes, label="height less the base's [m]")
     files = [_saved(figure, folder / f"{place}_ground.png")]
