@@ -5,17 +5,17 @@
         [--seeds 0] [--epochs 100] [--budget SECONDS] [--extras ceiling residuals axle rounds plots]
     python benchmarks/posterior_table.py --quick
 
-Windows are simulated once into DIR and used by every method; a cell (robot, ground, method, inputs, seed) that is finished is kept
-in DIR/cells, and one that was interrupted goes on from its last saved state, so that the same command may be given
-again and again until all is there. `--budget` is the training time of a cell: ours get as many epochs as fit into it,
-sbi's stop when it is used up. `--stop SECONDS` begins no new cell after that time. DIR/table.md is written anew after
-every command from all cells that there are. `--quick` is a toy in a temporary folder, whose figures mean nothing.
+Windows are simulated once into DIR and used by every method; a cell (robot, ground, method, inputs, seed) that is
+finished is kept in DIR/cells, and one that was interrupted goes on from its last saved state, so that the same
+command may be given again and again until all is there. `--budget` is the training time of a cell: ours get as many
+epochs as fit into it, sbi's stop when it is used up. `--stop SECONDS` begins no new cell after that time.
+DIR/table.md is written anew after every command from all cells that there are. `--quick` is a toy in a temporary
+folder, whose figures mean nothing.
 
 Gain is the mean log density of the true parameters on windows not trained on, in nats a parameter, the prior having 0.
 """
 
 import argparse
-import json
 import os
 import sys
 import tempfile
@@ -27,7 +27,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its core whenever another process has it
 
 import torch
-from posteriors import extras, report
+from posteriors import extras, plots, report
 from posteriors.ceilings import ceiling_of
 from posteriors.fit import Plan, fit
 from posteriors.judge import judge, latency
@@ -70,7 +70,9 @@ def main() -> None:
         device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device
                               if args.device != "auto" else "cpu")  # fmt: skip
         plan = Plan(args.epochs, args.budget, args.batch, args.rate, args.small)
-        kept = Kept(args.out, {"windows": args.windows, "judges": args.judges, "samples": args.samples, **plan._asdict()})
+        kept = Kept(
+            args.out, {"windows": args.windows, "judges": args.judges, "samples": args.samples, **plan._asdict()}
+        )
         run = Run(args, kept, plan, device, time.monotonic() + args.stop if args.stop else float("inf"))
         print(f"torch {torch.__version__} on {device}, {torch.get_num_threads()} threads, {args.out}", flush=True)
         for robot in args.robots:
@@ -114,6 +116,7 @@ def cell(run: Run, env: str, method: str, inputs: str, seed: int, windows: Held,
         done = fit(method, inputs, windows, prior, run.plan, seed, folder, run.device, spoken)
     except MissingExtra as e:
         return {"missing": str(e)}
+    plots.keep_draws(done.fitted, judges, folder)
     few = min(run.args.judges, run.args.peer_judges) if method == "sbi-npse" else None
     found = judge(done.fitted, judges, prior, run.args.samples, few)
     out = done.outcome

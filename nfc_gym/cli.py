@@ -1,4 +1,4 @@
-"""`nfc-gym`: check, close-loop, predict, excite, simulate, train, infer, demo. Heavy imports are inside the command that needs them.
+"""`nfc-gym`: check, close-loop, predict, excite, simulate, train, infer, demo. Heavy imports are inside commands.
 
 Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the same command resumes; 1 a fault of ours.
 """
@@ -315,10 +315,10 @@ def infer(
 ) -> None:
     """Say what psi could have made a window of motion, and draw from that posterior.
 
-    `states` are `obs["proprio"]` of the robot at each control step and `actions` what was commanded, in [-1, 1], both in
-    the order of the training set's manifest; with a posterior that sees maps, `elevation` (128, 128) too. A window longer than the
-    training set's counts from its end. The table gives each parameter's median and 90 % interval; one that the window
-    does not show stays as wide as the prior, and is marked.
+    `states` are `obs["proprio"]` of the robot at each control step and `actions` what was commanded, in [-1, 1], both
+    in the order of the training set's manifest; with a posterior that sees maps, `elevation` (128, 128) too. A window
+    longer than the training set's counts from its end. The table gives each parameter's median and 90 % interval; one
+    that the window does not show stays as wide as the prior, and is marked.
 
     Either kind of --out goes into RandomizePsi and into `nfc-gym simulate --proposal`.
 

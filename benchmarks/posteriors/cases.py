@@ -4,9 +4,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from posteriors import metrics
-from posteriors.fitted import Ours
-from posteriors.methods import METHODS, OURS, network_config
 
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.inference.config import Sizes
@@ -18,6 +15,9 @@ from nfc_gym.inference.sequential import SequentialConfig, sequential
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
 from nfc_gym.simulate import Simulator
+from posteriors import metrics
+from posteriors.fitted import Ours
+from posteriors.methods import METHODS, OURS, network_config
 
 AXLE = "front_left_wheel_damping"  # the gain kv of its servo: 0 is a lost axle
 

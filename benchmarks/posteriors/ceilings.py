@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from posteriors.judge import groups
-from posteriors.keep import write
-from posteriors.metrics import mean
 
 from nfc_gym.inference.windows import Windows
 from nfc_gym.simulate.ceiling import CLOUD, PAIRS, ceiling
+from posteriors.judge import groups
+from posteriors.keep import write
+from posteriors.metrics import mean
 
 
 def ceiling_of(
@@ -45,5 +45,3 @@ def ceiling_of(
         "joint": mean(whole[fine] / len(names)),
         "groups": {g: mean(each[fine][:, at].mean(1)) for g, at in groups(names).items()},
     }
-
-

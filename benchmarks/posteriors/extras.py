@@ -6,14 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from posteriors import cases, plots, residuals
-from posteriors.methods import OURS
-from posteriors.sets import JUDGE, Held, environment, prior_of, stored
-
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Spoken
 from nfc_gym.inference.train import TrainConfig
+from posteriors import cases, plots, residuals
+from posteriors.methods import OURS
+from posteriors.sets import JUDGE, Held, environment, prior_of, stored
 
 if TYPE_CHECKING:
     from posterior_table import Run
@@ -51,7 +50,8 @@ def _rounds(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> 
 
 
 def _plots(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> None:
-    plots.draw(run.args.out, run.kept.out / "training", robot, terrain, judges, run.device)
+    prior = prior_of(environment(robot, terrain))
+    plots.draw(run.args.out, run.kept.out / "training", f"{robot}{terrain}", prior, judges, run.device)
 
 
 def _opened(file: Path, run: Run) -> Network:

@@ -8,9 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from posteriors.fitted import Fitted, Ours
-from posteriors.methods import METHODS, network_config
-from posteriors.sets import Held
 
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
@@ -18,6 +15,9 @@ from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Report
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
+from posteriors.fitted import Fitted, Ours
+from posteriors.methods import METHODS, network_config
+from posteriors.sets import Held
 
 HELD_OUT = 0.05  # of the training windows, to compare epochs by
 _TIMED, _WARM = 10, 3  # steps that tell how long an epoch takes, after some that are not timed

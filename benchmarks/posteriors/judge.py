@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import torch
+
+from nfc_gym.inference.space import PriorBox
 from posteriors import metrics
 from posteriors.fitted import Fitted
 from posteriors.sets import Held
-
-from nfc_gym.inference.space import PriorBox
 
 LEVELS = (0.5, 0.9, 0.95)
 

@@ -31,7 +31,8 @@ def mean(values: Array) -> Mean:
 
 
 def marginal_gain(draws: Array, truth: Array) -> Array:
-    """(windows, d) nats told about each parameter by itself: log score of a normal fitted to its draws in z = probit(u).
+    """(windows, d) nats told about each parameter by itself: log score of a normal fitted to its draws
+    in z = probit(u).
 
     The prior is N(0, 1) in z and scores 0. Draws are no density: what is not normal in z is lost, and a posterior that
     is the prior comes out 1 / n below 0, so this is a little too low, alike for every method.
@@ -68,7 +69,7 @@ def coverage(draws: Array, truth: Array, level: float) -> Array:
 
 
 def ranks(draws: Array, truth: Array) -> Array:
-    """(windows, d) share of the draws below the truth: uniform if the posterior is right (simulation-based calibration)."""
+    """(windows, d) share of the draws below the truth: uniform if the posterior is right (SBC)."""
     return (draws < truth[:, None]).mean(1)
 
 

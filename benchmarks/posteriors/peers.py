@@ -1,9 +1,9 @@
 """sbi's NPE (neural spline flow) and NPSE on the same windows, with the same encoder, in the same coordinates.
 
-sbi sees z = probit(u), in which the prior is N(0, I) and nothing leaks over the box's edges, and x, the window of states
-and actions in one row; our encoder, trained with sbi's network, is its embedding. What it does otherwise, its defaults
-of network, optimiser, batch order and early stopping, is sbi's. It has no noise drawn anew with each pass: its x is one
-draw of noise a window.
+sbi sees z = probit(u), in which the prior is N(0, I) and nothing leaks over the box's edges, and x, the window of
+states and actions in one row; our encoder, trained with sbi's network, is its embedding. What it does otherwise, its
+defaults of network, optimiser, batch order and early stopping, is sbi's. It has no noise drawn anew with each pass:
+its x is one draw of noise a window.
 """
 
 import math
@@ -11,9 +11,6 @@ import time
 from typing import Any
 
 import torch
-from posteriors.fitted import gain_of, truth_of
-from posteriors.methods import Method, network_config
-from posteriors.sets import Held
 from torch import Tensor, nn
 
 from nfc_gym.core.errors import MissingExtra
@@ -23,6 +20,9 @@ from nfc_gym.inference.network import Network
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome
+from posteriors.fitted import gain_of, truth_of
+from posteriors.methods import Method, network_config
+from posteriors.sets import Held
 
 PATIENCE = 20  # epochs, ours too
 

@@ -8,31 +8,34 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from posteriors.fitted import Ours
-from posteriors.methods import METHODS
-from posteriors.residuals import maps_of
-from posteriors.sets import Held
+from numpy.typing import NDArray
 
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.network import Network
+from nfc_gym.inference.space import PriorBox
+from posteriors.fitted import Fitted
+from posteriors.methods import INPUTS, METHODS, OURS
+from posteriors.residuals import maps_of
+from posteriors.sets import Held
 
+Array = NDArray[np.float64]
 _DRAWS, _MAPS = 2000, 24
+DRAWS = "draws.npz"
 
 
-def draw(out: Path, training: Path, robot: str, terrain: str, judges: Held, device: torch.device) -> list[Path]:
+def draw(
+    out: Path, training: Path, place: str, prior: PriorBox, judges: Held, device: torch.device
+) -> list[Path]:  # fmt: skip
     """Every picture that the trained posteriors of one environment allow; gives the files."""
-    place, folder = f"{robot}{terrain}", out / "plots"
+    folder = out / "plots"
     folder.mkdir(exist_ok=True)
     batch = judges.noisy()
-    files = []
-    for inputs in ("window", "summaries", "linear", "map"):
-        networks = {}
-        for key, method in METHODS.items():
-            found = sorted(training.glob(f"{place}_{key}_{inputs}_*/posterior.safetensors"))
-            if found:
-                networks[method.name] = checkpoint.load(found[0])[0].to(device)
-        if networks:
-            files.append(joint(folder / f"{place}_{inputs}_joint.png", networks, batch))
+    files: list[Path] = []
+    for inputs in INPUTS:
+        found = {k: sorted(training.glob(f"{place}_{k}_{inputs}_*/{DRAWS}")) for k in METHODS}
+        drawn = {METHODS[k].name: np.load(files_[0])["u"] for k, files_ in found.items() if files_}
+        if drawn:
+            files.append(joint(folder / f"{place}_{inputs}_joint.png", drawn, prior, batch))
     heads = training / f"{place}_residuals" / "posterior.safetensors"
     if heads.is_file():
         network = checkpoint.load(heads)[0].to(device)
@@ -40,26 +43,36 @@ def draw(out: Path, training: Path, robot: str, terrain: str, judges: Held, devi
     return files
 
 
-def joint(file: Path, networks: dict[str, Network], batch: dict[str, torch.Tensor]) -> Path:
-    """One window without an effect: the two parameters of which the last method says most, one panel a method."""
-    row = int(torch.nonzero(batch["family"] == 0)[0])
+def keep_draws(fitted: Fitted, judges: Held, folder: Path) -> None:
+    """Keep what a method draws for the window that is pictured: the first one without an effect."""
+    folder.mkdir(parents=True, exist_ok=True)
+    batch = judges.noisy()
+    row = _pictured(batch)
     one = {k: t[row : row + 1] for k, t in batch.items()}
-    drawn = {n: Ours(net).draws(one, _DRAWS, 0).cpu().numpy()[0] for n, net in networks.items()}
-    network = list(networks.values())[-1]
-    prior = network.prior
-    names = [n for n, f in zip(prior.names, prior.free, strict=True) if f]
-    a, b = (int(i) for i in np.argsort(list(drawn.values())[-1].std(0))[:2])
-    low, high = (np.array(v)[list(prior.free)] for v in (prior.low, prior.high))
-    truth = low + (high - low) * one["psi"].cpu().numpy()[0][list(prior.free)]
+    np.savez(folder / DRAWS, u=fitted.draws(one, _DRAWS, 0).cpu().numpy()[0])
+
+
+def _pictured(batch: dict[str, torch.Tensor]) -> int:
+    return int(torch.nonzero(batch["family"] == 0)[0])
+
+
+def joint(file: Path, drawn: dict[str, Array], prior: PriorBox, batch: dict[str, torch.Tensor]) -> Path:
+    """The two parameters of which ours (else the last method there) says most, one panel a method."""
+    free = np.array(prior.free)
+    names, units = (np.array(v)[free] for v in (prior.names, prior.units))
+    best = drawn.get(METHODS[OURS].name, list(drawn.values())[-1])
+    a, b = (int(i) for i in np.argsort(best.std(0))[:2])
+    low, high = (np.array(v)[free] for v in (prior.low, prior.high))
+    truth = low + (high - low) * batch["psi"][_pictured(batch)].cpu().numpy()[free]
     figure, axes = plt.subplots(1, len(drawn), figsize=(2.6 * len(drawn), 3), sharex=True, sharey=True, squeeze=False)
     for axis, (name, u) in zip(axes[0], drawn.items(), strict=True):
         psi = low + (high - low) * u
-        axis.hist2d(psi[:, a], psi[:, b], bins=40, range=[(low[a], high[a]), (low[b], high[b])], cmap="viridis")
+        axis.hist2d(psi[:, a], psi[:, b], bins=25, range=[(low[a], high[a]), (low[b], high[b])], cmap="viridis")
         axis.plot(truth[a], truth[b], "x", color="red", markersize=9, markeredgewidth=2, label="truth")
         axis.set_title(name, fontsize=9)
-        axis.set_xlabel(f"{names[a]} [{prior.units[prior.names.index(names[a])]}]", fontsize=8)
+        axis.set_xlabel(f"{names[a]} [{units[a]}]", fontsize=8)
         axis.tick_params(labelsize=7)
-    axes[0, 0].set_ylabel(f"{names[b]} [{prior.units[prior.names.index(names[b])]}]", fontsize=8)
+    axes[0, 0].set_ylabel(f"{names[b]} [{units[b]}]", fontsize=8)
     axes[0, 0].legend(fontsize=7, loc="upper right")
     return _saved(figure, file)
 

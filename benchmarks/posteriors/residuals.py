@@ -5,10 +5,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from posteriors import metrics
-from posteriors.fit import Plan, fit_network
-from posteriors.methods import METHODS, OURS, network_config
-from posteriors.sets import Held
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.network import Network
@@ -18,6 +14,10 @@ from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.windows import Windows
 from nfc_gym.simulate.ceiling import replayed
 from nfc_gym.simulate.machine import MOTOR, Machine
+from posteriors import metrics
+from posteriors.fit import Plan, fit_network
+from posteriors.methods import METHODS, OURS, network_config
+from posteriors.sets import Held
 
 Array = NDArray[np.float64]
 SIZES = ((0, 2), (2, 5), (5, np.inf))  # of X / X_null
@@ -98,7 +98,9 @@ def strengths(env: str, judged: Windows, batch: dict[str, torch.Tensor], most: i
         made = made.reshape(_REPLAYS, h, -1)[..., told]
         seen = np.array(states[i])
         seen[:, machine.angles] = np.unwrap(seen[:, machine.angles], axis=0)
-        wrong = (seen[1:, told] - made.mean(0)) ** 2 / (machine.noise[told] ** 2 + made.var(0, ddof=1) * (1 + 1 / _REPLAYS))
+        wrong = (seen[1:, told] - made.mean(0)) ** 2 / (
+            machine.noise[told] ** 2 + made.var(0, ddof=1) * (1 + 1 / _REPLAYS)
+        )
         out[i] = wrong.mean()
     return out
 

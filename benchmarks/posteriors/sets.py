@@ -68,7 +68,7 @@ class Held:
         return len(self.tensors["psi"])
 
     def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
-        """See `nfc_gym.inference.data.WindowSet`; the same seed gives the same order and noise, None the stored order."""
+        """See `nfc_gym.inference.data.WindowSet`; equal seeds give equal order and noise, None the stored order."""
         device = self.noise.device
         chance = torch.Generator(device).manual_seed(0 if seed is None else seed)
         every = torch.arange(len(self), device=device)

@@ -158,8 +158,8 @@ def test_the_tables_print_what_there_is() -> None:
 
     one = {"gain": [0.3, 0.01], "gain_without_effect": [0.4, 0.02], "log_posterior": [-1.0, 0.1], "gains":
            [0.2, 0.3, 0.4], "marginal":
-           {"mass": [0.1, 0.01]}, "coverage": {k: [float(k), 0.01] for k in ("0.5", "0.9", "0.95")}, "width": [0.5, 0.1],
-           "ranks": 0.02, "tarp": 0.03, "distance_95": 0.04, "epochs": 5, "best": 4, "seconds": 9.0,
+           {"mass": [0.1, 0.01]}, "coverage": {k: [float(k), 0.01] for k in ("0.5", "0.9", "0.95")}, "width":
+           [0.5, 0.1], "ranks": 0.02, "tarp": 0.03, "distance_95": 0.04, "epochs": 5, "best": 4, "seconds": 9.0,
            "latency_ms": 12.0}  # fmt: skip
     less = one | {"gain": [0.1, 0.01], "gains": [0.0, 0.1, 0.2]}
     ceiling = {"windows": 3, "apart": 0, "cloud": 8, "pairs": 2, "joint": [0.8, 0.1], "groups": {"mass": [0.2, 0.1]}}
@@ -177,7 +177,9 @@ def test_noise_is_drawn_anew_with_each_pass_and_the_same_for_a_seed() -> None:
     from posteriors.sets import Held
 
     states = torch.zeros(40, 3, 2)
-    held = Held({"states": states, "actions": torch.zeros(40, 2, 1), "psi": torch.rand(40, 1)}, torch.tensor([0.5, 0.0]))
+    held = Held(
+        {"states": states, "actions": torch.zeros(40, 2, 1), "psi": torch.rand(40, 1)}, torch.tensor([0.5, 0.0])
+    )
     first, again, other = (torch.cat([b["states"] for b in held.batches(16, s)]) for s in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)

@@ -121,7 +121,7 @@ def test_training_says_what_is_wrong(windows: Path, prior: PriorBox, tmp_path: P
     with pytest.raises(InputError, match="--maps"):
         jobs.train_posterior(windows, prior, tmp_path / "a.safetensors",
                              NetworkConfig(elevation=True), TrainConfig(), device="cpu")  # fmt: skip
-    with pytest.raises(InputError, match="ends in .safetensors"):
+    with pytest.raises(InputError, match=r"ends in \.safetensors"):
         jobs.train_posterior(windows, prior, tmp_path / "a.pt", SMALL, TrainConfig(), device="cpu")
     with pytest.raises(InputError, match="there is auto, cpu"):
         jobs.device_of("tpu9")
