@@ -11,10 +11,10 @@ _ROWS = {
     "sde-tcn": (0.57, 0.46, -0.42, -0.46, -1.03, -2.64, -0.9, -1.5, 1.21, 0.69),
 }
 CAVEAT = (
-    "The paper does not say what its average log posterior is of. Ours beside it is the log density of all d parameters "
-    "together, normalised to [-1, 1]: gain - d log 2, the prior being -d log 2. Robots' masses and bounds, motion, sensor "
-    "noise and simulator are not the paper's, which gives none of them in full, so its figures are comparable with each "
-    "other, ours with ours, and only the order of the methods between the two."
+    "The paper does not say what its average log posterior is of. Ours beside it is the log density of all d "
+    "parameters together, normalised to [-1, 1]: gain - d log 2, the prior being -d log 2. Robots' masses and bounds, "
+    "motion, sensor noise and simulator are not the paper's, which gives none of them in full, so its figures are "
+    "comparable with each other, ours with ours, and only the order of the methods between the two."
 )
 
 

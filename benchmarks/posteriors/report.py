@@ -129,8 +129,8 @@ def _compared(every: dict[tuple[str, str, str, int], dict[str, Any]], places: li
         return ""
     head = ["", "inputs", "SDE + TCN", "best of the paper's five", "ahead by", "best of sbi", "ahead by"]
     return "## Ours against the others\n\n" + lines(head, rows) + (
-        "Gain a parameter, nats; differences are taken window by window, on the windows that both were judged on, after "
-        "a mean over seeds. Their standard errors are over windows: training again would give another difference.\n"
+        "Gain a parameter, nats; differences are taken window by window, on the windows that both were judged on, "
+        "after a mean over seeds. Their errors are over windows: training again would give another difference.\n"
     )  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """The residual heads: delta_s, delta_e and the structure head of one network, on windows that it was not trained on."""
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +27,7 @@ _REPLAYS = 16
 
 
 def heads(
-    env: str, windows: Held, judged: Windows, judges: Held, prior: PriorBox, plan: Plan, folder: Any,
+    env: str, windows: Held, judged: Windows, judges: Held, prior: PriorBox, plan: Plan, folder: Path,
     device: torch.device, samples: int, few: int, report: Report,
 ) -> tuple[Network, dict[str, Any]]:  # fmt: skip
     """Train SDE + TCN with all heads, and what is measured of them.
@@ -38,12 +40,12 @@ def heads(
       samples: draws a window.
       few: windows that are replayed, or whose maps are drawn.
     """
-    base = network_config(METHODS[OURS], "map", plan.small).to_dict()
-    families = tuple(judged.manifest.families)
-    config = type(network_config(METHODS[OURS], "map"))(**base | {
-        "delta_s": True, "delta_e": True, "families": families, "draws": 1 if plan.small else 4})  # fmt: skip
+    config = replace(
+        network_config(METHODS[OURS], "map", plan.small),
+        delta_s=True, delta_e=True, families=tuple(judged.manifest.families), draws=1 if plan.small else 4,
+    )  # fmt: skip
     done = fit_network(config, windows, prior, plan, 0, folder, device, report)
-    network = done.fitted.network  # type: ignore[attr-defined]
+    network = done.fitted.network
     out: dict[str, Any] = {"seconds": done.outcome.seconds, "epochs": len(done.outcome.held_out)}
     batch = judges.noisy()
     out |= dynamics(network, batch, samples)

@@ -142,9 +142,10 @@ def infer(
 
 def told(prior: PriorBox, psi: Array) -> list[Told]:
     """By parameter, in the prior's order, of those that are free: from draws (n, d)."""
-    ends = np.quantile(psi, [0.5, (1 - _LEVEL) / 2, (1 + _LEVEL) / 2], axis=0)
+    middle, low, high = np.quantile(psi, [0.5, (1 - _LEVEL) / 2, (1 + _LEVEL) / 2], axis=0).tolist()
+    widths = [_LEVEL * (b - a) for a, b in zip(prior.low, prior.high, strict=True)]  # of the prior's own interval
     return [
-        Told(name, prior.units[i], *(float(v) for v in ends[:, i]),
-             float((ends[2, i] - ends[1, i]) / (_LEVEL * (prior.high[i] - prior.low[i]))))
-        for i, name in enumerate(prior.names) if prior.free[i]
-    ]  # fmt: skip
+        Told(prior.names[i], prior.units[i], middle[i], low[i], high[i], (high[i] - low[i]) / widths[i])
+        for i in range(len(prior))
+        if prior.free[i]
+    ]
