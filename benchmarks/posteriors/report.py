@@ -13,8 +13,8 @@ from posteriors.metrics import mean
 Results = dict[str, dict[str, Any]]
 _NAMES = {
     "window": "states and actions",
-    "summaries": "the same and physics summaries",
-    "linear": "the same, from a linear start",
+    "summaries": "states, actions and physics summaries",
+    "linear": "states, actions and physics summaries, from a linear start",
     "map": "states, actions and elevation map",
 }
 
@@ -129,7 +129,7 @@ def _compared(every: dict[tuple[str, str, str, int], dict[str, Any]], places: li
         return ""
     head = ["", "inputs", "SDE + TCN", "best of the paper's five", "ahead by", "best of sbi", "ahead by"]
     return "## Ours against the others\n\n" + lines(head, rows) + (
-        "Gain a parameter, nats; differences are taken window by window, on the windows that both were judged on, "
+        "\nGain a parameter, nats; differences are taken window by window, on the windows that both were judged on, "
         "after a mean over seeds. Their errors are over windows: training again would give another difference.\n"
     )  # fmt: skip
 
