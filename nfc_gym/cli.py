@@ -1,4 +1,4 @@
-"""`nfc-gym`: check, close-loop, predict, excite, simulate, demo. Heavy imports are inside the command that needs them.
+"""`nfc-gym`: check, close-loop, predict, excite, simulate, train, infer, demo. Heavy imports are inside commands.
 
 Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the same command resumes; 1 a fault of ours.
 """
@@ -242,6 +242,105 @@ def simulate(
             from nfc_gym.simulate.maps import keep_maps
 
             keep_maps(out, jobs, Console())
+
+
+@app.command()
+def train(
+    ctx: typer.Context,
+    windows: Annotated[Path, typer.Argument(metavar="DIR", help="What `nfc-gym simulate` wrote.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.safetensors", help="The posterior.")],
+    encoder: Annotated[str, typer.Option(help="Of the motion: tcn, nn, qmc-rff, qmc-fks, none.")] = "tcn",
+    density: Annotated[str, typer.Option(help="Of psi: score (diffusion), mixture, flow (splines).")] = "score",
+    delta_s: Annotated[bool, typer.Option(help="Infer the residual dynamics too.")] = True,
+    maps: Annotated[
+        bool, typer.Option("--maps", help="See the elevation map; needs windows simulated with --maps.")
+    ] = False,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the windows, at most.")] = 100,
+    batch: Annotated[int, typer.Option(min=1, help="Windows a step.")] = 256,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first weights, the order and the noise.")] = 0,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto is a GPU where there is one.")] = "auto",
+) -> None:
+    """Train a posterior: from a window of motion to a distribution over psi (and delta_s) that could have made it.
+
+    Done once a robot; `nfc-gym infer` then takes milliseconds a window. A twentieth of the windows is held out, and the
+    weights kept are those of the epoch that did best on it. Interrupted, even killed, the same command goes on: the
+    state lies in FILE.safetensors.training, which may be deleted at the end.
+
+    What the motion does not show comes back as wide as the prior, however long one trains: simulate motion like the one
+    that you will log.
+
+    Example: nfc-gym train windows/jackal --out jackal.safetensors
+    """
+    with _outcome(ctx, resumes=True):
+        from nfc_gym.core import MissingExtra
+        from nfc_gym.inference.windows import Manifest
+        from nfc_gym.simulate.machine import Machine
+
+        try:
+            from nfc_gym.inference import jobs
+        except ImportError as e:
+            raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
+        from nfc_gym.inference.config import NetworkConfig
+        from nfc_gym.inference.progress import Spoken
+        from nfc_gym.inference.space import PriorBox
+        from nfc_gym.inference.train import TrainConfig
+
+        machine = Machine(Manifest.read(windows).environment)
+        prior = PriorBox.of(machine.space, machine.kind.name)
+        config = NetworkConfig(
+            encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
+        )
+        training = TrainConfig(epochs=epochs, batch=batch, seed=seed)
+        done = jobs.train_posterior(windows, prior, out, config, training, device=device, report=Spoken())
+        if done.best:
+            said = f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
+        else:
+            said = "nothing that was learned held on the windows held out: simulate more of them"
+        typer.echo(f"{out}: {said} ({done.seconds:.0f} s)")
+
+
+@app.command()
+def infer(
+    ctx: typer.Context,
+    posterior: Annotated[Path, typer.Argument(metavar="FILE.safetensors", help="What `nfc-gym train` wrote.")],
+    window: Annotated[
+        Path, typer.Argument(metavar="WINDOW.npz", help="Arrays `states` (n + 1, s) and `actions` (n, a).")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help=".npz: the draws; .safetensors: the posterior given this window."),
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, help="Draws.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+) -> None:
+    """Say what psi could have made a window of motion, and draw from that posterior.
+
+    `states` are `obs["proprio"]` of the robot at each control step and `actions` what was commanded, in [-1, 1], both
+    in the order of the training set's manifest; with a posterior that sees maps, `elevation` (128, 128) too. A window
+    longer than the training set's counts from its end. The table gives each parameter's median and 90 % interval; one
+    that the window does not show stays as wide as the prior, and is marked.
+
+    Either kind of --out goes into RandomizePsi and into `nfc-gym simulate --proposal`.
+
+    Example: nfc-gym infer jackal.safetensors window.npz --out psi.npz
+    """
+    with _outcome(ctx):
+        from rich.table import Table
+
+        from nfc_gym.core import MissingExtra
+
+        try:
+            from nfc_gym.inference import jobs
+        except ImportError as e:
+            raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
+
+        _, found = jobs.infer(posterior, window, samples=samples, seed=seed, out=out)
+        table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
+        for each in found:
+            note = "  not shown" if each.width >= jobs.AS_WIDE else ""
+            interval = f"{each.low:.4g} to {each.high:.4g}"
+            table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
+        Console(highlight=False, width=None if sys.stdout.isatty() else 140).print(table)
 
 
 @app.command()

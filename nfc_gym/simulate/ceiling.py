@@ -5,6 +5,8 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.windows import Batch
+from nfc_gym.physics.residual import Components
+from nfc_gym.physics.state import move
 from nfc_gym.simulate.fisher import STEP, Array, Ceiling, bounds, information
 from nfc_gym.simulate.ground import made
 from nfc_gym.simulate.machine import MOTOR, Machine
@@ -57,7 +59,9 @@ def ceiling(
     return bounds(np.array(found))
 
 
-def replayed(machine: Machine, window: Batch, u: Array, jitter: Array, nthread: int) -> Array:
+def replayed(
+    machine: Machine, window: Batch, u: Array, jitter: Array, nthread: int, delta_s: Array | None = None
+) -> Array:  # fmt: skip
     """States (m, H s) after each control step of one window from its start, under other psi, u (m, d).
 
     Args:
@@ -66,6 +70,7 @@ def replayed(machine: Machine, window: Batch, u: Array, jitter: Array, nthread: 
       u: (m, d).
       jitter: (m, H, a) added to the actions.
       nthread: threads.
+      delta_s: (m, s) added to the physical state after each control step; None adds nothing.
 
     Returns:
       nan for a simulation that comes apart.
@@ -80,11 +85,18 @@ def replayed(machine: Machine, window: Batch, u: Array, jitter: Array, nthread: 
     view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
     batch.state[...] = window["start"]
     view.now = robot.derive(view)
+    names, model = list(machine.state_names), sims.model
+    parts = None if delta_s is None else Components(model, names, len(names))
     out = [np.concatenate(robot.proprio(view), -1)]
     for action, noise in zip(window["actions"][0].astype(np.float64), np.moveaxis(jitter, 1, 0), strict=True):
         commanded = np.tile(action, (m, 1))
         view.ctrl[...] = robot.actuate(np.clip(action + noise, -1, 1), view)
         step(sims, np.ones(m, bool), kind.frame_skip)
+        if parts is not None and delta_s is not None:
+            change = parts.tangent(np.array(view.qpos), delta_s)
+            move(model, view.qpos, np.ascontiguousarray(change[:, : model.nv]))
+            view.qvel[...] += change[:, model.nv :]
+            batch.forward()
         view.task.update(robot.advance(view, commanded))
         view.before, view.now = view.now, robot.derive(view)
         out.append(np.concatenate(robot.proprio(view), -1))

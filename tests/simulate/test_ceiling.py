@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import InputError
-from nfc_gym.simulate.ceiling import ceiling
+from nfc_gym.simulate.ceiling import ceiling, replayed
 from nfc_gym.simulate.fisher import bounds, gain, information, variance
+from nfc_gym.simulate.machine import Machine
 
 
 def test_information_of_a_linear_system_is_its_own() -> None:
@@ -91,3 +92,17 @@ def test_noise_of_motors_lowers_a_jackals_ceiling(jackal: dict[str, np.ndarray])
 def test_noise_of_another_robot_is_refused(jackal: dict[str, np.ndarray]) -> None:
     with pytest.raises(InputError, match="want \\(15,\\)"):
         ceiling("nfc_gym/JackalFlat-v0", jackal, noise=np.ones(52))
+
+
+def test_a_residual_is_added_after_each_control_step(jackal: dict[str, np.ndarray]) -> None:
+    machine = Machine("nfc_gym/JackalFlat-v0")
+    one = {k: v[:1] for k, v in jackal.items()} | {"actions": jackal["actions"][:1, :2]}
+    u, still = np.tile(one["psi"].astype(float), (2, 1)), np.zeros((2, 2, 2))
+    forward = machine.state_names.index("body:base:linvel@body.x")
+    delta = np.zeros((2, len(machine.state_names)))
+    delta[1, forward] = 0.03
+    without = replayed(machine, one, u, still, 1).reshape(2, 2, -1)
+    with_ = replayed(machine, one, u, still, 1, delta).reshape(2, 2, -1)
+    np.testing.assert_allclose(with_[0], without[0], atol=1e-9)
+    assert with_[1, 0, forward] - without[1, 0, forward] == pytest.approx(0.03, abs=1e-9)
+    assert with_[1, 1, forward] > with_[0, 1, forward] + 0.03  # what the first step was given is still there

@@ -1,0 +1,174 @@
+"""The paper's Table I: posteriors of a simulator's parameters by robot, ground and method, beside their ceiling.
+
+    python benchmarks/posterior_table.py --out DIR [--robots Jackal Ant ...] [--terrain Flat Rough] [--windows 100000]
+        [--methods mdn-rff mdn-tcn sde-nn sde-rff sde-fks sde-tcn sbi-npe sbi-npse] [--inputs window summaries]
+        [--seeds 0] [--epochs 100] [--budget SECONDS] [--extras ceiling residuals axle rounds plots]
+    python benchmarks/posterior_table.py --quick
+
+Windows are simulated once into DIR and used by every method; a cell (robot, ground, method, inputs, seed) that is
+finished is kept in DIR/cells, and one that was interrupted goes on from its last saved state, so that the same
+command may be given again and again until all is there. `--budget` is the training time of a cell: ours get as many
+epochs as fit into it, sbi's stop when it is used up. `--stop SECONDS` begins no new cell after that time.
+DIR/table.md is written anew after every command from all cells that there are. `--quick` is a toy in a temporary
+folder, whose figures mean nothing.
+
+Gain is the mean log density of the true parameters on windows not trained on, in nats a parameter, the prior having 0.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its core whenever another process has it
+
+import torch
+from posteriors import extras, plots, report
+from posteriors.ceilings import ceiling_of
+from posteriors.fit import Plan, fit
+from posteriors.judge import judge, latency
+from posteriors.keep import Kept
+from posteriors.methods import INPUTS, METHODS, possible
+from posteriors.paper import ROBOTS, TERRAINS
+from posteriors.sets import JUDGE, TRAIN, Held, environment, prior_of, stored
+
+from nfc_gym.core.errors import InputError, MissingExtra
+from nfc_gym.inference.progress import Spoken
+
+EXTRAS = ("ceiling", "residuals", "axle", "rounds", "plots")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a command asks for, and until when it may begin something new."""
+
+    args: argparse.Namespace
+    kept: Kept
+    plan: Plan
+    device: torch.device
+    ends: float
+
+    def folder(self, name: str) -> Path:
+        """Where the training of that name keeps its state."""
+        return self.kept.folder(name)
+
+    @property
+    def over(self) -> bool:
+        return time.monotonic() > self.ends
+
+
+def main() -> None:
+    """Command line."""
+    args = _arguments()
+    with tempfile.TemporaryDirectory() as folder:
+        args.out = args.out or Path(folder)
+        args.data = args.data or args.out
+        device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device
+                              if args.device != "auto" else "cpu")  # fmt: skip
+        plan = Plan(args.epochs, args.budget, args.batch, args.rate, args.small)
+        kept = Kept(
+            args.out, {"windows": args.windows, "judges": args.judges, "samples": args.samples, **plan._asdict()}
+        )
+        run = Run(args, kept, plan, device, time.monotonic() + args.stop if args.stop else float("inf"))
+        print(f"torch {torch.__version__} on {device}, {torch.get_num_threads()} threads, {args.out}", flush=True)
+        for robot in args.robots:
+            for terrain in args.terrain:
+                if run.over:
+                    print("time is up: the same command goes on")
+                else:
+                    robot_on(run, robot, terrain)
+        text = report.table(kept.values())
+        (args.out / "table.md").write_text(text)
+        print(text)
+
+
+def robot_on(run: Run, robot: str, terrain: str) -> None:
+    """Every cell of one environment, then what else was asked for."""
+    args, env = run.args, environment(robot, terrain)
+    maps = "map" in args.inputs or "residuals" in args.extras
+    train_on = stored(args.data, env, args.windows, TRAIN, args.jobs, maps)
+    judged = stored(args.data, env, args.judges, JUDGE, args.jobs, maps)
+    windows, judges = (Held.of(w, run.device, maps) for w in (train_on, judged))
+    if "ceiling" in args.extras:
+        run.kept.once(f"{robot}{terrain}_ceiling", lambda: ceiling_of(
+            args.data, env, judged, args.ceiling_windows, args.jobs, *args.ceiling_draws))  # fmt: skip
+    for seed in args.seeds:
+        for inputs in args.inputs:
+            for method in args.methods:
+                if not run.over and not possible(METHODS[method], inputs):
+                    run.kept.once(f"{robot}{terrain}_{method}_{inputs}_{seed}", lambda m=method, i=inputs, s=seed: cell(
+                        run, env, m, i, s, windows, judges))  # fmt: skip
+    for extra in args.extras:
+        if extra != "ceiling" and not run.over:
+            extras.EXTRAS[extra](run, robot, terrain, windows, judges)
+
+
+def cell(run: Run, env: str, method: str, inputs: str, seed: int, windows: Held, judges: Held) -> dict[str, Any]:
+    """Train and judge one method; a peer that is not installed says so instead, and is tried again."""
+    prior, folder = prior_of(env), run.folder(f"{env[8:-3]}_{method}_{inputs}_{seed}")
+    spoken = Spoken()
+    spoken.message(f"{env}: {METHODS[method].name}, {inputs}, seed {seed}")
+    try:
+        done = fit(method, inputs, windows, prior, run.plan, seed, folder, run.device, spoken)
+    except MissingExtra as e:
+        return {"missing": str(e)}
+    plots.keep_draws(done.fitted, judges, folder)
+    few = min(run.args.judges, run.args.peer_judges) if method == "sbi-npse" else None
+    found = judge(done.fitted, judges, prior, run.args.samples, few)
+    out = done.outcome
+    return found | {
+        "epochs": len(out.held_out), "planned": done.epochs, "best": out.best, "stopped": out.stopped,
+        "seconds": out.seconds, "latency_ms": latency(done.fitted, judges), "device": str(run.device),
+        "threads": torch.get_num_threads(),
+    }  # fmt: skip
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="folder for windows, cells and tables")
+    parser.add_argument("--data", type=Path, help="folder for windows and ceilings, where several DIR share them")
+    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
+    parser.add_argument("--terrain", nargs="+", choices=TERRAINS, default=list(TERRAINS))
+    parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--inputs", nargs="+", choices=list(INPUTS), default=["window", "summaries"])
+    parser.add_argument("--extras", nargs="*", choices=EXTRAS, default=["ceiling"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--windows", type=int, default=100_000, help="to train on")
+    parser.add_argument("--judges", type=int, default=2000, help="windows not trained on")
+    parser.add_argument("--peer-judges", type=int, default=200, help="of those, for NPSE, whose densities take long")
+    parser.add_argument("--samples", type=int, default=512, help="draws a window")
+    parser.add_argument("--epochs", type=int, default=100, help="at most")
+    parser.add_argument("--budget", type=float, default=0, help="seconds of training a cell; 0 sets none")
+    parser.add_argument("--stop", type=float, default=0, help="begin nothing new after these seconds")
+    parser.add_argument("--batch", type=int, default=256)
+    parser.add_argument("--rate", type=float, default=5e-4)
+    parser.add_argument("--small", action="store_true", help="networks of a toy's size")
+    parser.add_argument("--jobs", type=int, default=0, help="processes of the simulation; 0 takes all cores")
+    parser.add_argument("--device", default="auto", help="cpu, cuda, or auto")
+    parser.add_argument("--ceiling-windows", type=int, default=8)
+    parser.add_argument("--ceiling-draws", nargs=2, type=int, default=[256, 32], metavar=("CLOUD", "PAIRS"))
+    parser.add_argument("--truths", type=int, default=20, help="of the sequential rounds")
+    parser.add_argument("--round", type=int, default=10_000, help="simulations a round")
+    parser.add_argument("--few", type=int, default=200, help="windows that are replayed, or whose maps are drawn")
+    parser.add_argument("--axles", type=int, default=100, help="windows with a lost axle")
+    parser.add_argument("--quick", action="store_true", help="a toy: Jackal on flat ground, in a minute")
+    args = parser.parse_args()
+    if args.out is None and not args.quick:
+        parser.error("name a folder: --out DIR")
+    if args.quick:
+        args.robots, args.terrain, args.inputs, args.extras = ["Jackal"], ["Flat"], ["window"], ["ceiling"]
+        args.methods = [m for m in args.methods if m != "sbi-npse"]  # its 500 steps a draw take minutes on a processor
+        args.windows, args.judges, args.samples, args.epochs, args.small = 512, 64, 64, 2, True
+        args.ceiling_windows, args.ceiling_draws, args.jobs, args.peer_judges = 1, [16, 4], 1, 8
+    return args
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as e:
+        sys.exit(str(e))

@@ -1,0 +1,60 @@
+"""Finished results under DIR: each is computed once, and belongs to the settings that it was computed with."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from nfc_gym.core.errors import InputError
+
+
+class Kept:
+    """Results by name, one JSON file each.
+
+    Args:
+      out: the folder.
+      settings: what results depend on beside their names.
+
+    Raises:
+      InputError: the folder holds results of other settings.
+    """
+
+    def __init__(self, out: Path, settings: dict[str, Any]) -> None:
+        self.cells, self.out = out / "cells", out
+        self.cells.mkdir(parents=True, exist_ok=True)
+        file = out / "settings.json"
+        if file.is_file():
+            before = json.loads(file.read_text())
+            odd = [f"{k} {before.get(k)}, not {v}" for k, v in settings.items() if before.get(k) != v]
+            if odd:
+                raise InputError(f"{out} holds results of {', '.join(odd)}: give those, or another folder")
+        write(file, settings)
+
+    def once(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """What `make` gives, or gave when it was called for this name before; what is `missing` is tried again."""
+        file = self.cells / f"{name}.json"
+        if file.is_file():
+            found = json.loads(file.read_text())
+            if "missing" not in found:
+                return found
+        write(file, make())
+        return json.loads(file.read_text())
+
+    def keep(self, name: str, found: dict[str, Any]) -> None:
+        """Write a result, over an earlier one of that name."""
+        write(self.cells / f"{name}.json", found)
+
+    def folder(self, name: str) -> Path:
+        """Where training keeps its state."""
+        return self.out / "training" / name
+
+    def values(self) -> dict[str, dict[str, Any]]:
+        """Every result that there is, by name."""
+        return {f.stem: json.loads(f.read_text()) for f in sorted(self.cells.glob("*.json"))}
+
+
+def write(file: Path, value: Any) -> None:
+    """Whole or not at all."""
+    part = file.with_suffix(".part")
+    part.write_text(json.dumps(value, indent=1))
+    part.replace(file)

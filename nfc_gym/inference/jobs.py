@@ -1,0 +1,151 @@
+"""What `nfc-gym train` and `nfc-gym infer` do: a posterior from a folder of windows, and draws of it given one."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.core.files import replacing
+from nfc_gym.inference import checkpoint
+from nfc_gym.inference.config import NetworkConfig, Sizes
+from nfc_gym.inference.data import StoredWindows
+from nfc_gym.inference.network import Network
+from nfc_gym.inference.posterior import Window, load
+from nfc_gym.inference.progress import Report, quiet
+from nfc_gym.inference.space import PriorBox
+from nfc_gym.inference.train import Outcome, TrainConfig, train
+from nfc_gym.inference.windows import Windows
+
+Array = NDArray[np.float64]
+HELD_OUT = 0.05  # of the windows, by which epochs are compared
+_LEVEL = 0.9
+AS_WIDE = 0.9  # of the prior's own 90 % interval: told little or nothing
+
+
+def device_of(name: str) -> torch.device:
+    """`auto` is a GPU where there is one.
+
+    Raises:
+      InputError: no device of that name here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as e:
+        raise InputError(f"device {name!r}: {str(e).splitlines()[0]}; there is auto, cpu, and cuda on a GPU") from None
+
+
+def train_posterior(
+    folder: Path, prior: PriorBox, out: Path, config: NetworkConfig, training: TrainConfig, *, device: str = "auto",
+    report: Report = quiet,
+) -> Outcome:  # fmt: skip
+    """Train a network on a folder of windows into a checkpoint; a run that was stopped goes on.
+
+    Args:
+      folder: what `nfc-gym simulate` wrote.
+      prior: psi's box of the windows' environment.
+      out: the checkpoint, `.safetensors`; the state of training lies in a folder of that name and `.training`.
+      config: of the network. `families` that are not empty are replaced by those of the windows.
+      training: see `TrainConfig`.
+      device: `auto`, `cpu`, `cuda`.
+      report: is told of the progress.
+
+    Raises:
+      InputError: no such windows, windows without maps where the network needs them, or a name of another ending.
+    """
+    if out.suffix != ".safetensors":
+        raise InputError(f"{out}: a posterior is kept in a file that ends in .safetensors")
+    stored = Windows(folder, robot=prior.robot, psi_names=prior.names)
+    if config.elevation and "map" not in stored.names:
+        raise InputError(f"{folder}: the windows have no elevation maps; make them with `nfc-gym simulate ... --maps`")
+    if config.families:
+        config = replace(config, families=tuple(stored.manifest.families))
+    about = stored.manifest
+    sizes = Sizes(about.horizon, len(about.state_names), len(about.action_names))
+    network = Network(config, sizes, prior, training.seed)
+    first, held_out = StoredWindows(stored).split(HELD_OUT)
+    state = out.with_name(out.name + ".training")
+    state.mkdir(parents=True, exist_ok=True)
+    outcome = train(network, first, held_out, training, folder=state, device=device_of(device), report=report)
+    notes = {
+        "environment": about.environment, "windows": len(stored), "best": outcome.best, "stopped": outcome.stopped,
+        "seconds": outcome.seconds, "held_out": outcome.held_out, "start": outcome.start,
+    }  # fmt: skip
+    checkpoint.save(out, network.cpu(), notes=notes)
+    return outcome
+
+
+def read_window(path: Path) -> Window:
+    """A window of motion from an .npz of `states` (n + 1, s), `actions` (n, a), perhaps `elevation` (128, 128).
+
+    Raises:
+      InputError: no such file, or not of this form.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays: dict[str, Any] = {k: file[k] for k in file.files}
+    except (OSError, ValueError, EOFError, AttributeError) as e:
+        raise InputError(f"{path} is no .npz file ({e}); want one with `states` (n + 1, s), `actions` (n, a)") from None
+    missing = [k for k in ("states", "actions") if k not in arrays]
+    if missing:
+        raise InputError(f"{path}: no array {missing[0]!r}; there are: {', '.join(arrays) or 'none'}")
+    return Window(arrays["states"], arrays["actions"], arrays.get("elevation"))
+
+
+class Told(NamedTuple):
+    """What draws say of one parameter: median, the 90 % interval, and its width over the prior's own."""
+
+    name: str
+    unit: str
+    median: float
+    low: float
+    high: float
+    width: float
+
+
+def infer(
+    posterior: Path, window: Path, *, samples: int = 1000, seed: int = 0, out: Path | None = None
+) -> tuple[Fidelity, list[Told]]:
+    """Draw from a posterior given a window.
+
+    Args:
+      posterior: what `train_posterior` wrote.
+      window: see `read_window`.
+      samples: how many.
+      seed: of the draws.
+      out: `.npz` for the draws (`psi`, and `delta_s` where it is inferred), or `.safetensors` for the posterior given
+        this window; wrappers and `nfc-gym simulate --proposal` take either.
+
+    Raises:
+      InputError: a damaged file, a window that is not the network's, or another ending.
+    """
+    if out is not None and out.suffix not in (".npz", ".safetensors"):
+        raise InputError(f"{out}: draws are kept in .npz, the posterior given the window in .safetensors")
+    given = load(posterior).given(read_window(window))
+    parts = [p for p in given.network.parts if p != "delta_e"]
+    drawn = given.of(*parts).sample(samples, np.random.default_rng(seed))
+    if out is not None and out.suffix == ".safetensors":
+        given.save(out)
+    elif out is not None:
+        with replacing(out) as part, part.open("wb") as file:
+            np.savez(file, **{p: getattr(drawn, p) for p in parts})
+    return drawn, told(given.prior, np.asarray(drawn.psi))
+
+
+def told(prior: PriorBox, psi: Array) -> list[Told]:
+    """By parameter, in the prior's order, of those that are free: from draws (n, d)."""
+    middle, low, high = np.quantile(psi, [0.5, (1 - _LEVEL) / 2, (1 + _LEVEL) / 2], axis=0).tolist()
+    widths = [_LEVEL * (b - a) for a, b in zip(prior.low, prior.high, strict=True)]  # of the prior's own interval
+    return [
+        Told(prior.names[i], prior.units[i], middle[i], low[i], high[i], (high[i] - low[i]) / widths[i])
+        for i in range(len(prior))
+        if prior.free[i]
+    ]

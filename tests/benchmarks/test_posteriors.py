@@ -1,0 +1,189 @@
+"""The figures of benchmarks/posterior_table.py against closed forms: known normals, maps and curves."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+torch = pytest.importorskip("torch", reason="the posteriors that are judged are nfc_gym.inference's")
+
+
+def normals(rng: np.random.Generator, windows: int, n: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
+    """Draws in u and truths of a right posterior: z = x + spread e, x known, so the posterior of z is normal."""
+    middle = rng.standard_normal((windows, 3)) * math.sqrt(1 - spread**2)
+    draws = middle[:, None] + spread * rng.standard_normal((windows, n, 3))
+    return ndtr(draws), ndtr(middle + spread * rng.standard_normal((windows, 3)))
+
+
+def test_the_gain_of_a_known_normal_is_the_log_of_how_much_narrower_it_is() -> None:
+    from posteriors import metrics
+
+    draws, truth = normals(np.random.default_rng(0), 3000, 200, 0.2)
+    found = metrics.mean(metrics.marginal_gain(draws, truth).mean(1))
+    # E[log N(z; m, s) - log N(z; 0, 1)] = -log s, as z is N(0, 1) in all; 1 / n is lost to fitting from draws
+    assert found.value == pytest.approx(-math.log(0.2), abs=4 * found.error + 0.01)
+
+
+def test_the_prior_gains_nothing() -> None:
+    from posteriors import metrics
+
+    draws, truth = normals(np.random.default_rng(1), 2000, 200, 1.0)
+    found = metrics.mean(metrics.marginal_gain(draws, truth).mean(1))
+    assert abs(found.value) < 4 * found.error + 0.01
+
+
+def test_density_changes_with_the_coordinates() -> None:
+    from posteriors.fitted import gain_of, truth_of
+
+    z = truth_of(torch.tensor([[0.1, 0.6], [0.5, 0.9]], dtype=torch.float64))
+    prior = torch.distributions.Normal(0, 1).log_prob(z).sum(-1)
+    assert gain_of(z, prior).numpy() == pytest.approx(np.zeros(2), abs=1e-12)
+    narrow = torch.distributions.Normal(z, torch.full_like(z, 0.1)).log_prob(z).sum(-1)
+    assert (gain_of(z, narrow) - gain_of(z, prior)).numpy() == pytest.approx((narrow - prior).numpy())
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9, 0.95])
+@pytest.mark.parametrize("spread", [0.3, 1.0])
+def test_right_posteriors_are_covered_as_often_as_they_say(level: float, spread: float) -> None:
+    from posteriors import metrics
+
+    draws, truth = normals(np.random.default_rng(2), 3000, 128, spread)
+    found = metrics.mean(metrics.coverage(draws, truth, level))
+    assert found.value == pytest.approx(round(level * 65) / 65, abs=4 * found.error)
+
+
+def test_too_narrow_posteriors_are_not() -> None:
+    from posteriors import metrics
+
+    draws, truth = normals(np.random.default_rng(3), 500, 128, 0.5)
+    narrow = draws.mean(1, keepdims=True) + (draws - draws.mean(1, keepdims=True)) / 2
+    assert metrics.coverage(narrow, truth, 0.9).mean() < 0.75
+
+
+def test_an_interval_holds_a_truth_at_the_edge_of_the_box() -> None:
+    from posteriors import metrics
+
+    draws = np.random.default_rng(4).exponential(0.02, (50, 400, 1)).clip(1e-6, 1)
+    low, high = metrics.intervals(draws, 0.9)
+    assert (low == 0).mean() > 0.8
+    # 90 % of an exponential lies below log(10) of its means
+    assert np.median(high) == pytest.approx(0.02 * math.log(10), rel=0.2)
+
+
+def test_ranks_and_random_points_show_what_is_wrong() -> None:
+    from posteriors import metrics
+    from posteriors.judge import critical
+
+    rng = np.random.default_rng(5)
+    draws, truth = normals(rng, 800, 100, 0.5)
+    right = [metrics.farthest(metrics.ranks(draws, truth)[:, 0]), metrics.farthest(metrics.tarp(draws, truth, rng))]
+    wide = np.clip(0.5 + (draws - 0.5) * 0.3, 0, 1)
+    assert max(right) < critical(800, 20)
+    assert metrics.farthest(metrics.ranks(wide, truth)[:, 0]) > 2 * critical(800)
+    shifted = ndtr(np.sqrt(2) * (draws - 0.5))
+    assert metrics.farthest(metrics.tarp(shifted, truth, rng)) > critical(800)
+
+
+def test_the_energy_score_of_a_normal_is_its_closed_form() -> None:
+    from posteriors import metrics
+
+    rng = np.random.default_rng(6)
+    truth = np.array([[0.0], [1.5]]).repeat(200, 0)
+    score = metrics.energy_score(rng.standard_normal((400, 300, 1)), truth).reshape(2, 200)
+    for values, y in zip(score, (0.0, 1.5), strict=True):
+        bell = math.exp(-y * y / 2) / math.sqrt(2 * math.pi)
+        exact = y * (2 * ndtr(y) - 1) + 2 * bell - 1 / math.sqrt(math.pi)  # Gneiting et al. 2005, for one dimension
+        found = metrics.mean(values)
+        assert found.value == pytest.approx(exact, abs=4 * found.error)
+
+
+def test_a_normal_like_draws_has_their_mean_and_covariance() -> None:
+    from posteriors import metrics
+
+    rng = np.random.default_rng(7)
+    draws = rng.exponential(size=(1, 40, 3)) @ np.array([[1, 0.5, 0], [0, 1, 0.2], [0, 0, 2.0]])
+    like = metrics.normal_like(draws, 100_000, rng)[0]
+    assert like.mean(0) == pytest.approx(draws[0].mean(0), abs=0.05)
+    assert np.cov(like.T) == pytest.approx(np.cov(draws[0].T), rel=0.1, abs=0.05)
+
+
+def test_the_variogram_score_sees_correlations() -> None:
+    from posteriors import metrics
+
+    rng = np.random.default_rng(8)
+    smooth = rng.standard_normal((30, 41, 1, 1)) * np.ones((32, 32))
+    rough = rng.standard_normal((30, 40, 32, 32))
+    truth = smooth[:, 0]
+    assert metrics.variogram_score(smooth[:, 1:], truth) == pytest.approx(np.zeros(30))
+    # E sqrt|x - x'| of two N(0, 1) is 2^(1/2) Gamma(3/4) / sqrt(pi)
+    wanted = (math.sqrt(2) * math.gamma(0.75) / math.sqrt(math.pi)) ** 2
+    assert metrics.variogram_score(rough, truth).mean() == pytest.approx(wanted, rel=0.05)
+
+
+def test_a_wave_is_in_its_octave_and_white_noise_in_all_alike() -> None:
+    from posteriors import metrics
+
+    wave = np.sin(2 * np.pi * 11 * np.arange(128) / 128) * np.ones((128, 1))
+    power = metrics.spectrum(wave)
+    assert power.argmax() == 3  # 8 to 16 waves
+    white = metrics.spectrum(np.random.default_rng(9).standard_normal((200, 128, 128))).mean(0)
+    assert white[1:] == pytest.approx(np.full(5, white[-1]), rel=0.1)
+
+
+def test_the_area_counts_ties_half() -> None:
+    from posteriors import metrics
+
+    assert metrics.area(np.array([1.0, 2, 2, 3]), np.array([False, True, False, True])) == pytest.approx(3.5 / 4)
+
+
+def test_what_is_finished_is_kept_and_what_is_missing_tried_again(tmp_path: Path) -> None:
+    from posteriors.keep import Kept
+
+    from nfc_gym.core import InputError
+
+    kept = Kept(tmp_path, {"windows": 10})
+    assert kept.once("a", lambda: {"gain": [1.0, 0.1]}) == kept.once("a", lambda: pytest.fail("made twice"))
+    kept.once("b", lambda: {"missing": "sbi"})
+    assert kept.once("b", lambda: {"gain": [2.0, 0.1]}) == {"gain": [2.0, 0.1]}
+    assert json.loads((tmp_path / "cells" / "b.json").read_text())["gain"][0] == 2
+    with pytest.raises(InputError, match="windows 10, not 20"):
+        Kept(tmp_path, {"windows": 20})
+
+
+def test_the_tables_print_what_there_is() -> None:
+    from posteriors import report
+
+    one = {"gain": [0.3, 0.01], "gain_without_effect": [0.4, 0.02], "log_posterior": [-1.0, 0.1], "gains":
+           [0.2, 0.3, 0.4], "marginal":
+           {"mass": [0.1, 0.01]}, "coverage": {k: [float(k), 0.01] for k in ("0.5", "0.9", "0.95")}, "width":
+           [0.5, 0.1], "ranks": 0.02, "tarp": 0.03, "distance_95": 0.04, "epochs": 5, "best": 4, "seconds": 9.0,
+           "latency_ms": 12.0}  # fmt: skip
+    less = one | {"gain": [0.1, 0.01], "gains": [0.0, 0.1, 0.2]}
+    ceiling = {"windows": 3, "apart": 0, "cloud": 8, "pairs": 2, "joint": [0.8, 0.1], "groups": {"mass": [0.2, 0.1]}}
+    text = report.table({
+        "JackalFlat_sde-tcn_window_0": one, "JackalFlat_mdn-rff_window_0": less, "JackalFlat_ceiling": ceiling,
+        "JackalFlat_sbi-npe_window_0": {"missing": "sbi is not installed"},
+    })  # fmt: skip
+    assert "0.50" in text  # efficiency: 0.4 of 0.8
+    assert "+0.200 ± 0.000" in text  # window by window
+    assert "sbi is not installed" in text
+    assert "-1.00 ± 0.10 / 1.21" in text  # beside the paper's
+
+
+def test_noise_is_drawn_anew_with_each_pass_and_the_same_for_a_seed() -> None:
+    from posteriors.sets import Held
+
+    states = torch.zeros(40, 3, 2)
+    held = Held(
+        {"states": states, "actions": torch.zeros(40, 2, 1), "psi": torch.rand(40, 1)}, torch.tensor([0.5, 0.0])
+    )
+    first, again, other = (torch.cat([b["states"] for b in held.batches(16, s)]) for s in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert (first[..., 1] == 0).all()
+    assert float(first[..., 0].std()) == pytest.approx(0.5, rel=0.2)
+    train, judge = held.split(0.25)
+    assert (len(train), len(judge)) == (30, 10)

@@ -1,0 +1,133 @@
+"""`nfc-gym train` and `nfc-gym infer`, from a folder of windows to psi."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from nfc_gym.cli import app
+from nfc_gym.core import InputError
+from nfc_gym.core.posterior import load_source
+from nfc_gym.inference import jobs
+from nfc_gym.inference.config import NetworkConfig
+from nfc_gym.inference.space import PriorBox
+from nfc_gym.inference.train import TrainConfig
+from nfc_gym.inference.windows import Windows
+from nfc_gym.simulate import simulate
+from nfc_gym.simulate.machine import Machine
+
+ENV = "nfc_gym/QuadcopterFlat-v0"
+SMALL = NetworkConfig(encoder="none", summaries=True, linear=True, delta_s=True, features=0, hidden=16, depth=1)
+
+
+@pytest.fixture(scope="module")
+def windows(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("jobs") / "windows"
+    simulate(ENV, 60, folder, jobs=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def prior() -> PriorBox:
+    machine = Machine(ENV)
+    return PriorBox.of(machine.space, machine.kind.name)
+
+
+@pytest.fixture(scope="module")
+def posterior(windows: Path, prior: PriorBox) -> Path:
+    out = windows.parent / "quadcopter.safetensors"
+    jobs.train_posterior(windows, prior, out, SMALL, TrainConfig(epochs=1, batch=32), device="cpu")
+    return out
+
+
+@pytest.fixture(scope="module")
+def motion(windows: Path) -> Path:
+    one = Windows(windows)[0]
+    file = windows.parent / "window.npz"
+    np.savez(file, states=one["states"], actions=one["actions"])
+    return file
+
+
+def test_draws_lie_in_the_prior_and_open_as_a_source(posterior: Path, motion: Path, prior: PriorBox) -> None:
+    out = posterior.parent / "psi.npz"
+    drawn, told = jobs.infer(posterior, motion, samples=200, out=out)
+    assert ((np.array(drawn.psi) >= prior.low) & (np.array(drawn.psi) <= prior.high)).all()
+    assert [t.name for t in told] == list(prior.names)
+    again = load_source(out).sample(5, np.random.default_rng(0))
+    assert again.psi is not None
+    assert again.delta_s is not None
+    assert all((drawn.psi == row).all(1).any() for row in again.psi)
+
+
+def test_the_posterior_given_a_window_is_kept(posterior: Path, motion: Path) -> None:
+    out = posterior.parent / "today.safetensors"
+    jobs.infer(posterior, motion, samples=10, out=out)
+    assert np.shape(load_source(out).sample(7, np.random.default_rng(0)).psi) == (7, 9)
+
+
+def test_the_table_tells_the_width_over_the_prior(prior: PriorBox) -> None:
+    u = np.random.default_rng(0).uniform(size=(20_000, len(prior)))
+    u[:, 0] = 0.4 + 0.1 * u[:, 0]
+    told = jobs.told(prior, prior.psi_of(u))
+    assert told[0].width == pytest.approx(0.1, rel=0.05)
+    assert told[0].median == pytest.approx(prior.low[0] + 0.45 * (prior.high[0] - prior.low[0]), rel=0.01)
+    assert told[1].width == pytest.approx(1, rel=0.03)
+
+
+def test_the_command_trains_and_the_other_tells(windows: Path, motion: Path, tmp_path: Path) -> None:
+    file = tmp_path / "q.safetensors"
+    run = CliRunner()
+    made = run.invoke(app, ["train", str(windows), "--out", str(file), "--encoder", "none", "--epochs", "1",
+                            "--no-delta-s", "--device", "cpu"])  # fmt: skip
+    assert made.exit_code == 0, made.output
+    assert "held" in made.output
+    found = run.invoke(app, ["infer", str(file), str(motion), "--samples", "50"])
+    assert found.exit_code == 0, found.output
+    assert "base_mass" in found.output
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"states": np.zeros((21, 21))}, "no array 'actions'"),
+        ({"states": np.zeros((11, 21)), "actions": np.zeros((10, 4))}, "trained on windows of 20"),
+        ({"states": np.full((21, 21), np.nan), "actions": np.zeros((20, 4))}, "nan"),
+    ],
+)
+def test_a_window_that_is_none_is_refused(
+    posterior: Path, tmp_path: Path, arrays: dict[str, np.ndarray], said: str
+) -> None:
+    file = tmp_path / "w.npz"
+    np.savez(file, **arrays)
+    done = CliRunner().invoke(app, ["infer", str(posterior), str(file)])
+    assert done.exit_code == 2
+    assert said in " ".join(done.output.split())
+
+
+def test_files_that_are_something_else_are_refused(posterior: Path, motion: Path, tmp_path: Path) -> None:
+    text = tmp_path / "w.npz"
+    text.write_text("no archive")
+    for at, said in ((text, "no .npz"), (tmp_path / "gone.npz", "no such file")):
+        with pytest.raises(InputError, match=said):
+            jobs.infer(posterior, at)
+    with pytest.raises(InputError, match=r"\.npz"):
+        jobs.infer(posterior, motion, out=tmp_path / "draws.csv")
+
+
+def test_training_says_what_is_wrong(windows: Path, prior: PriorBox, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--maps"):
+        jobs.train_posterior(windows, prior, tmp_path / "a.safetensors",
+                             NetworkConfig(elevation=True), TrainConfig(), device="cpu")  # fmt: skip
+    with pytest.raises(InputError, match=r"ends in \.safetensors"):
+        jobs.train_posterior(windows, prior, tmp_path / "a.pt", SMALL, TrainConfig(), device="cpu")
+    with pytest.raises(InputError, match="there is auto, cpu"):
+        jobs.device_of("tpu9")
+    other = tmp_path / "other"
+    shutil.copytree(windows, other)
+    about = json.loads((other / "manifest.json").read_text())
+    (other / "manifest.json").write_text(json.dumps(about | {"robot": "ant"}))
+    with pytest.raises(InputError, match="'ant'"):
+        jobs.train_posterior(other, prior, tmp_path / "a.safetensors", SMALL, TrainConfig(), device="cpu")
