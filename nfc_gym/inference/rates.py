@@ -1,8 +1,8 @@
 """How often a score alarms: a threshold at a wanted false-positive rate, and what a detector is judged by.
 
-A score is compared with its threshold window by window; nothing is adjusted for neighbours. F1 after point adjustment, by
-which a whole stretch counts as found once one of its points is, is left out on purpose: a random score wins it
-(Kim, Choi, Choi, Lee and Yoon 2022, "Towards a rigorous evaluation of time-series anomaly detection").
+A score is compared with its threshold window by window; nothing is adjusted for neighbours. F1 after point
+adjustment, by which a whole stretch counts as found once one of its points is, is left out on purpose: a random score
+wins it (Kim, Choi, Choi, Lee and Yoon 2022, "Towards a rigorous evaluation of time-series anomaly detection").
 """
 
 import math
@@ -67,8 +67,9 @@ def threshold_at(scores: ArrayLike, rate: float) -> Threshold:
     n = len(found)
     if n < least:
         raise InputError(
-            f"threshold: {n} held-out windows cannot show a false-positive rate of {rate:g}, which takes {least} or more "
-            f"({ALARMS} false alarms among them); from these a rate of {min(1.0, ALARMS / n):.2g} or more can be set"
+            f"threshold: {n} held-out windows cannot show a false-positive rate of {rate:g}, which takes {least} or "
+            f"more ({ALARMS} false alarms among them); "
+            f"from these a rate of {min(1.0, ALARMS / n):.2g} or more can be set"
         )
     k = math.floor(rate * (n + 1))
     low, high = betaincinv(k, n + 1 - k, [0.05, 0.95])

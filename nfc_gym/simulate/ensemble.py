@@ -1,7 +1,7 @@
 """The ensemble Kalman filter's two formulae, for many windows at once (Evensen 2003, "The ensemble Kalman filter").
 
-M members predict k observations, in units of the sensor noise. Their spread S (M, k), rows divided by sqrt(M - 1), gives
-the covariance of the mean error e by
+M members predict k observations, in units of the sensor noise. Their spread S (M, k), rows divided by sqrt(M - 1),
+gives the covariance of the mean error e by
 
     Sigma = D + (1 - a) S' S,    D = 1 + a diag(S' S):
 

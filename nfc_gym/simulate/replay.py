@@ -1,14 +1,17 @@
 """The posterior-predictive replay: does the simulator, as it is believed to be, explain this window?
 
-A window's actions are replayed from its start under draws of psi, each with a start-state noise and motor noise of its own,
-which are thereby carried through. After each control step the error, observation less replay, in units of the
-sensor noise, is whitened: if the simulator is right the mean error e is, to first order, Gaussian with the covariance
+A window's actions are replayed from its start under draws of psi, each with a start-state noise and motor noise of
+its own, which are thereby carried through. After each control step the error, observation less replay, in units of
+the sensor noise, is whitened: if the simulator is right the mean error e is, to first order, Gaussian with the
+covariance
 
     Sigma = I + C: the sensors' noise, and what psi, start and motors leave open, by the spread of the replays.
 
-The replays then move towards what was observed (`ensemble`) and go on: the next error is conditioned on all that was seen so
-far, so a start that was off, or contacts that scatter, do not hide what comes after. The score is the mean over the window
-of X = e' Sigma^-1 e / k, about 1 where the simulator explains the motion down to the noise.
+The replays then move towards what was observed (`ensemble`) and go on: the next error is conditioned on all that was
+seen so far, so a start that was off, or contacts that scatter, do not hide what comes after. The score is the mean
+over the window, its first steps left out, of X = e' Sigma^-1 e / k (cut at `MOST`): about 1 where the simulator
+explains the motion down to the noise. Rolled out freely for the whole window instead, the start's noise hides most
+faults of a robot on wheels.
 
 Conditioned on the actions like this a lost motor shows, where the motion alone may look like any other. How high scores
 go without a fault is found from nominal windows (`inference.rates`), not from tables: contacts are not Gaussian.
@@ -33,6 +36,8 @@ from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
 DRAWS = 32  # replays a window
+SETTLE = 5  # control steps in which replays find the start's contacts and speeds; they do not count
+MOST = 4.0  # of X in one step: beyond it is a blow of contact, and more of it tells nothing more of the model
 _TURN = 2048  # replays at once
 _AIMS = (9, 11)  # entries of a runner's proprio that tell of its target, which no replay knows
 
@@ -82,16 +87,15 @@ class Replay:
         self._sims: Simulations | None = None
 
     def score(self, states: Array, actions: Array, start: Array | None = None) -> Array:
-        """(n,) mean X of windows; arguments and errors as of `steps`."""
-        return self.steps(states, actions, start).mean(1)
+        """(n,) mean of min(X, `MOST`) after the first `SETTLE` steps; arguments and errors as of `steps`."""
+        return np.minimum(self.steps(states, actions, start)[:, SETTLE:], MOST).mean(1)
 
     def steps(self, states: Array, actions: Array, start: Array | None = None) -> Array:
         """(n, H) X of each control step of windows; infinite from where replays come apart.
 
         Args:
-          states: (n, H+1, s) as observed, with noise.
-          actions: (n, H, a) as commanded.
-          start: (n, nq + nv) measured positions and velocities of the model at the window's first state. None takes them
+          states: (n, H+1, s) as observed, with noise. actions: (n, H, a) as commanded. start: (n, nq + nv) measured
+          positions and velocities of the model at the window's first state. None takes them
             from that state, for robots whose `proprio` has them: Jackal and Quadcopter.
 
         Raises:

@@ -13,7 +13,8 @@ from nfc_gym.simulate.machine import Machine
 Array = NDArray[np.float64]
 # Measurement noise of quantities that `proprio` does not have, of the sizes of `machine.HABITS`.
 _NOISE = {
-    "body:pos": 0.02, "body:quat": 0.0025, "body:linvel": 0.05, "body:angvel": 0.03, "joint:pos": 0.002, "joint:vel": 0.05,
+    "body:pos": 0.02, "body:quat": 0.0025, "body:linvel": 0.05, "body:angvel": 0.03, "joint:pos": 0.002,
+    "joint:vel": 0.05,
 }  # fmt: skip
 
 
