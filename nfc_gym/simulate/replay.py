@@ -36,6 +36,9 @@ from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
 DRAWS = 32  # replays a window
+INFLATION = (
+    1.05  # of the replays' spread before each analysis: few replays, taken as Gaussian, grow too sure of themselves
+)
 SETTLE = 5  # control steps in which replays find the start's contacts and speeds; they do not count
 MOST = 4.0  # of X in one step: beyond it is a blow of contact, and more of it tells nothing more of the model
 _TURN = 2048  # replays at once
@@ -88,7 +91,12 @@ class Replay:
 
     def score(self, states: Array, actions: Array, start: Array | None = None) -> Array:
         """(n,) mean of min(X, `MOST`) after the first `SETTLE` steps; arguments and errors as of `steps`."""
-        return np.minimum(self.steps(states, actions, start)[:, SETTLE:], MOST).mean(1)
+        return self.summed(self.steps(states, actions, start))
+
+    @staticmethod
+    def summed(steps: Array) -> Array:
+        """(n,) scores from X of each control step (n, H)."""
+        return np.minimum(steps[:, SETTLE:], MOST).mean(1)
 
     def steps(self, states: Array, actions: Array, start: Array | None = None) -> Array:
         """(n, H) X of each control step of windows; infinite from where replays come apart.
@@ -139,7 +147,9 @@ class Replay:
         view.task.update(robot.advance(view, commanded))
         view.before, view.now = view.now, robot.derive(view)
         shown = np.concatenate(robot.proprio(view), -1).reshape(n, m, -1)
-        return machine.difference(states[:, None, t + 1], shown)[..., self.told] / machine.noise[self.told]
+        errors = machine.difference(states[:, None, t + 1], shown)[..., self.told] / machine.noise[self.told]
+        mean = errors.mean(1, keepdims=True)
+        return mean + INFLATION * (errors - mean)
 
     def _move(self, sims: Simulations, gain: Array) -> None:
         """Draw the replays towards what was observed."""
@@ -148,8 +158,9 @@ class Replay:
         for k in range(n * m):
             mujoco.mj_differentiatePos(model, away[k], 1.0, view.qpos[k - k % m], view.qpos[k])
         deviation = np.concatenate([away, view.qvel], 1).reshape(n, m, -1)
-        deviation = (deviation - deviation.mean(1, keepdims=True)) / np.sqrt(m - 1)
-        moved = (gain @ deviation).reshape(n * m, -1)
+        deviation -= deviation.mean(1, keepdims=True)
+        moved = (INFLATION - 1) * deviation + gain @ (INFLATION / np.sqrt(m - 1) * deviation)
+        moved = moved.reshape(n * m, -1)
         for k in range(n * m):
             mujoco.mj_integratePos(model, view.qpos[k], moved[k, :nv], 1.0)
         view.qvel[...] += moved[:, nv:]

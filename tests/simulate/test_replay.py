@@ -32,7 +32,7 @@ def test_the_ensemble_is_a_kalman_filter_where_all_is_linear(monkeypatch: pytest
     """x ~ N(0, P), y = H x + noise: with many members X and the posterior are those of the closed form."""
     monkeypatch.setattr("nfc_gym.simulate.ensemble.DIAGONAL", 0.0)
     rng = np.random.default_rng(0)
-    n, m, h = 60, 500, rng.standard_normal((3, 2))
+    n, m, h = 120, 200, rng.standard_normal((3, 2))
     root = np.array([[1.0, 0.0], [0.5, 0.8]])
     members = rng.standard_normal((n, m, 2)) @ root.T
     y = np.array([1.0, -2.0, 0.5])
@@ -73,8 +73,8 @@ def test_start_noise_has_the_sizes_that_it_says(machine: Machine) -> None:
 def test_nominal_windows_score_about_one_and_faults_higher(machine: Machine, replay: Replay) -> None:
     nominal, slippery = machine.space.nominal, machine.space.nominal.copy()
     slippery[[i for i, n in enumerate(machine.space.names) if n.endswith("friction")]] *= 0.3
-    plain = trials(machine, np.tile(nominal, (16, 1)), 1)
-    faulty = trials(machine, np.tile(slippery, (12, 1)), 2)
+    plain = trials(machine, np.tile(nominal, (10, 1)), 1)
+    faulty = trials(machine, np.tile(slippery, (6, 1)), 2)
     a, b = (replay.score(w["states"], w["actions"]) for w in (plain, faulty))
     assert 0.9 < np.median(a) < 1.3
     assert auroc(a, b)[0] > 0.95
