@@ -85,9 +85,9 @@ class Contrast(Learner):
             raise InputError(f"contrast: two halves of 4 steps or more make a window of 8, got {sizes.horizon}")
         self.config, self.sizes, self.prior, self.channels = config, sizes, prior, tuple(channels)
         self.horizon, self.states, self.actions = sizes.horizon, sizes.states, sizes.actions
-        self.half = sizes.horizon // 2
+        self.span = sizes.horizon // 2
         with seeded(seed):
-            self.encoder = TCN(self.half, sizes.states, sizes.actions)
+            self.encoder = TCN(self.span, sizes.states, sizes.actions)
             self.project = nn.Linear(self.encoder.features, config.features)
         self.register_buffer("spread", torch.ones(sizes.states))
 
@@ -100,21 +100,21 @@ class Contrast(Learner):
         """
         checked(self, batch["states"].cpu(), batch["actions"].cpu())
         states, actions = batch["states"], batch["actions"]
-        self.encoder.fit(states[:, : self.half + 1], actions[:, : self.half], None)
+        self.encoder.fit(states[:, : self.span + 1], actions[:, : self.span], None)
         flat = states.reshape(-1, self.states).double()
         spread = flat.std(0, correction=0)
         self.spread.copy_(torch.where(spread > TINY * (1 + flat.mean(0).abs()), spread, 0.0))
 
     def closeness(self, states: Tensor, actions: Tensor) -> Tensor:
         """(B,) cosine between the halves of windows (B, H+1, s), (B, H, a)."""
-        h = self.half
+        h = self.span
         halves = ((states[:, : h + 1], actions[:, :h]), (states[:, -h - 1 :], actions[:, -h:]))
         context, target = (self.project(self.encoder(s, a)) for s, a in halves)
         return nn.functional.cosine_similarity(context, target, dim=1)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Cross-entropy of p over a batch, part of which is given disturbances here."""
-        states, h = batch["states"], self.half
+        states, h = batch["states"], self.span
         b = len(states)
         kind = torch.randint(len(KINDS), (b,), device=states.device)
         struck = torch.rand(b, device=states.device) < self.config.share

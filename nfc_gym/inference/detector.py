@@ -107,13 +107,14 @@ class WindowDetector:
         single = act.ndim == 1
         if single:
             before, act, after = before[None], act[None], after[None]
-        self._keep(before, act, after)
+        kept = self._keep(before, act, after)
         due = (self._count >= self.scorer.horizon) & ((self._count - self.scorer.horizon) % self.every == 0)
         if due.any():
-            self._score[due] = self.scorer.score(*checked(self.scorer, self._states[due], self._actions[due]))
+            self._score[due] = self.scorer.score(*checked(self.scorer, kept[due], self._actions[due]))
         return float(self._score[0]) if single else self._score.copy()
 
-    def _keep(self, before: Array, act: Array, after: Array) -> None:
+    def _keep(self, before: Array, act: Array, after: Array) -> Array:
+        """(n, H+1, s), the last states of each episode."""
         h, s, a = self.scorer.horizon, self.scorer.states, self.scorer.actions
         for name, x, width in (("observation", before, s), ("action", act, a), ("observation", after, s)):
             if x.ndim != 2 or x.shape[1] != width:
@@ -129,6 +130,7 @@ class WindowDetector:
         # At an episode's first transition the state before it was not seen yet.
         self._states[:, -2], self._states[:, -1], self._actions[:, -1] = before, after, act
         self._count += 1
+        return self._states
 
 
 class Either:

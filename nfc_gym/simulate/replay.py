@@ -36,9 +36,8 @@ from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
 DRAWS = 32  # replays a window
-INFLATION = (
-    1.05  # of the replays' spread before each analysis: few replays, taken as Gaussian, grow too sure of themselves
-)
+# Of the replays' spread before each analysis: few replays, taken as Gaussian, grow too sure of themselves.
+INFLATION = 1.1
 SETTLE = 5  # control steps in which replays find the start's contacts and speeds; they do not count
 MOST = 4.0  # of X in one step: beyond it is a blow of contact, and more of it tells nothing more of the model
 _TURN = 2048  # replays at once

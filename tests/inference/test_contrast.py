@@ -59,8 +59,8 @@ def test_it_finds_disturbances_in_windows_it_has_not_seen(trained: Contrast) -> 
     plain = trained.score(states.numpy(), actions.numpy())
     areas = {}
     for k, name in enumerate(KINDS):
-        target = injected(states[:, -trained.half :], trained.spread, torch.full((600,), k))
-        struck = torch.cat([states[:, : -trained.half], target], 1)
+        target = injected(states[:, -trained.span :], trained.spread, torch.full((600,), k))
+        struck = torch.cat([states[:, : -trained.span], target], 1)
         areas[name] = auroc(plain, trained.score(struck.numpy(), actions.numpy()))[0]
     assert min(areas.values()) > 0.7, areas
     assert np.mean(list(areas.values())) > 0.8, areas

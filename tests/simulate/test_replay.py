@@ -36,7 +36,9 @@ def test_the_ensemble_is_a_kalman_filter_where_all_is_linear(monkeypatch: pytest
     root = np.array([[1.0, 0.0], [0.5, 0.8]])
     members = rng.standard_normal((n, m, 2)) @ root.T
     y = np.array([1.0, -2.0, 0.5])
-    found = innovation(y - members @ h.T, rng.standard_normal((m, 3)))
+    eps = rng.standard_normal((m, 3))  # one for all windows, so made exactly standard: its own error is no average
+    eps = (eps - eps.mean(0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(eps.T))).T
+    found = innovation(y - members @ h.T, eps)
     p = root @ root.T
     sigma = np.eye(3) + h @ p @ h.T
     assert found.squared.mean() == pytest.approx(y @ np.linalg.solve(sigma, y), rel=0.03)
