@@ -101,9 +101,10 @@ class Replay:
         """(n, H) X of each control step of windows; infinite from where replays come apart.
 
         Args:
-          states: (n, H+1, s) as observed, with noise. actions: (n, H, a) as commanded. start: (n, nq + nv) measured
-          positions and velocities of the model at the window's first state. None takes them
-            from that state, for robots whose `proprio` has them: Jackal and Quadcopter.
+          states: (n, H+1, s) as observed, with noise.
+          actions: (n, H, a) as commanded.
+          start: (n, nq + nv) measured positions and velocities of the model at the window's first state. None takes
+            them from that state, for robots whose `proprio` has them: Jackal and Quadcopter.
 
         Raises:
           InputError: windows of another robot, shorter than H or not finite, or a start that is needed and not given.
