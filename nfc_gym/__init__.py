@@ -23,12 +23,12 @@ registry.register()  # `import nfc_gym` is what makes `gymnasium.make("nfc_gym/.
 
 
 def _open_posterior(path: Path) -> Sampler:
-    """A neural posterior's checkpoint; torch is loaded only now."""
+    """A checkpoint of a neural posterior or of an anomaly detector; torch is loaded only now."""
     try:
-        from nfc_gym.inference.posterior import load
+        from nfc_gym.inference.detector_file import opened
     except ImportError as e:
-        raise MissingExtra(f"{path}: a posterior needs {e.name}: pip install 'nfc_gym[inference]'") from None
-    return load(path)
+        raise MissingExtra(f"{path}: a network needs {e.name}: pip install 'nfc_gym[inference]'") from None
+    return opened(path)
 
 
 register_loader(".safetensors", _open_posterior)  # wherever a source may be a path, it may be a posterior

@@ -17,6 +17,7 @@ from nfc_gym.inference.heads.mixture import Mixture
 from nfc_gym.inference.heads.score import Score
 from nfc_gym.inference.heads.structure import Structure
 from nfc_gym.inference.heads.terrain import CELLS, Terrain
+from nfc_gym.inference.learner import Learner
 from nfc_gym.inference.linear import LinearBase
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import EDGE, PriorBox
@@ -35,7 +36,7 @@ class Encoded(NamedTuple):
     elevation: Tensor | None = None
 
 
-class Network(nn.Module):
+class Network(Learner):
     """From a window to densities over what made it.
 
     Args:

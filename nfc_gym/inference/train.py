@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.data import Batch, WindowSet
-from nfc_gym.inference.network import Network
+from nfc_gym.inference.learner import Learner
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.random import mixed, seeded
 from nfc_gym.inference.state import load_state, save_state
@@ -81,7 +81,7 @@ class Outcome:
 
 
 def train(
-    network: Network, windows: WindowSet, held_out: WindowSet, config: TrainConfig | None = None, *,
+    network: Learner, windows: WindowSet, held_out: WindowSet, config: TrainConfig | None = None, *,
     folder: Path | None = None, device: str | torch.device = "cpu", report: Report = quiet,
 ) -> Outcome:  # fmt: skip
     """Train a network in place; it ends with the averaged weights of the best epoch.
@@ -123,7 +123,7 @@ class _Run:
     """A training run's whole state. All randomness is a function of (seed, step), so nothing else need be saved."""
 
     def __init__(
-        self, network: Network, windows: WindowSet, held_out: WindowSet, config: TrainConfig, device: torch.device
+        self, network: Learner, windows: WindowSet, held_out: WindowSet, config: TrainConfig, device: torch.device
     ) -> None:  # fmt: skip
         if not len(windows) or not len(held_out):
             raise InputError(f"training: {len(windows)} windows to train on and {len(held_out)} held out; want both")
@@ -203,7 +203,7 @@ class _Run:
         rise = min(1.0, (self.step + 1) / max(1, self.config.warmup))
         return self.config.rate * rise * (1 + math.cos(math.pi * self.step / self.total)) / 2
 
-    def loss(self, network: Network, batch: Batch) -> Tensor:
+    def loss(self, network: Learner, batch: Batch) -> Tensor:
         """Sum of the heads' losses."""
         batch = {k: t.to(self.device, non_blocking=True) for k, t in batch.items()}
         with torch.autocast(self.device.type, torch.bfloat16, self.config.mixed and self.device.type == "cuda"):

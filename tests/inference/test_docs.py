@@ -11,13 +11,15 @@ import torch
 from problems import motion_windows
 
 import nfc_gym  # noqa: F401 (registers the environments)
+from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.trials import trials
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "inference.md").read_text(encoding="utf-8")
 
 
 def test_train_then_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     programs = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
-    assert len(programs) == 2
+    assert len(programs) == 3
     monkeypatch.chdir(tmp_path)
     t = motion_windows(60).tensors
     env = gymnasium.make("nfc_gym/JackalFlat-v0", context=["psi"])
@@ -27,6 +29,10 @@ def test_train_then_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert names["outcome"].stopped == "epochs"
     assert names["psi"].shape == (100, 17)
     assert np.isfinite(names["told"]).all()
+    machine = Machine("nfc_gym/JackalFlat-v0")
+    nominal = trials(machine, np.tile(machine.space.nominal, (60, 1)), 0)
+    names |= {"nominal_states": nominal["states"], "nominal_actions": nominal["actions"]}
+    exec(programs[2].replace("given)", "given, draws=4)").replace("rate=0.01", "rate=0.05"), names)
     names["env"].reset(seed=0)
     assert {p.name for p in tmp_path.iterdir()} == {"run", "jackal.safetensors", "today.safetensors"}
     env.close()

@@ -1,0 +1,199 @@
+"""The posterior-predictive replay: does the simulator, as it is believed to be, explain this window?
+
+A window's actions are replayed from its start under draws of psi, each with a start-state noise and motor noise of
+its own, which are thereby carried through. After each control step the error, observation less replay, in units of
+the sensor noise, is whitened: if the simulator is right the mean error e is, to first order, Gaussian with the
+covariance
+
+    Sigma = I + C: the sensors' noise, and what psi, start and motors leave open, by the spread of the replays.
+
+The replays then move towards what was observed (`ensemble`) and go on: the next error is conditioned on all that was
+seen so far, so a start that was off, or contacts that scatter, do not hide what comes after. The score is the mean
+over the window, its first steps left out, of X = e' Sigma^-1 e / k (cut at `MOST`): about 1 where the simulator
+explains the motion down to the noise. Rolled out freely for the whole window instead, the start's noise hides most
+faults of a robot on wheels.
+
+Conditioned on the actions like this a lost motor shows, where the motion alone may look like any other. How high scores
+go without a fault is found from nominal windows (`inference.rates`), not from tables: contacts are not Gaussian.
+"""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.posterior import Sampler
+from nfc_gym.envs.ant import Ant
+from nfc_gym.envs.humanoid import Humanoid
+from nfc_gym.envs.quadcopter import Quadcopter
+from nfc_gym.envs.simulations import Simulations
+from nfc_gym.inference.detector import checked
+from nfc_gym.simulate.ensemble import innovation
+from nfc_gym.simulate.machine import MOTOR, Machine
+from nfc_gym.simulate.roll import step
+from nfc_gym.simulate.start import disturbed, observed
+from nfc_gym.terrain import Heightfield
+
+Array = NDArray[np.float64]
+DRAWS = 32  # replays a window
+# Of the replays' spread before each analysis: few replays, taken as Gaussian, grow too sure of themselves.
+INFLATION = 1.1
+SETTLE = 5  # control steps in which replays find the start's contacts and speeds; they do not count
+MOST = 4.0  # of X in one step: beyond it is a blow of contact, and more of it tells nothing more of the model
+_TURN = 2048  # replays at once
+_AIMS = (9, 11)  # entries of a runner's proprio that tell of its target, which no replay knows
+
+
+class Replay:
+    """Scores windows by replaying them; a `WindowScore` of `inference.detector`.
+
+    Equal windows get equal scores: psi, start noise and motor noise are drawn once.
+
+    Args:
+      environment: id, `nfc_gym/JackalFlat-v0`.
+      belief: what psi is drawn from: a posterior given a window of this machine, a `Fidelity`, or None for nominal.
+      draws: replays a window.
+      motor: standard deviation of the motors' noise, a share of the actions' range.
+      ground: the map underfoot, for a Rough environment: one for all windows.
+      seed: of all draws.
+      nthread: threads; the scores do not depend on them.
+
+    Raises:
+      InputError: no such environment, a belief of other parameters, no ground where one is needed.
+    """
+
+    def __init__(
+        self, environment: str, belief: Sampler | None = None, *, draws: int = DRAWS, motor: float = MOTOR,
+        ground: Heightfield | None = None, seed: int = 0, nthread: int = 1,
+    ) -> None:  # fmt: skip
+        self.machine = machine = Machine(environment)
+        if draws < 2:
+            raise InputError(f"replay: draws must be 2 or more, got {draws}")
+        if machine.rough != (ground is not None):
+            raise InputError(
+                f"replay: {machine.environment} {'needs a' if machine.rough else 'is a plane: no'} `ground`"
+            )
+        self.horizon = machine.habit.horizon
+        self.states, self.actions = machine.kind.proprio_size, machine.kind.action_size
+        self.draws, self.nthread = draws, nthread
+        self.maps = [] if ground is None else [ground]
+        rng = np.random.default_rng(seed)
+        self.psi = _psi(machine, belief, draws, rng)
+        self.jitter = motor * rng.standard_normal((draws, self.horizon, self.actions))
+        self.start = rng.standard_normal((draws, 2 * machine.model.nv))
+        told = machine.noise > 0
+        if isinstance(machine.settings.robot(machine.model), Ant | Humanoid):
+            told[list(_AIMS)] = False
+        self.told = np.flatnonzero(told)
+        self.eps = rng.standard_normal((draws, self.horizon, len(self.told)))
+        self._sims: Simulations | None = None
+
+    def score(self, states: Array, actions: Array, start: Array | None = None) -> Array:
+        """(n,) mean of min(X, `MOST`) after the first `SETTLE` steps; arguments and errors as of `steps`."""
+        return self.summed(self.steps(states, actions, start))
+
+    @staticmethod
+    def summed(steps: Array) -> Array:
+        """(n,) scores from X of each control step (n, H)."""
+        return np.minimum(steps[:, SETTLE:], MOST).mean(1)
+
+    def steps(self, states: Array, actions: Array, start: Array | None = None) -> Array:
+        """(n, H) X of each control step of windows; infinite from where replays come apart.
+
+        Args:
+          states: (n, H+1, s) as observed, with noise.
+          actions: (n, H, a) as commanded.
+          start: (n, nq + nv) measured positions and velocities of the model at the window's first state. None takes
+            them from that state, for robots whose `proprio` has them: Jackal and Quadcopter.
+
+        Raises:
+          InputError: windows of another robot, shorter than H or not finite, or a start that is needed and not given.
+        """
+        states, actions = checked(self, states, actions)
+        starts = observed(self.machine, states[:, 0]) if start is None else self._given(len(states), start)
+        per = max(1, _TURN // self.draws)
+        parts = [
+            self._scored(states[i : i + per], actions[i : i + per], starts[i : i + per])
+            for i in range(0, len(states), per)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, self.horizon))
+
+    def _given(self, n: int, start: Array) -> Array:
+        start, width = np.asarray(start, float), self.machine.model.nq + self.machine.model.nv
+        if start.shape != (n, width) or not np.isfinite(start).all():
+            raise InputError(f"replay: start must be finite, of shape {(n, width)}, got {start.shape}")
+        return start
+
+    def _scored(self, states: Array, actions: Array, starts: Array) -> Array:
+        """(n, H) X of each control step; infinite from where replays come apart."""
+        sims, held = self._begin(states, starts), np.ones(len(states), bool)
+        out = np.empty((len(states), self.horizon))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for t in range(self.horizon):
+                errors = self._step(sims, states, actions, t)
+                held &= np.isfinite(errors).all((1, 2))
+                found = innovation(np.where(held[:, None, None], errors, 0.0), self.eps[:, t])
+                out[:, t] = np.where(held, found.squared / len(self.told), np.inf)
+                self._move(sims, np.where(held[:, None, None], found.gain, 0.0))
+        return out
+
+    def _step(self, sims: Simulations, states: Array, actions: Array, t: int) -> Array:
+        """(n, draws, k) one control step on: window less replay in units of the sensor noise."""
+        machine, n, m = self.machine, len(states), self.draws
+        robot, view = sims.robot, sims.view
+        commanded = np.repeat(actions[:, t], m, 0)
+        view.ctrl[...] = robot.actuate(np.clip(commanded + np.tile(self.jitter[:, t], (n, 1)), -1, 1), view)
+        step(sims, np.ones(n * m, bool), machine.kind.frame_skip)
+        view.task.update(robot.advance(view, commanded))
+        view.before, view.now = view.now, robot.derive(view)
+        shown = np.concatenate(robot.proprio(view), -1).reshape(n, m, -1)
+        errors = machine.difference(states[:, None, t + 1], shown)[..., self.told] / machine.noise[self.told]
+        mean = errors.mean(1, keepdims=True)
+        return mean + INFLATION * (errors - mean)
+
+    def _move(self, sims: Simulations, gain: Array) -> None:
+        """Draw the replays towards what was observed."""
+        n, m, nv, model, view = len(gain), self.draws, sims.model.nv, sims.model, sims.view
+        away = np.empty((n * m, nv))
+        for k in range(n * m):
+            mujoco.mj_differentiatePos(model, away[k], 1.0, view.qpos[k - k % m], view.qpos[k])
+        deviation = np.concatenate([away, view.qvel], 1).reshape(n, m, -1)
+        deviation -= deviation.mean(1, keepdims=True)
+        moved = (INFLATION - 1) * deviation + gain @ (INFLATION / np.sqrt(m - 1) * deviation)
+        moved = moved.reshape(n * m, -1)
+        for k in range(n * m):
+            mujoco.mj_integratePos(model, view.qpos[k], moved[k, :nv], 1.0)
+        view.qvel[...] += moved[:, nv:]
+        view.now = sims.robot.derive(view)
+
+    def _begin(self, states: Array, starts: Array) -> Simulations:
+        """n windows times draws simulations at their starts."""
+        machine, n, nq = self.machine, len(states), self.machine.model.nq
+        mujoco.set_mju_user_warning(lambda message: None)  # replays that come apart are nan
+        sims = self._sims
+        if sims is None or sims.n != n * self.draws:
+            sims = self._sims = machine.simulations(n * self.draws, self.nthread, self.maps)
+            rows = np.arange(sims.n)
+            given = {"psi": np.tile(self.psi, (n, 1))} | ({"terrain_id": 0 * rows} if machine.rough else {})
+            sims.begin(rows, given)
+        sims.batch.reset(np.arange(sims.n), sims.rest)
+        view = sims.view
+        rows = disturbed(machine, np.repeat(starts, self.draws, 0), np.tile(self.start, (n, 1)))
+        view.qpos[...], view.qvel[...] = rows[:, :nq], rows[:, nq:]
+        view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
+        if isinstance(sims.robot, Quadcopter):
+            view.task["goal"] = np.repeat(starts[:, :3] + states[:, 0, :3], self.draws, 0)
+        view.now = sims.robot.derive(view)
+        return sims
+
+
+def _psi(machine: Machine, belief: Sampler | None, draws: int, rng: np.random.Generator) -> Array:
+    """(draws, d)."""
+    space = machine.space
+    if belief is None:
+        return np.tile(space.nominal, (draws, 1))
+    psi = belief.sample(draws, rng).psi
+    if psi is None or psi.shape != (draws, len(space)):
+        have = "says nothing of psi" if psi is None else f"has psi of shape {psi.shape}"
+        raise InputError(f"replay: the belief {have}; want {(draws, len(space))}: {', '.join(space.names)}")
+    return psi

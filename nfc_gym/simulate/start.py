@@ -1,0 +1,71 @@
+"""Where a replay starts: the model's state from what a robot observes of itself, and how far off that may be."""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.envs.jackal import Jackal
+from nfc_gym.envs.quadcopter import Quadcopter
+from nfc_gym.envs.rotations import axes, to_world
+from nfc_gym.simulate.machine import Machine
+
+Array = NDArray[np.float64]
+# Measurement noise of quantities that `proprio` does not have, of the sizes of `machine.HABITS`.
+_NOISE = {
+    "body:pos": 0.02, "body:quat": 0.0025, "body:linvel": 0.05, "body:angvel": 0.03, "joint:pos": 0.002,
+    "joint:vel": 0.05,
+}  # fmt: skip
+
+
+def observed(machine: Machine, states: Array) -> Array:
+    """(n, nq + nv) from observations `proprio` (n, s).
+
+    The Jackal's wheels are taken to turn as they were last told to, the Quadcopter's mounts to be at rest.
+
+    Raises:
+      InputError: `proprio` does not determine the state of this robot.
+    """
+    model, kind = machine.model, machine.kind
+    qpos, qvel = np.tile(machine.settings.robot(model).home, (len(states), 1)), np.zeros((len(states), model.nv))
+    if issubclass(kind, Jackal):
+        qpos[:, 3:7], qpos[:, :3] = states[:, :4], states[:, 10:13]
+        qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+        qvel[:, :3] = to_world(axes(qpos[:, 3:7]), states[:, 4:7])
+        qvel[:, 3:6] = states[:, 7:10]
+        robot = machine.settings.robot(model)
+        qvel[:, model.jnt_dofadr[model.actuator_trnid[:, 0]]] = robot.actuate(states[:, 13:15], None)  # type: ignore[arg-type]
+    elif issubclass(kind, Quadcopter):
+        qpos[:, 3:7] = states[:, 3:7] / np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
+        qpos[:, 7:], qvel[:, :6] = states[:, 13:], states[:, 7:13]
+    else:
+        raise InputError(
+            f"replay: what a {kind.name} observes does not determine its state (where its base is, or how it leans); "
+            "give `start`, positions and velocities by a state estimate. Without one: jackal, quadcopter"
+        )
+    return np.concatenate([qpos, qvel], 1)
+
+
+def spreads(machine: Machine) -> tuple[Array, Array]:
+    """(nv,) standard deviations of a measured start, in the model's tangent space: of positions and of velocities."""
+    own: dict[str, float] = {}
+    for name, sd in zip(machine.state_names, machine.noise, strict=True):
+        parts = name.split(":")
+        if len(parts) == 3:
+            own.setdefault(f"{parts[0]}:{parts[2].split('.')[0].split('@')[0]}", float(sd))
+    noise, model = _NOISE | own, machine.model
+    position, velocity = np.full(model.nv, noise["joint:pos"]), np.full(model.nv, noise["joint:vel"])
+    if model.jnt_type[0] == int(mujoco.mjtJoint.mjJNT_FREE):
+        position[:3], position[3:6] = noise["body:pos"], 2 * noise["body:quat"]  # an angle is twice a quaternion's part
+        velocity[:3], velocity[3:6] = noise["body:linvel"], noise["body:angvel"]
+    return position, velocity
+
+
+def disturbed(machine: Machine, start: Array, eps: Array) -> Array:
+    """Starts (n, nq + nv) with noise: eps (n, 2 nv), standard normal."""
+    model = machine.model
+    position, velocity = spreads(machine)
+    qpos, qvel = start[:, : model.nq].copy(), start[:, model.nq :] + eps[:, model.nv :] * velocity
+    for row, moved in zip(qpos, eps[:, : model.nv] * position, strict=True):
+        mujoco.mj_integratePos(model, row, moved, 1.0)
+    return np.concatenate([qpos, qvel], 1)

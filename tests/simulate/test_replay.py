@@ -1,0 +1,122 @@
+"""The replay: against the Kalman filter in closed form, and on a Jackal with and without faults."""
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from nfc_gym.core import Fidelity, InputError
+from nfc_gym.inference.detector import WindowDetector
+from nfc_gym.inference.rates import Threshold, auroc
+from nfc_gym.simulate import start
+from nfc_gym.simulate.ensemble import innovation
+from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.replay import Replay
+from nfc_gym.simulate.trials import trials
+from nfc_gym.wrappers import MonitorAnomaly
+
+JACKAL = "nfc_gym/JackalFlat-v0"
+
+
+@pytest.fixture(scope="module")
+def machine() -> Machine:
+    return Machine(JACKAL)
+
+
+@pytest.fixture(scope="module")
+def replay() -> Replay:
+    return Replay(JACKAL)
+
+
+def test_the_ensemble_is_a_kalman_filter_where_all_is_linear(monkeypatch: pytest.MonkeyPatch) -> None:
+    """x ~ N(0, P), y = H x + noise: with many members X and the posterior are those of the closed form."""
+    monkeypatch.setattr("nfc_gym.simulate.ensemble.DIAGONAL", 0.0)
+    rng = np.random.default_rng(0)
+    n, m, h = 120, 200, rng.standard_normal((3, 2))
+    root = np.array([[1.0, 0.0], [0.5, 0.8]])
+    members = rng.standard_normal((n, m, 2)) @ root.T
+    y = np.array([1.0, -2.0, 0.5])
+    eps = rng.standard_normal((m, 3))  # one for all windows, so made exactly standard: its own error is no average
+    eps = (eps - eps.mean(0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(eps.T))).T
+    found = innovation(y - members @ h.T, eps)
+    p = root @ root.T
+    sigma = np.eye(3) + h @ p @ h.T
+    assert found.squared.mean() == pytest.approx(y @ np.linalg.solve(sigma, y), rel=0.03)
+    deviation = (members - members.mean(1, keepdims=True)) / np.sqrt(m - 1)
+    moved = members + found.gain @ deviation
+    k = p @ h.T @ np.linalg.inv(sigma)
+    np.testing.assert_allclose(moved.mean((0, 1)), k @ y, atol=0.03)
+    np.testing.assert_allclose(np.mean([np.cov(x.T) for x in moved], 0), p - k @ h @ p, atol=0.03)
+
+
+def test_a_jackals_state_is_read_from_what_it_observes(machine: Machine) -> None:
+    window = trials(machine, np.tile(machine.space.nominal, (4, 1)), 0, noise=0.0)
+    nq = machine.model.nq
+    true = window["start"][:, 1 : 1 + nq + machine.model.nv]
+    found = start.observed(machine, window["states"][:, 0])
+    np.testing.assert_allclose(found[:, :7], true[:, :7], atol=1e-6)
+    np.testing.assert_allclose(found[:, nq : nq + 6], true[:, nq : nq + 6], atol=1e-5)
+    wheels = found[:, nq + 6 :]
+    assert np.corrcoef(wheels.ravel(), true[:, nq + 6 :].ravel())[0, 1] > 0.9
+
+
+def test_start_noise_has_the_sizes_that_it_says(machine: Machine) -> None:
+    nv, nq = machine.model.nv, machine.model.nq
+    at = np.tile(np.concatenate([machine.model.qpos0, np.zeros(nv)]), (4000, 1))
+    out = start.disturbed(machine, at, np.random.default_rng(0).standard_normal((4000, 2 * nv)))
+    away = np.empty((4000, nv))
+    for row, q in zip(away, out[:, :nq], strict=True):
+        mujoco.mj_differentiatePos(machine.model, row, 1.0, machine.model.qpos0, q)
+    position, velocity = start.spreads(machine)
+    np.testing.assert_allclose(away.std(0), position, rtol=0.06)
+    np.testing.assert_allclose(out[:, nq:].std(0), velocity, rtol=0.06)
+
+
+def test_nominal_windows_score_about_one_and_faults_higher(machine: Machine, replay: Replay) -> None:
+    nominal, slippery = machine.space.nominal, machine.space.nominal.copy()
+    slippery[[i for i, n in enumerate(machine.space.names) if n.endswith("friction")]] *= 0.3
+    plain = trials(machine, np.tile(nominal, (10, 1)), 1)
+    faulty = trials(machine, np.tile(slippery, (6, 1)), 2)
+    a, b = (replay.score(w["states"], w["actions"]) for w in (plain, faulty))
+    assert 0.9 < np.median(a) < 1.3
+    assert auroc(a, b)[0] > 0.95
+    np.testing.assert_array_equal(replay.score(plain["states"][:3], plain["actions"][:3]), a[:3])
+    # under a belief that has the slippery wheels, the same windows are what was to be expected
+    knowing = Replay(JACKAL, Fidelity(psi=slippery))
+    c = knowing.score(faulty["states"], faulty["actions"])
+    assert np.median(c) < 1.5
+    assert np.median(b) > 2 * np.median(c)
+
+
+def test_a_lost_axle_is_found_under_the_wrapper(machine: Machine, replay: Replay) -> None:
+    """End to end with observations of the environment; the threshold lies between the two, far from either."""
+    lost = {"front_left_wheel_damping": 0.0, "rear_left_wheel_damping": 0.0}
+    alarms, rng = [], np.random.default_rng(0)
+    for psi in ({}, lost):
+        env = gymnasium.make(JACKAL, context=["psi"])
+        noisy = gymnasium.wrappers.TransformObservation(
+            env, lambda o: o | {"proprio": o["proprio"] + machine.noise * rng.standard_normal(15)}, None
+        )
+        detector = WindowDetector(replay, Threshold(2.0, 0.01, 300, 0.0, 0.02), every=25)
+        watched = MonitorAnomaly(noisy, detector)
+        watched.reset(seed=0, options={"psi": psi})
+        infos = [watched.step(np.array([0.4, 0.5 * np.sin(t / 8)], np.float32))[4] for t in range(76)]
+        assert not any(i["anomaly"] for i in infos[:49])
+        alarms.append(bool(infos[-1]["anomaly"]))
+        env.close()
+    assert alarms == [False, True]
+
+
+def test_bad_input_is_refused(machine: Machine, replay: Replay) -> None:
+    with pytest.raises(InputError, match="20 steps; this detector needs 50"):
+        replay.score(np.zeros((1, 21, 15)), np.zeros((1, 20, 2)))
+    with pytest.raises(InputError, match="another robot"):
+        replay.score(np.zeros((1, 51, 52)), np.zeros((1, 50, 8)))
+    with pytest.raises(InputError, match="needs a `ground`"):
+        Replay("nfc_gym/JackalRough-v0")
+    with pytest.raises(InputError, match="psi of shape"):
+        Replay(JACKAL, Fidelity(psi=np.ones(3)))
+    with pytest.raises(InputError, match="give `start`"):
+        Replay("nfc_gym/AntFlat-v0", draws=2).score(np.zeros((1, 51, 52)), np.zeros((1, 50, 8)))
+    with pytest.raises(InputError, match="start must be finite"):
+        replay.score(np.zeros((1, 51, 15)), np.zeros((1, 50, 2)), np.zeros((1, 3)))
