@@ -20,6 +20,7 @@ from nfc_gym.core.errors import InputError
 
 Batch = dict[str, Tensor]
 _AXES = {"states": 3, "actions": 3, "psi": 2, "delta_s": 2, "delta_e": 3, "map": 3, "family": 1}
+_MAPS = ("map", "delta_e")
 
 
 class WindowSet(Protocol):
@@ -93,7 +94,7 @@ class StoredWindows:
     Args:
       stored: has `manifest`, a length and `batches(size, seed, rows, names)`, which gives dicts of arrays.
       rows: (k,) which windows; default all.
-      maps: read the elevation maps too: `perceived` becomes `map`, and `true` less `perceived` becomes `delta_e`.
+      maps: read the elevation maps too: `map`, as perceived, and `delta_e`, truth minus perceived.
 
     Raises:
       InputError: the set holds no maps and they are asked for.
@@ -102,12 +103,10 @@ class StoredWindows:
     def __init__(self, stored: Any, rows: NDArray[np.integer] | None = None, maps: bool = False) -> None:
         self.stored, self.manifest, self.maps = stored, stored.manifest, maps
         self.rows = np.arange(len(stored)) if rows is None else rows
-        self.names = tuple(n for n in stored.names if n in _AXES)
-        if maps:
-            missing = sorted({"perceived", "true"} - set(stored.names))
-            if missing:
-                raise InputError(f"windows: the set holds no maps ({missing[0]!r} is missing); simulate with them")
-            self.names += ("perceived", "true")
+        missing = [n for n in _MAPS if n not in stored.names]
+        if maps and missing:
+            raise InputError(f"windows: the set holds no maps ({missing[0]!r} is missing); simulate with --maps")
+        self.names = tuple(n for n in stored.names if n in _AXES and (maps or n not in _MAPS))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -115,11 +114,7 @@ class StoredWindows:
     def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
         """See `WindowSet.batches`; None is an order of its own, the same each time."""
         for arrays in self.stored.batches(size, 0 if seed is None else seed, self.rows, self.names):
-            batch = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
-            if self.maps:
-                batch["map"] = batch.pop("perceived").float()
-                batch["delta_e"] = batch.pop("true").float() - batch["map"]
-            yield batch
+            yield {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
 
     def split(self, share: float) -> tuple["StoredWindows", "StoredWindows"]:
         """The first windows, and the last `share` of them: to train on and to hold out."""

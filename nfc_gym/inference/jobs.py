@@ -69,7 +69,7 @@ def train_posterior(
     about = stored.manifest
     sizes = Sizes(about.horizon, len(about.state_names), len(about.action_names))
     network = Network(config, sizes, prior, training.seed)
-    first, held_out = StoredWindows(stored).split(HELD_OUT)
+    first, held_out = StoredWindows(stored, maps=config.elevation).split(HELD_OUT)
     state = out.with_name(out.name + ".training")
     state.mkdir(parents=True, exist_ok=True)
     outcome = train(network, first, held_out, training, folder=state, device=device_of(device), report=report)

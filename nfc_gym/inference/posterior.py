@@ -192,8 +192,8 @@ class NeuralPosterior:
 
     def to(self, device: str | torch.device) -> "NeuralPosterior":
         """The same on another device; the network moves."""
-        features = None if self.kept is None else self.features.to(device)
-        return NeuralPosterior(self.network.to(device), features, self.notes)
+        kept = self.kept and Encoded(*(None if x is None else x.to(device) for x in self.kept))
+        return NeuralPosterior(self.network.to(device), kept, self.notes, self.parts)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a checkpoint that `load` and `load_source` open; of a given window what is kept of it."""

@@ -49,6 +49,13 @@ def test_it_is_a_posterior_of_the_core(density: str) -> None:
     assert sum(given.families().values()) == pytest.approx(1)
 
 
+def test_what_was_given_moves_along_to_another_device() -> None:
+    posterior, window = cart()
+    given = posterior.given(window)
+    np.testing.assert_array_equal(given.of("psi").to("cpu").sample(9, rng()).psi, given.of("psi").sample(9, rng()).psi)
+    assert given.of("psi").to("cpu").sample(9, rng()).given == ("psi",)
+
+
 def test_sampling_leaves_torchs_generator_alone() -> None:
     posterior, window = cart()
     torch.manual_seed(1)
