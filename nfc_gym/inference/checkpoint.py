@@ -14,7 +14,7 @@ from nfc_gym.core.files import replacing
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.network import Encoded, Network
 from nfc_gym.inference.space import PriorBox
-from nfc_gym.inference.state import read
+from nfc_gym.inference.state import read, require_format
 
 FORMAT = "nfc_gym-posterior-1"
 GIVEN = "given/"  # before the names of the encoded window's tensors, in the file of a posterior that was given one
@@ -54,10 +54,7 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
       InputError: the file is damaged, of another format, or of another robot or prior than asked for.
     """
     tensors, metadata = read(path)
-    if metadata.get("format") != FORMAT:
-        raise InputError(
-            f"{path}: format {metadata.get('format')!r}; this version of nfc_gym ({__version__}) reads {FORMAT!r}"
-        )
+    require_format(path, metadata, FORMAT)
     try:
         about = json.loads(metadata["about"])
         own = PriorBox.from_dict(about["prior"])

@@ -18,7 +18,7 @@ from nfc_gym.inference.contrast import Contrast, ContrastConfig
 from nfc_gym.inference.detector import WindowDetector
 from nfc_gym.inference.rates import Threshold
 from nfc_gym.inference.space import PriorBox
-from nfc_gym.inference.state import read
+from nfc_gym.inference.state import read, require_format
 
 FORMAT = "nfc_gym-detector-1"
 
@@ -61,10 +61,7 @@ def load(path: str | os.PathLike[str], prior: PriorBox | None = None) -> WindowD
     """
     path = Path(path)
     tensors, metadata = read(path)
-    if metadata.get("format") != FORMAT:
-        raise InputError(
-            f"{path}: format {metadata.get('format')!r}; this version of nfc_gym ({__version__}) reads {FORMAT!r}"
-        )
+    require_format(path, metadata, FORMAT)
     try:
         about = json.loads(metadata["about"])
         own, sizes = PriorBox.from_dict(about["prior"]), Sizes(**about["sizes"])

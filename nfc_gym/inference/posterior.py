@@ -192,7 +192,10 @@ class NeuralPosterior:
 
     def to(self, device: str | torch.device) -> "NeuralPosterior":
         """The same on another device; the network moves."""
-        kept = self.kept and Encoded(*(None if x is None else x.to(device) for x in self.kept))
+        kept = self.kept
+        if kept is not None:
+            seen = None if kept.elevation is None else kept.elevation.to(device)
+            kept = Encoded(kept.features.to(device), kept.mean.to(device), seen)
         return NeuralPosterior(self.network.to(device), kept, self.notes, self.parts)
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -9,6 +9,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from nfc_gym import __version__
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
 
@@ -68,3 +69,11 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return {k: file.get_tensor(k) for k in file.keys()}, file.metadata() or {}  # noqa: SIM118 (no dict)
     except (SafetensorError, OSError, ValueError) as e:
         raise InputError(f"{path}: truncated, or no safetensors file ({e})") from None
+
+
+def require_format(path: Path, metadata: dict[str, str], known: str) -> None:
+    """Raises `InputError` where a file's metadata name another format than the known one."""
+    if metadata.get("format") != known:
+        raise InputError(
+            f"{path}: format {metadata.get('format')!r}; this version of nfc_gym ({__version__}) reads {known!r}"
+        )

@@ -11,7 +11,7 @@ from nfc_gym.measured.screen import Screen, Screened, screen_all
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.conditions import MARK
 
-_FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block
+_FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block or fewer
 _COSTLY = 20  # the same where roll-outs are costly
 _ENOUGH = 12  # blocks that such a thinning must leave, and does leave where each is costly
 _FAINT = 0.05  # of the best gain: what the best of a family must reach there to be among the field whatever its rank
