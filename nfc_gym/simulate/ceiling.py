@@ -4,9 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.envs.simulations import Simulations
 from nfc_gym.inference.windows import Batch
 from nfc_gym.physics.residual import Components
 from nfc_gym.physics.state import move
+from nfc_gym.simulate import starts
 from nfc_gym.simulate.fisher import STEP, Array, Ceiling, bounds, information
 from nfc_gym.simulate.ground import made
 from nfc_gym.simulate.machine import MOTOR, Machine
@@ -26,6 +28,7 @@ def ceiling(
     pairs: int = PAIRS,
     seed: int = 0,
     nthread: int = 1,
+    before: Array | None = None,
 ) -> Ceiling:
     """What windows can tell of psi at most.
 
@@ -38,6 +41,8 @@ def ceiling(
       width, cloud, pairs: step of u, and draws, see `information`.
       seed: of the motors' noise.
       nthread: threads of the simulation; 0 takes every core.
+      before: (nv, nv) covariance of the velocities with which windows begin (`starts.spread`): then they are known
+        through the first observation alone, as to whoever infers. None takes them as known exactly, a higher ceiling.
     """
     machine = Machine(environment)
     sd = machine.noise if noise is None else np.asarray(noise, float)
@@ -48,19 +53,25 @@ def ceiling(
     n, horizon, size = windows["actions"].shape
     found = []
     for i in range(n):
-        jitter = motor * np.random.default_rng([seed, i]).standard_normal((cloud + pairs, horizon, size))
+        rng = np.random.default_rng([seed, i])
+        jitter = motor * rng.standard_normal((cloud + pairs, horizon, size))
         one = {name: value[i : i + 1] for name, value in windows.items()}
-
-        def simulator(u: Array, draw: NDArray[np.intp], one: Batch = one, jitter: Array = jitter) -> Array:
-            return replayed(machine, one, u, jitter[draw], nthread)
-
         u = np.asarray(windows["psi"][i], float)
+        off = np.zeros((cloud + pairs, machine.model.nv))
+        if before is not None:
+            first = _first(machine, one, u, starts.STEP * np.eye(1 + machine.model.nv)[:, 1:])
+            off = rng.standard_normal(off.shape) @ starts.left_open(first, sd, before).T
+
+        def simulator(u: Array, draw: NDArray[np.intp], one: Batch = one, e: Array = jitter, off: Array = off) -> Array:
+            return replayed(machine, one, u, e[draw], nthread, off=off[draw])
+
         found.append(information(simulator, u, np.tile(sd, horizon), width, cloud, pairs))
     return bounds(np.array(found))
 
 
 def replayed(
-    machine: Machine, window: Batch, u: Array, jitter: Array, nthread: int, delta_s: Array | None = None
+    machine: Machine, window: Batch, u: Array, jitter: Array, nthread: int, delta_s: Array | None = None,
+    off: Array | None = None,
 ) -> Array:  # fmt: skip
     """States (m, H s) after each control step of one window from its start, under other psi, u (m, d).
 
@@ -71,20 +82,14 @@ def replayed(
       jitter: (m, H, a) added to the actions.
       nthread: threads.
       delta_s: (m, s) added to the physical state after each control step; None adds nothing.
+      off: (m, nv) added to the velocities of the start, in the robot's own frame; None adds nothing.
 
     Returns:
       nan for a simulation that comes apart.
     """
     kind, m = machine.kind, len(u)
-    ground, seed, hard = (window[f"terrain_{k}"][0].item() for k in ("kind", "seed", "difficulty"))
-    maps = [made(machine.terrain_kinds[ground], seed, hard, kind.terrain_scale)] if machine.rough else []
-    sims = machine.simulations(m, nthread, maps)
+    sims = _begun(machine, window, u, nthread, off)
     robot, view, batch = sims.robot, sims.view, sims.batch
-    sims.begin(np.arange(m), {"psi": machine.space.low + u * (machine.space.high - machine.space.low)})
-    # Whatever of the task is in the states (a target, a goal) is the same for all psi.
-    view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
-    batch.state[...] = window["start"]
-    view.now = robot.derive(view)
     names, model = list(machine.state_names), sims.model
     parts = None if delta_s is None else Components(model, names, len(names))
     out = [np.concatenate(robot.proprio(view), -1)]
@@ -105,3 +110,26 @@ def replayed(
         states[..., machine.angles] = np.unwrap(states[..., machine.angles], axis=1)
     states = states[:, 1:].reshape(m, -1)
     return np.where(np.isfinite(states).all(1, keepdims=True), states, np.nan)
+
+
+def _begun(machine: Machine, window: Batch, u: Array, nthread: int, off: Array | None) -> Simulations:
+    """Simulations at the start of a window, under psi of their own; see `replayed`."""
+    ground, seed, hard = (window[f"terrain_{k}"][0].item() for k in ("kind", "seed", "difficulty"))
+    maps = [made(machine.terrain_kinds[ground], seed, hard, machine.kind.terrain_scale)] if machine.rough else []
+    sims = machine.simulations(len(u), nthread, maps)
+    view = sims.view
+    sims.begin(np.arange(len(u)), {"psi": machine.space.low + u * (machine.space.high - machine.space.low)})
+    # Whatever of the task is in the states (a target, a goal) is the same for all psi.
+    view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
+    sims.batch.state[...] = window["start"]
+    if off is not None and off.any():
+        view.qvel[...] += starts.world(off, np.array(view.qpos[:, 3:7]))
+        sims.batch.forward()
+    view.now = sims.robot.derive(view)
+    return sims
+
+
+def _first(machine: Machine, window: Batch, u: Array, off: Array) -> Array:
+    """(m, s) what is observed at the start, with velocities `off` (m, nv)."""
+    sims = _begun(machine, window, np.tile(u, (len(off), 1)), 1, off)
+    return np.concatenate(sims.robot.proprio(sims.view), -1)

@@ -1,5 +1,6 @@
 """Ground of a shard: a pool of seeded maps, and where on them the motion begins."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -40,6 +41,12 @@ class Ground:
         scale = machine.kind.terrain_scale
         each = zip(names, seeds, difficulty, strict=True)
         return cls(kind, seeds, difficulty, [made(str(k), int(s), float(d), scale) for k, s, d in each])
+
+    @classmethod
+    def given(cls, maps: Sequence[terrain.Heightfield]) -> "Ground":
+        """Maps that were not made from seeds: their kind is -1."""
+        n = len(maps)
+        return cls(np.full(n, -1, np.int16), np.zeros(n, np.int64), np.zeros(n, np.float32), list(maps))
 
 
 @lru_cache(maxsize=128)

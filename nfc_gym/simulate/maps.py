@@ -18,7 +18,8 @@ from nfc_gym.inference.shards import maps_path, save_maps
 from nfc_gym.inference.windows import Batch, Manifest, Windows
 from nfc_gym.physics.state import yaw
 from nfc_gym.simulate.ground import made
-from nfc_gym.simulate.workers import cores, pool_of
+from nfc_gym.simulate.pool import unordered
+from nfc_gym.simulate.workers import cores
 from nfc_gym.terrain import DepthCamera, Heightfield, PerceivedMap, elevation
 
 READ = ("pose", "terrain_kind", "terrain_seed", "terrain_difficulty", "camera_seed", "camera_level")
@@ -74,8 +75,9 @@ def keep_maps(folder: str | Path, jobs: int = 0, console: Console | None = None)
     folder = Path(folder)
     left = [k for k in Windows(folder).manifest.finished if not maps_path(folder, k).exists()]
     shown = Progress(console=console, disable=console is None)
-    with pool_of(min(jobs or cores(), max(len(left), 1))) as pool, shown as bar:
-        for _ in bar.track(pool.map(_keep, [folder] * len(left), left), len(left), description="elevation maps"):
+    with shown as bar:
+        kept = unordered(_keep, ((folder, k) for k in left), jobs or cores())
+        for _ in bar.track(kept, len(left), description="elevation maps"):
             pass
 
 

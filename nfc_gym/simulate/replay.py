@@ -17,6 +17,9 @@ Conditioned on the actions like this a lost motor shows, where the motion alone 
 go without a fault is found from nominal windows (`inference.rates`), not from tables: contacts are not Gaussian.
 """
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +57,9 @@ class Replay:
       belief: what psi is drawn from: a posterior given a window of this machine, a `Fidelity`, or None for nominal.
       draws: replays a window.
       motor: standard deviation of the motors' noise, a share of the actions' range.
-      ground: the map underfoot, for a Rough environment: one for all windows.
+      ground: the map underfoot, for a Rough environment: one for all windows, or several to choose from.
+      standing: () -> (n,) which of several maps each row of a vector environment stands on at present:
+        `lambda: env.unwrapped.terrain_id`.
       seed: of all draws.
       nthread: threads; the scores do not depend on them.
 
@@ -64,40 +69,48 @@ class Replay:
 
     def __init__(
         self, environment: str, belief: Sampler | None = None, *, draws: int = DRAWS, motor: float = MOTOR,
-        ground: Heightfield | None = None, seed: int = 0, nthread: int = 1,
+        ground: Heightfield | Sequence[Heightfield] | None = None, standing: Callable[[], Any] | None = None,
+        seed: int = 0, nthread: int = 1,
     ) -> None:  # fmt: skip
         self.machine = machine = Machine(environment)
         if draws < 2:
             raise InputError(f"replay: draws must be 2 or more, got {draws}")
-        if machine.rough != (ground is not None):
+        maps = [] if ground is None else [ground] if isinstance(ground, Heightfield) else list(ground)
+        if machine.rough != bool(maps):
             raise InputError(
                 f"replay: {machine.environment} {'needs a' if machine.rough else 'is a plane: no'} `ground`"
             )
         self.horizon = machine.habit.horizon
         self.states, self.actions = machine.kind.proprio_size, machine.kind.action_size
         self.draws, self.nthread = draws, nthread
-        self.maps = [] if ground is None else [ground]
+        self.maps, self.standing = maps, standing
         rng = np.random.default_rng(seed)
         self.psi = _psi(machine, belief, draws, rng)
         self.jitter = motor * rng.standard_normal((draws, self.horizon, self.actions))
         self.start = rng.standard_normal((draws, 2 * machine.model.nv))
-        told = machine.noise > 0
-        if isinstance(machine.settings.robot(machine.model), Ant | Humanoid):
-            told[list(_AIMS)] = False
-        self.told = np.flatnonzero(told)
+        self.told = np.flatnonzero(told(machine))
         self.eps = rng.standard_normal((draws, self.horizon, len(self.told)))
         self._sims: Simulations | None = None
 
-    def score(self, states: Array, actions: Array, start: Array | None = None) -> Array:
+    def score(
+        self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
+    ) -> Array:
         """(n,) mean of min(X, `MOST`) after the first `SETTLE` steps; arguments and errors as of `steps`."""
-        return self.summed(self.steps(states, actions, start))
+        return self.summed(self.steps(states, actions, start, which))
+
+    def score_rows(self, states: Array, actions: Array, rows: NDArray[np.intp]) -> Array:
+        """The same for windows of some rows of a vector environment, each on the map that it stands on."""
+        which = None if self.standing is None else np.asarray(self.standing())[rows]
+        return self.score(states, actions, which=which)
 
     @staticmethod
     def summed(steps: Array) -> Array:
         """(n,) scores from X of each control step (n, H)."""
         return np.minimum(steps[:, SETTLE:], MOST).mean(1)
 
-    def steps(self, states: Array, actions: Array, start: Array | None = None) -> Array:
+    def steps(
+        self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
+    ) -> Array:
         """(n, H) X of each control step of windows; infinite from where replays come apart.
 
         Args:
@@ -105,18 +118,31 @@ class Replay:
           actions: (n, H, a) as commanded.
           start: (n, nq + nv) measured positions and velocities of the model at the window's first state. None takes
             them from that state, for robots whose `proprio` has them: Jackal and Quadcopter.
+          which: (n,) map of each window, where there are several.
 
         Raises:
-          InputError: windows of another robot, shorter than H or not finite, or a start that is needed and not given.
+          InputError: windows of another robot, shorter than H or not finite, or a start or a map that is needed and not
+            given.
         """
         states, actions = checked(self, states, actions)
         starts = observed(self.machine, states[:, 0]) if start is None else self._given(len(states), start)
-        per = max(1, _TURN // self.draws)
+        which, per = self._which(len(states), which), max(1, _TURN // self.draws)
         parts = [
-            self._scored(states[i : i + per], actions[i : i + per], starts[i : i + per])
+            self._scored(states[i : i + per], actions[i : i + per], starts[i : i + per], which[i : i + per])
             for i in range(0, len(states), per)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, self.horizon))
+
+    def _which(self, n: int, which: NDArray[np.intp] | None) -> NDArray[np.intp]:
+        count = max(len(self.maps), 1)
+        if which is None and count > 1:
+            raise InputError(
+                f"replay: {count} maps: say `which` each window is on, or `standing` of a vector environment"
+            )
+        chosen = np.zeros(n, np.intp) if which is None else np.asarray(which)
+        if chosen.shape != (n,) or chosen.dtype.kind not in "iu" or ((chosen < 0) | (chosen >= count)).any():
+            raise InputError(f"replay: `which` must be ({n},) numbers of maps, 0 to {count - 1}, got {which!r}")
+        return chosen
 
     def _given(self, n: int, start: Array) -> Array:
         start, width = np.asarray(start, float), self.machine.model.nq + self.machine.model.nv
@@ -124,9 +150,9 @@ class Replay:
             raise InputError(f"replay: start must be finite, of shape {(n, width)}, got {start.shape}")
         return start
 
-    def _scored(self, states: Array, actions: Array, starts: Array) -> Array:
+    def _scored(self, states: Array, actions: Array, starts: Array, which: NDArray[np.intp]) -> Array:
         """(n, H) X of each control step; infinite from where replays come apart."""
-        sims, held = self._begin(states, starts), np.ones(len(states), bool)
+        sims, held = self._begin(states, starts, which), np.ones(len(states), bool)
         out = np.empty((len(states), self.horizon))
         with np.errstate(over="ignore", invalid="ignore"):
             for t in range(self.horizon):
@@ -166,16 +192,17 @@ class Replay:
         view.qvel[...] += moved[:, nv:]
         view.now = sims.robot.derive(view)
 
-    def _begin(self, states: Array, starts: Array) -> Simulations:
+    def _begin(self, states: Array, starts: Array, which: NDArray[np.intp]) -> Simulations:
         """n windows times draws simulations at their starts."""
         machine, n, nq = self.machine, len(states), self.machine.model.nq
         mujoco.set_mju_user_warning(lambda message: None)  # replays that come apart are nan
         sims = self._sims
-        if sims is None or sims.n != n * self.draws:
+        fresh = sims is None or sims.n != n * self.draws
+        if sims is None or fresh:
             sims = self._sims = machine.simulations(n * self.draws, self.nthread, self.maps)
-            rows = np.arange(sims.n)
-            given = {"psi": np.tile(self.psi, (n, 1))} | ({"terrain_id": 0 * rows} if machine.rough else {})
-            sims.begin(rows, given)
+        if fresh or len(self.maps) > 1:
+            on = {"terrain_id": np.repeat(which, self.draws)} if machine.rough else {}
+            sims.begin(np.arange(sims.n), {"psi": np.tile(self.psi, (n, 1))} | on)
         sims.batch.reset(np.arange(sims.n), sims.rest)
         view = sims.view
         rows = disturbed(machine, np.repeat(starts, self.draws, 0), np.tile(self.start, (n, 1)))
@@ -185,6 +212,14 @@ class Replay:
             view.task["goal"] = np.repeat(starts[:, :3] + states[:, 0, :3], self.draws, 0)
         view.now = sims.robot.derive(view)
         return sims
+
+
+def told(machine: Machine) -> NDArray[np.bool_]:
+    """(s,) entries of `proprio` that are measured and that a replay can say: no command, nothing of unknown targets."""
+    found = machine.noise > 0
+    if issubclass(machine.kind, Ant | Humanoid):
+        found[list(_AIMS)] = False
+    return found
 
 
 def _psi(machine: Machine, belief: Sampler | None, draws: int, rng: np.random.Generator) -> Array:

@@ -13,6 +13,7 @@ from nfc_gym.simulate.drive import drive_of
 from nfc_gym.simulate.ground import begin
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.policy import Policy
+from nfc_gym.simulate.recorded import Recorded, place
 from nfc_gym.simulate.residuals import Given, Residuals
 from nfc_gym.terrain import Heightfield
 
@@ -34,6 +35,7 @@ class Task:
       warm: (n,) control steps before the window, W at most; rows that need fewer wait.
       guided: (n,) rows that a policy moves.
       given: effects, rows of each contiguous; the rest have none.
+      recorded: (n) whose starts and actions take the place of `start`, `signal` and the policy; `warm` is then 0.
     """
 
     psi: Array
@@ -44,6 +46,7 @@ class Task:
     warm: NDArray[np.intp]
     guided: Flags
     given: Sequence[Given]
+    recorded: Recorded | None = None
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,8 @@ def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy 
     sims = machine.simulations(n, nthread, maps)
     robot, view, batch = sims.robot, sims.view, sims.batch
     begin(machine, sims, task.psi, task.which, task.start)
+    if task.recorded is not None:
+        place(machine, sims, task.recorded.starts, task.recorded.states[:, 0])
     for each in task.given:
         each.effect.bind(sims.model)
     residuals = Residuals(sims, task.given)
@@ -132,7 +137,7 @@ def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy 
     shown = np.zeros((len(rows), kind.proprio_size))
     for t in range(longest + horizon):
         alive = (t >= longest - task.warm) & ~unstable & ~ended
-        action = drive(view, task.signal[:, t])
+        action = drive(view, task.signal[:, t]) if task.recorded is None else task.recorded.actions[:, t]
         if policy is not None and task.guided.any():
             action[task.guided] = policy.act(sims, task.guided) + _EXPLORE * task.signal[task.guided, t]
         # What is recorded is what was commanded, to the bit.
@@ -164,6 +169,9 @@ def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy 
         if k >= 0:
             delta[rows] += machine.difference(np.concatenate(robot.proprio(view), -1)[rows], shown)
     states[:, horizon] = np.concatenate(robot.proprio(view), -1)
+    if task.recorded is not None:  # commands and last actions are the task's, not the simulation's
+        quiet = machine.noise == 0
+        states[:, :, quiet] = task.recorded.states[:, :, quiet]
     pose[:, horizon] = view.qpos[:, :7]
     unstable |= ~ended & ~(np.isfinite(states).all((1, 2)) & np.isfinite(delta).all(1))
     return Rolled(states, actions, delta / horizon, pose, start, unstable, ended)

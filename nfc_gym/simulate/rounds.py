@@ -1,7 +1,7 @@
 """`Simulator`: windows under given psi, in memory, as sequential rounds of inference ask for them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from nfc_gym.simulate.draws import Array
 from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.maps import maps
 from nfc_gym.simulate.policy import Act
+from nfc_gym.simulate.recorded import Recorded
 from nfc_gym.simulate.run import PER_SHARD, manifest_of, settled, units
 from nfc_gym.simulate.shard import Plan
 
@@ -27,6 +28,7 @@ class Simulator:
       effects, motor, policy, policy_share: as of `simulate`.
       jobs: processes, and threads where one shard is all there is; 0 takes all cores.
       noise: what multiplies the sensors' noise, which is added to the states.
+      recorded: motion that the windows repeat in place of excitation, see `recorded.Recorded`.
       names: arrays of the batch, as of `Windows`; `map` and `delta_e`, where named, are rebuilt.
     """
 
@@ -38,6 +40,7 @@ class Simulator:
     jobs: int = 0
     noise: float = 1.0
     names: Sequence[str] = ("states", "actions", "delta_s", "family")
+    recorded: Recorded | None = None
 
     def __call__(self, psi: Array, rng: np.random.Generator) -> dict[str, Any]:
         """A batch of tensors with a leading axis of n windows.
@@ -50,18 +53,34 @@ class Simulator:
           InputError: psi of another size or outside the prior's box, or an array that windows do not have.
           MissingExtra: torch is not installed.
         """
+        return self._batch(len(psi), units(np.asarray(psi, float), Machine(self.environment).space, len(psi)), rng)
+
+    def draw(self, n: int, rng: np.random.Generator) -> dict[str, Any]:
+        """A batch of n windows whose psi is drawn from the prior, and is in it as `psi`, positions u in the box.
+
+        Of a psi under which no motion holds another is drawn.
+
+        Args:
+          n: windows.
+          rng: see `__call__`.
+        """
+        return replace(self, names=("psi", *self.names))._batch(n, None, rng)
+
+    def _batch(self, n: int, u: Array | None, rng: np.random.Generator) -> dict[str, Any]:
         try:
             import torch
         except ImportError:
             raise MissingExtra("rounds of inference need torch: pip install 'nfc_gym[inference]'") from None
         machine = Machine(self.environment)
-        u = units(np.asarray(psi, float), machine.space, len(psi))
-        manifest = manifest_of(self.environment, len(u), int(rng.integers(2**32)), PER_SHARD, {})
-        share = self.policy_share if self.policy is not None else 0.0
-        plan = Plan(manifest, settled(self.policy), self.effects, share, self.motor)
+        if self.recorded is not None:
+            self.recorded.require(machine)
+        manifest = manifest_of(self.environment, n, int(rng.integers(2**32)), PER_SHARD, {})
+        share = self.policy_share if self.policy is not None and self.recorded is None else 0.0
+        plan = Plan(manifest, settled(self.policy), self.effects, share, self.motor, self.recorded)
         made = workers.made(
-            plan, range(manifest.shards), lambda k: u[k * PER_SHARD : (k + 1) * PER_SHARD], self.jobs, None
-        )
+            plan, range(manifest.shards), lambda k: None if u is None else u[k * PER_SHARD : (k + 1) * PER_SHARD],
+            self.jobs, None,
+        )  # fmt: skip
         shards = [safetensors.numpy.load(data) for _, data in sorted(made)]
         whole = {name: np.concatenate([s[name] for s in shards]) for name in shards[0]}
         if {"map", "delta_e"} & set(self.names):

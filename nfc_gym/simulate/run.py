@@ -20,7 +20,7 @@ from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.simulate import workers
 from nfc_gym.simulate.draws import PROPOSAL, Array, generator
 from nfc_gym.simulate.machine import MOTOR, Machine
-from nfc_gym.simulate.policy import Act, Policy
+from nfc_gym.simulate.policy import Act, Perceptron, Policy
 from nfc_gym.simulate.residuals import families
 from nfc_gym.simulate.shard import Plan, described, workshop
 
@@ -155,6 +155,8 @@ def _digest(sampler: Sampler | None, seed: int, machine: Machine) -> str | None:
 def _named(policy: Act | str | None) -> str | None:
     if policy is None:
         return None
+    if isinstance(policy, Perceptron):
+        return policy.digest
     if callable(policy):
         return getattr(policy, "__qualname__", type(policy).__qualname__)
     return hashlib.sha256(Path(policy).read_bytes()).hexdigest()[:16]

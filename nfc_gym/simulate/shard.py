@@ -15,6 +15,7 @@ from nfc_gym.simulate.draws import LABELS, MOTION, PLACES, Array, between, gener
 from nfc_gym.simulate.drive import channels
 from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.policy import Act, Policy
+from nfc_gym.simulate.recorded import Recorded
 from nfc_gym.simulate.residuals import Given, candidates, sizes
 from nfc_gym.simulate.roll import Rolled, Task, roll
 
@@ -33,6 +34,7 @@ class Plan:
       policy: callable or path of what moves a share of the windows.
       effects, policy_share: shares of the windows.
       motor: standard deviation of what the motors make of an action, see `machine.MOTOR`.
+      recorded: motion that windows repeat, each some stretch of it, on its own ground; None excites and invents ground.
     """
 
     manifest: Manifest
@@ -40,6 +42,7 @@ class Plan:
     effects: float = 0.5
     policy_share: float = 0.5
     motor: float = MOTOR
+    recorded: Recorded | None = None
 
 
 @dataclass
@@ -98,9 +101,10 @@ def make_shard(plan: Plan, shard: int, proposed: Array | None = None, nthread: i
     shop = workshop(manifest.environment)
     policy = None if plan.policy is None else _policy(plan.policy, manifest.environment)
     machine, n = shop.machine, manifest.size(shard)
-    soil = ground.Ground.of(machine, manifest.seed, shard)
+    again = plan.recorded
+    soil = ground.Ground.of(machine, manifest.seed, shard) if again is None else ground.Ground.given(again.maps)
     labels = _labels(plan, shop, shard, np.arange(n), 0, proposed)
-    longest, horizon = machine.habit.warm[1], machine.habit.horizon
+    longest, horizon = 0 if again else machine.habit.warm[1], machine.habit.horizon
     counts = {"windows": n, "unstable": 0, "ended": 0, "relabelled": 0}
     out: dict[str, NDArray] = {}
     pending = np.arange(n)
@@ -173,8 +177,11 @@ def _task(
     robot_channels, starts = channels(machine.settings.robot(machine.model)), ground.count(machine)
     waves = motion.count(steps, robot_channels)
     u = uniforms(plan.manifest.seed, shard, MOTION, order, attempt, 5 + starts + waves)
-    low, high = habit.warm
+    low, high = (0, 0) if plan.recorded else habit.warm
     which = picked(u[:, 1], max(len(soil.maps), 1))
+    recorded = None if plan.recorded is None else plan.recorded.at(picked(u[:, 3], len(plan.recorded)))
+    if recorded is not None and recorded.which is not None:
+        which = recorded.which
     psi = machine.space.low + labels.u[order] * (machine.space.high - machine.space.low)
     task = Task(
         psi=psi,
@@ -186,6 +193,7 @@ def _task(
         warm=low + picked(u[:, 0], high - low + 1),
         guided=(u[:, 2] < plan.policy_share) & (plan.policy is not None),
         given=_given(shop, labels, order),
+        recorded=recorded,
     )
     plane = not soil.maps
     kept = {

@@ -1,30 +1,19 @@
 """Who makes the shards: this process, several, or a Ray cluster. Whoever does, a shard's bits are the same."""
 
-import os
 import pickle
-import signal
-import threading
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
 from typing import Any
 
-from nfc_gym.core.errors import InputError, MissingExtra, NfcError
+from nfc_gym.core.errors import InputError, NfcError
+from nfc_gym.simulate.cluster import connected, cores
 from nfc_gym.simulate.draws import Array
+from nfc_gym.simulate.pool import unordered
 from nfc_gym.simulate.shard import Plan, make_shard
 
 Proposed = Callable[[int], Array | None]  # u (n, d) that a proposal gives a shard
 Made = Generator[tuple[int, bytes], None, None]
-_AHEAD = 2  # shards in flight for each worker: results wait in memory until they are written
+_AHEAD = 2  # shards in flight for each of a cluster's workers: results wait in memory until they are written
 _RETRIES = 3  # times that Ray makes a shard again whose worker died
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def made(plan: Plan, shards: Sequence[int], proposed: Proposed, jobs: int, ray: str | None) -> Made:
@@ -59,82 +48,8 @@ def processes(plan: Plan, shards: Sequence[int], proposed: Proposed, jobs: int) 
         pickle.dumps(plan)
     except (pickle.PicklingError, AttributeError, TypeError) as e:
         raise InputError(f"policy: cannot be sent to other processes ({e}); give a file, or jobs=1") from None
-    with pool_of(jobs) as pool:
-        yield from _flow(
-            shards, jobs, lambda k: pool.submit(make_shard, plan, k, proposed(k)), _first, lambda f: f.result()
-        )
-
-
-@contextmanager
-def pool_of(jobs: int) -> Generator[ProcessPoolExecutor, None, None]:
-    """Processes of one thread each, which end at once where this one is interrupted or dies.
-
-    Raises:
-      NfcError: one of them died.
-    """
-    with _single_threaded():
-        pool = ProcessPoolExecutor(jobs, get_context("spawn"), _ready)
-        try:
-            yield pool
-        except BrokenProcessPool:
-            raise NfcError(
-                "a worker process died, perhaps for want of memory; finished shards stay: the same command goes on, "
-                "and --jobs with a smaller number needs less"
-            ) from None
-        finally:
-            running = list((pool._processes or {}).values())
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in running:
-                process.terminate()
-
-
-def _ready() -> None:
-    """In a worker: Ctrl-C is the caller's to answer, and nobody works on for a caller that was killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        caller = parent_process()
-        if caller is not None:
-            caller.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def _single_threaded() -> Generator[None, None, None]:
-    """Processes started meanwhile compute with one thread each."""
-    before = {k: os.environ.get(k) for k in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for k, v in before.items():
-            if v is None:
-                del os.environ[k]
-            else:
-                os.environ[k] = v
-
-
-def _first(running: list[Future]) -> Any:
-    return next(iter(wait(running, return_when=FIRST_COMPLETED)[0]))
-
-
-def _flow(
-    shards: Sequence[int],
-    jobs: int,
-    submit: Callable[[int], Any],
-    first: Callable[[list[Any]], Any],
-    result: Callable[[Any], bytes],
-) -> Made:
-    """Shards as they are finished, with `_AHEAD` a worker in flight."""
-    waiting, running = list(shards), {}
-    while waiting or running:
-        while waiting and len(running) < _AHEAD * jobs:
-            k = waiting.pop(0)
-            running[submit(k)] = k
-        done = first(list(running))
-        yield running.pop(done), result(done)
+    for i, found in unordered(make_shard, ((plan, k, proposed(k)) for k in shards), jobs):
+        yield shards[i], found
 
 
 def on_ray(plan: Plan, shards: Sequence[int], proposed: Proposed, address: str, jobs: int) -> Made:
@@ -151,23 +66,21 @@ def on_ray(plan: Plan, shards: Sequence[int], proposed: Proposed, address: str, 
       InputError: no such cluster.
       NfcError: a shard's workers died again and again.
     """
-    try:
-        import ray  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise MissingExtra("a cluster needs Ray: pip install 'nfc_gym[ray]'") from None
-    started = not ray.is_initialized()
-    if started:
-        where = {"num_cpus": jobs or cores()} if address == "local" else {"address": address}
-        try:
-            ray.init(**where, include_dashboard=False, logging_level="warning", log_to_driver=False)
-        except (ConnectionError, ValueError, RuntimeError) as e:
-            raise InputError(f"--ray {address}: no such cluster ({e}); want its address, auto or local") from None
+    with connected(address, jobs) as ray:
+        yield from _as_tasks(ray, plan, shards, proposed, jobs)
+
+
+def _as_tasks(ray: Any, plan: Plan, shards: Sequence[int], proposed: Proposed, jobs: int) -> Made:
     make = ray.remote(num_cpus=1, max_retries=_RETRIES)(make_shard)
     given, jobs = ray.put(plan), jobs or int(ray.cluster_resources().get("CPU", 1))
     try:
-        yield from _flow(
-            shards, jobs, lambda k: make.remote(given, k, proposed(k)), lambda refs: ray.wait(refs)[0][0], ray.get
-        )
+        waiting, running = list(shards), {}
+        while waiting or running:
+            while waiting and len(running) < _AHEAD * jobs:
+                k = waiting.pop(0)
+                running[make.remote(given, k, proposed(k))] = k
+            done = ray.wait(list(running))[0][0]
+            yield running.pop(done), ray.get(done)
     except ray.exceptions.RayTaskError as e:
         raise e.cause if isinstance(e.cause, NfcError) else NfcError(f"a worker failed: {e.cause!r}") from None
     except ray.exceptions.RayError as e:
@@ -175,6 +88,3 @@ def on_ray(plan: Plan, shards: Sequence[int], proposed: Proposed, address: str, 
             f"a shard's workers died {_RETRIES + 1} times ({type(e).__name__}); finished shards stay: "
             "the same command goes on"
         ) from None
-    finally:
-        if started:
-            ray.shutdown()

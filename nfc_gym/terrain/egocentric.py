@@ -6,6 +6,7 @@ the collision surface of `Heightfield.height` by at most a quarter of a cell's t
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -41,15 +42,67 @@ def elevation(
     Raises:
       InputError: shapes that do not fit each other, or positions or headings that are not finite.
     """
+    base, heading = _checked(xyz, yaw)
+    if out is None:
+        out = np.empty((*heading.shape, SIZE, SIZE), np.float32)
+    elif out.shape != (*heading.shape, SIZE, SIZE) or out.dtype != np.float32 or not out.flags.c_contiguous:
+        raise InputError(f"out is {out.dtype} {out.shape}; want float32 {(*heading.shape, SIZE, SIZE)}, contiguous")
+    _look(heightfield, base, heading, np.eye(3), out.reshape(heading.size, SIZE, SIZE))
+    return out
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Some cells of an elevation map: `elevation[..., i, j]` on a coarser, smaller grid.
+
+    Attributes:
+      first: row and column of the first.
+      step: cells from one to the next, either way.
+      shape: how many of them, forward and to the left.
+
+    Raises:
+      InputError: the grid reaches outside the map.
+    """
+
+    first: tuple[int, int]
+    step: int
+    shape: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        for at, count in zip(self.first, self.shape, strict=True):
+            if at < 0 or self.step < 1 or count < 1 or at + self.step * (count - 1) >= SIZE:
+                raise InputError(f"{self} reaches outside the {SIZE} x {SIZE} elevation map")
+
+    def of(self, elevation: NDArray) -> NDArray:
+        """These cells (..., *shape) of whole maps (..., SIZE, SIZE)."""
+        rows, columns = (slice(a, a + self.step * n, self.step) for a, n in zip(self.first, self.shape, strict=True))
+        return elevation[..., rows, columns]
+
+    def around(
+        self, heightfield: Heightfield | Sequence[Heightfield], xyz: ArrayLike, yaw: ArrayLike
+    ) -> NDArray[np.float32]:
+        """The same cells (..., *shape) without the rest of the maps; arguments and errors as of `elevation`."""
+        base, heading = _checked(xyz, yaw)
+        out = np.empty((*heading.shape, *self.shape), np.float32)
+        coarser = np.array([[self.step, 0, self.first[1]], [0, self.step, self.first[0]], [0, 0, 1]], float)
+        _look(heightfield, base, heading, coarser, out.reshape(heading.size, *self.shape))
+        return out
+
+
+def _checked(xyz: ArrayLike, yaw: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions (..., 3) and headings (...)."""
     base, heading = np.asarray(xyz, np.float64), np.asarray(yaw, np.float64)
     if base.shape != (*heading.shape, 3):
         raise InputError(f"xyz has shape {base.shape} and yaw {heading.shape}; want (..., 3) and (...)")
     if not (np.isfinite(base).all() and np.isfinite(heading).all()):
         raise InputError("xyz and yaw must be finite")
-    if out is None:
-        out = np.empty((*heading.shape, SIZE, SIZE), np.float32)
-    elif out.shape != (*heading.shape, SIZE, SIZE) or out.dtype != np.float32 or not out.flags.c_contiguous:
-        raise InputError(f"out is {out.dtype} {out.shape}; want float32 {(*heading.shape, SIZE, SIZE)}, contiguous")
+    return base, heading
+
+
+def _look(
+    heightfield: Heightfield | Sequence[Heightfield], base: NDArray, heading: NDArray, grid: NDArray, out: NDArray
+) -> None:
+    """Write maps (count, rows, columns), whose cells `grid` (3, 3) takes to (j, i) of the elevation map."""
     count = heading.size
     fields = [heightfield] * count if isinstance(heightfield, Heightfield) else list(heightfield)
     if len(fields) != count:
@@ -60,13 +113,12 @@ def elevation(
     else:
         resolution, origin = np.array([[f.resolution] for f in fields]), np.array([f.origin for f in fields])
     centre = (places[:, :2] - origin.reshape(-1, 2)) / resolution
-    matrices = to_grid(centre, turns, CELL / np.reshape(resolution, -1))
-    lifts, maps = places[:, 2].astype(np.float32), out.reshape(count, SIZE, SIZE)
+    matrices = to_grid(centre, turns, CELL / np.reshape(resolution, -1)) @ grid
+    lifts, size = places[:, 2].astype(np.float32), (out.shape[2], out.shape[1])
     # Robots on the same map one after the other, so that its heights are still in the cache.
     for k in sorted(range(count), key=lambda k: id(fields[k])):
-        cv2.warpAffine(fields[k].heights, matrices[k], (SIZE, SIZE), maps[k], _FLAGS, borderMode=cv2.BORDER_REPLICATE)
-        np.subtract(maps[k], lifts[k], out=maps[k])  # while the map is in the cache, too
-    return out
+        cv2.warpAffine(fields[k].heights, matrices[k], size, out[k], _FLAGS, borderMode=cv2.BORDER_REPLICATE)
+        np.subtract(out[k], lifts[k], out=out[k])  # while the map is in the cache, too
 
 
 def to_grid(

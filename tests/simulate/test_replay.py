@@ -13,6 +13,7 @@ from nfc_gym.simulate.ensemble import innovation
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
 from nfc_gym.simulate.trials import trials
+from nfc_gym.terrain import make
 from nfc_gym.wrappers import MonitorAnomaly
 
 JACKAL = "nfc_gym/JackalFlat-v0"
@@ -120,3 +121,34 @@ def test_bad_input_is_refused(machine: Machine, replay: Replay) -> None:
         Replay("nfc_gym/AntFlat-v0", draws=2).score(np.zeros((1, 51, 52)), np.zeros((1, 50, 8)))
     with pytest.raises(InputError, match="start must be finite"):
         replay.score(np.zeros((1, 51, 15)), np.zeros((1, 50, 2)), np.zeros((1, 3)))
+
+
+def test_every_row_of_a_vector_environment_is_replayed_on_its_own_ground() -> None:
+    """Two Jackals on two maps: nothing unusual where each is replayed on its own, much where the maps change places."""
+    env = gymnasium.make_vec("nfc_gym/JackalRough-v0", num_envs=2, context=["psi"], terrain_pool=2)
+    last = env.reset(seed=3, options={"terrain_id": np.array([0, 1]), "psi": {}})[0]["proprio"]
+    inner, rng, scores = env.unwrapped, np.random.default_rng(1), []
+    noise = Machine("nfc_gym/JackalRough-v0").noise
+    own, other = (
+        WindowDetector(Replay("nfc_gym/JackalRough-v0", ground=inner.maps, standing=who))
+        for who in (lambda: inner.terrain_id, lambda: 1 - inner.terrain_id)
+    )
+    for t in range(50):
+        action = np.array([[0.8, 0.3 * np.sin(t / 9)], [0.8, -0.3 * np.sin(t / 9)]], np.float32)
+        seen = env.step(action)[0]["proprio"] + noise * rng.standard_normal((2, 15))
+        scores = [d.update(last, action, seen) for d in (own, other)]
+        last = seen
+    env.close()
+    assert scores[0].shape == (2,)
+    assert (scores[0] < 1.1).all()
+    assert (scores[1] > 1.2 * scores[0]).all()
+
+
+def test_several_maps_ask_for_whose_is_whose() -> None:
+    maps = [make("rough", 0.3, seed) for seed in (0, 1)]
+    several = Replay("nfc_gym/JackalRough-v0", draws=2, ground=maps)
+    windows = np.tile(np.eye(15)[0], (1, 51, 1)), np.zeros((1, 50, 2))
+    with pytest.raises(InputError, match="2 maps: say `which`"):
+        several.score(*windows)
+    with pytest.raises(InputError, match="0 to 1"):
+        several.score(*windows, which=np.array([2]))
