@@ -58,8 +58,11 @@ def require_writable(path: Path) -> None:
     """Find out, before any work is done, whether a file or folder could be written at `path`; nothing stays behind.
 
     Raises:
-      InputError: a part of the path is a file, a folder cannot be written to, or the disk is full.
+      InputError: a part of the path is a file, a folder cannot be written to, the disk is full, or the path looks like
+        an option whose value was forgotten.
     """
+    if str(path).startswith("--"):
+        raise InputError(f"--out {path} looks like another option: give --out a value (./{path}, if that is its name)")
     try:
         folder = path
         while not folder.exists():

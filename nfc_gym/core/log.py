@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 
 Array = NDArray[np.float64]
+_LEAST = 1e-9  # s: no clock ticks faster, and differences of less underflow
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,12 @@ class Log:
             raise InputError(
                 f"log {self.name!r}: time must be a vector of two or more samples, got shape {self.time.shape}"
             )
-        back = np.flatnonzero(np.diff(self.time) <= 0)
+        back = np.flatnonzero(np.diff(self.time) < _LEAST)
         if back.size:
             k = int(back[0])
             raise InputError(
-                f"log {self.name!r}: time must increase, but goes from {self.time[k]:g} to {self.time[k + 1]:g} s "
-                f"at row {k + 1}"
+                f"log {self.name!r}: time must increase, by {_LEAST:g} s or more, but goes from {self.time[k]:g} to "
+                f"{self.time[k + 1]:g} s at row {k + 1}"
             )
         rows = {**self.controls, **self.exogenous, **self.known, **{k: c.values for k, c in self.channels.items()}}
         for key, values in rows.items():

@@ -191,8 +191,12 @@ class Arena:
     # ---- verdicts ---------------------------------------------------------------------------------------------------
 
     def worth(self, j: Judged, share: float) -> bool:
-        """Whether a gain holds on unseen logs and is a share of the misfit worth naming."""
-        return j.lower > 0 and j.gain > 0 and j.total > share * self.misfit
+        """Whether a gain holds on unseen logs and is a share of the misfit worth naming.
+
+        The selection logs may show nothing of it (a limit that they never reach), but must not speak against it by
+        more than the noise of one number.
+        """
+        return j.lower > 0 and j.gain > -dispersion(self.current) and j.total > share * self.misfit
 
     @property
     def misfit(self) -> float:

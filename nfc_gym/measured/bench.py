@@ -1,7 +1,7 @@
 """The test bench: a mapping's model, parameters and logs made ready for fitting; one `Bench` serves the whole loop."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from nfc_gym import assets
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
+from nfc_gym.measured.belief import Belief
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
@@ -35,12 +36,16 @@ class Bench:
       spec: the model as written, to save it with corrections.
       plant: the compiled model with psi and no effects.
       states: of every log, by name.
+      belief: of a posterior that calibration starts from.
+      compare: calibrate from nominal values too, to say what that saved.
     """
 
     dataset: Dataset
     spec: mujoco.MjSpec
     plant: Plant
     states: dict[str, States]
+    belief: Belief | None = None
+    compare: bool = False
 
     @property
     def mode(self) -> str:
@@ -100,19 +105,9 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
     # The commands of a firmware servo are targets, from which no push can be told without its law.
     served = any(c.servo is not None for c in bench.dataset.mapping.controls.values())
     rolled = _rolled(bench, logs) if bench.mode == "rollout" and not served else None
-    motion = rolled or _measured(bench, logs)
-    data = mujoco.MjData(model)
-    count = len(motion.qpos)
-    needed, pushed, acting = np.zeros((count, model.nv)), np.zeros((count, model.nv)), np.zeros((count, model.nu))
-    driven = np.zeros(model.nv)
-    for k in range(count):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = motion.qpos[k], motion.qvel[k], motion.ctrl[k]
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        mujoco.mj_mulM(model, data, driven, motion.qacc[k])
-        needed[k] = driven + data.qfrc_bias
-        mujoco.mj_fwdActuation(model, data)
-        pushed[k], acting[k] = data.qfrc_actuator, data.actuator_force
+    measured = _measured(bench, logs)
+    motion = rolled or measured
+    needed, pushed, acting = _forces(model, motion)
     rms = lambda a: np.sqrt((a**2).mean(0))  # noqa: E731
     need, push = rms(needed), rms(pushed)
     # A driven wheel needs little for its own motion and pushes the vehicle: roll-outs show what it pushes. At measured
@@ -129,7 +124,45 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
     }
     command = motion.ctrl.std(0) + 0.1 * np.abs(motion.ctrl).mean(0)
     ends = [f(np.stack([f(bench.states[log.name].qpos, 0) for log in logs]), 0) for f in (np.min, np.max)]
-    return Scales(force, rms(motion.qvel), command, rms(acting), first.interval, exogenous, channels, *ends)
+    push = _known_push(bench, logs, measured) if rolled else None
+    return Scales(
+        force, rms(motion.qvel), command, rms(acting), first.interval, exogenous, channels, ends[0], ends[1], push
+    )
+
+
+def _forces(model: mujoco.MjModel, motion: "_Motion") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the model needs for a motion (n, nv), and what its actuators push (n, nv) and exert (n, nu) along it."""
+    data = mujoco.MjData(model)
+    count = len(motion.qpos)
+    needed, pushed, acting = np.zeros((count, model.nv)), np.zeros((count, model.nv)), np.zeros((count, model.nu))
+    driven = np.zeros(model.nv)
+    for k in range(count):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = motion.qpos[k], motion.qvel[k], motion.ctrl[k]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_mulM(model, data, driven, motion.qacc[k])
+        needed[k] = driven + data.qfrc_bias
+        mujoco.mj_fwdActuation(model, data)
+        pushed[k], acting[k] = data.qfrc_actuator, data.actuator_force
+    return needed, pushed, acting
+
+
+def _known_push(bench: Bench, logs: Sequence[Log], motion: "_Motion") -> np.ndarray:
+    """(nv,) what the actuators pushed at most as their laws tell from the measured motion, less what its noise adds.
+
+    The largest is the 99th percentile, which noise alone would bring to 2.33 standard deviations. Degrees of freedom
+    that no channel shows get 0.
+    """
+    model, states = bench.plant.model, [bench.states[log.name] for log in logs]
+    spread = [np.median([np.median(getattr(s, f"{k}_sd"), 0) for s in states], 0) for k in ("qpos", "qvel")]
+    pushed = _forces(model, motion)[1]
+    turned = motion.qpos.copy()
+    for q in turned:
+        mujoco.mj_integratePos(model, q, spread[0], 1.0)
+    moved = replace(motion, qpos=turned), replace(motion, qvel=motion.qvel + spread[1])
+    noise = sum(((_forces(model, m)[1] - pushed) ** 2).mean(0) for m in moved)
+    known = np.maximum(np.quantile(np.abs(pushed), 0.99, axis=0) - 2.33 * np.sqrt(noise), 0.0)
+    return np.where(spread[1] > 0, known, 0.0)
 
 
 @dataclass(frozen=True)

@@ -226,6 +226,19 @@ def heat_grid(label: str, x: Sequence[float], y: Sequence[float], rows: Sequence
     return _svg(_WIDTH, _HEIGHT, label, body)
 
 
+def curve_chart(label: str, x_label: str, y_label: str, series: Sequence[Series]) -> Markup:
+    """Values against anything, on axes that just hold them."""
+    points = [(a, b) for s in series for a, b in s.points() if a is not None and b is not None]
+    if not points:
+        return Markup('<p class="none">No value to draw.</p>')
+    xs, ys = zip(*points, strict=True)
+    margin = 0.06 * (max(ys) - min(ys)) or max(abs(max(ys)), 1.0) * 0.1
+    x = _Axis(min(xs), max(xs) if max(xs) > min(xs) else min(xs) + 1.0, _LEFT, _WIDTH - _RIGHT)
+    y = _Axis(min(ys) - margin, max(ys) + margin, _HEIGHT - _BOTTOM, _TOP)
+    body = [_frame(x, y, x_label, y_label), *(_path(s, x, y) for s in series)]
+    return _svg(_WIDTH, _HEIGHT, label, body)
+
+
 def trace_chart(label: str, unit: str, series: Sequence[Series]) -> Markup:
     """Values against time; the range is the measurement's, so that a prediction that runs away does not flatten it."""
     xs = [a for s in series for a, b in s.points() if a is not None and b is not None]

@@ -162,7 +162,9 @@ class Stage:
         logs, states = [], []
         for i in range(len(commands)):
             part = slice(i, i + 1)
-            one = Trajectory(motion.qpos[:, part], motion.qvel[:, part], None, motion.stable[:, part])
+            one = Trajectory(
+                motion.qpos[:, part], motion.qvel[:, part], None, motion.stable[:, part], motion.touched[:, part]
+            )
             at = lambda a: interpolate(a, step, False)[0, 0]  # noqa: E731
             qpos, qvel = at(one.qpos), at(one.qvel)
             states.append(States(qpos, qvel, np.zeros_like(qvel), q_sd, v_sd, sd.observed))

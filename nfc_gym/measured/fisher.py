@@ -15,10 +15,12 @@ from nfc_gym.measured.fit import COARSE, FINE, jacobian
 from nfc_gym.measured.metric import Metric, loss_weight
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import probe_sets
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
+_EVERY = 3  # of the blocks one is begun at another start, to see what of a column repeats
 _ALIKE = 0.01  # singular value of unit columns below which they span nothing new: a bend of the law, not another law
 
 
@@ -46,6 +48,20 @@ class Lens:
         if len(free):
             slopes = jacobian(problem, under, limits, x, self.base, free, size)
         self.tangent = np.where(self.stable[:, None, None], self.weight[..., None] * slopes, 0.0)
+
+    def twin(self, seed: int = 0) -> "Lens | None":
+        """Some of the data, begun at other starts; None where nothing touches and a column is what it is anywhere."""
+        problem = self.problem
+        if not (isinstance(problem, RolloutProblem) and problem.rough and problem.touches(self.plant, self.x)):
+            return None
+        index = self.shared
+        problem = problem.take(index).redrawn(np.random.default_rng(seed))
+        return Lens(problem, self.under.take(index), self.plant, self.x, self.weight[index])
+
+    @property
+    def shared(self) -> NDArray[np.intp]:
+        """Blocks that the twin has."""
+        return np.arange(0, len(self.problem), _EVERY)
 
     def columns(self, effect: Effect, thetas: Array) -> Array:
         """(S, m, r) change that a further effect makes at each of its parameter vectors (r, k).
@@ -112,15 +128,6 @@ def realistic(effect: Effect, every_size: bool = True) -> list[tuple[Array, Arra
     return out
 
 
-def sized(effect: Effect, theta: Array, share: float) -> Array:
-    """The effect's parameters (k,) at a share of the size that theta has, along the coordinates that a fit walks in."""
-    null = effect.null.copy()
-    shape = np.array([p.shape for p in effect.params])
-    null[shape] = theta[shape]
-    start = effect.chart(null)
-    return np.asarray(effect.unchart(start + share * (effect.chart(theta) - start)), np.float64)
-
-
 def span(columns: Array, floor: float = _ALIKE) -> Array:
     """(n, j) orthonormal basis of columns (n, r), less those that vanish or are nearly copies of others."""
     norms = np.linalg.norm(columns, axis=0)
@@ -134,6 +141,16 @@ def span(columns: Array, floor: float = _ALIKE) -> Array:
 def without(columns: Array, basis: Array) -> Array:
     """Columns (n,) or (n, r) less what an orthonormal basis (n, j) can imitate."""
     return columns - basis @ (basis.T @ columns)
+
+
+def repeated(one: Array, other: Array) -> Array:
+    """(r,) share of each column (n, r) that its twin (n, r) has too: their cosine, none where they disagree.
+
+    Where bodies touch, much of what a small change does hangs on the very instant of an impact. Another start within
+    the noise gives another such part, so that it tells nothing of the cause; a machine's own start is such another.
+    """
+    lengths = np.linalg.norm(one, axis=0) * np.linalg.norm(other, axis=0)
+    return np.clip((one * other).sum(0) / np.maximum(lengths, 1e-12), 0.0, 1.0)
 
 
 def left_over(gram: Array, of: int, others: Sequence[int]) -> float:

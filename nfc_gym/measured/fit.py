@@ -7,10 +7,12 @@ import cma
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from nfc_gym.measured.box import Box, box
 from nfc_gym.measured.metric import TURN, Metric, loss, loss_weight
 from nfc_gym.measured.problem import Problem
+from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -88,51 +90,70 @@ def fit(
     Returns:
       The fit; never worse than the start under the loss.
     """
-    limits = box(plant)
-    fresh = np.arange(0 if known is None else known.shape[-1], len(limits.scale))
-
-    last: dict[str, Array] = {}
-
-    def white(x: Array) -> Array:
-        # The optimiser asks for slopes where it has just asked for the residual.
-        if "x" not in last or not np.array_equal(last["x"], x):
-            last["x"], last["white"] = x.copy(), metric.whiten(problem.residual(plant, x[None]))[0]
-        return last["white"]
-
-    def residual(z: Array) -> Array:
-        return np.concatenate([white(limits.x(z, start)).ravel(), (z - limits.centre) * limits.pull])
-
-    def slopes(x: Array, size: float) -> Array:
-        found = jacobian(problem, metric, limits, x, white(x), fresh, size)
-        return found if known is None else np.concatenate([known, found], -1)
-
-    def derivative(z: Array, size: float) -> Array:
-        tick()
-        last["jacobian"] = slopes(limits.x(z, start), size)
-        return np.concatenate([last["jacobian"].reshape(-1, len(z)), np.diag(limits.pull)])
-
+    ask = _Asked(problem, metric, plant, start, known, tick)
+    limits = ask.limits
     room = 1e-6 * (limits.roof - limits.floor)
     x = start.copy()
     stages = ((COARSE, rounds // 2), (TINY, rounds - rounds // 2)) if problem.rough else ((FINE, rounds),)
     for size, share in stages if len(limits.scale) else ():
         solved = least_squares(
-            residual, np.clip(limits.at(x), limits.floor + room, limits.roof - room),
-            lambda z, size=size: derivative(z, size),  # pyright: ignore[reportArgumentType] (no stubs)
+            ask.residual, np.clip(limits.at(x), limits.floor + room, limits.roof - room),
+            lambda z, size=size: ask.derivative(z, size),  # pyright: ignore[reportArgumentType] (no stubs)
             (limits.floor, limits.roof), loss="soft_l1", f_scale=TURN, x_scale="jac",
             max_nfev=max(share, 1), ftol=1e-5, xtol=1e-5, gtol=1e-8,
         )  # fmt: skip
         x = limits.x(solved.x, start)
-    if problem.rough and len(limits.scale):
-        last["jacobian"] = slopes(x, COARSE)
-    base, found = white(x), last.get("jacobian", np.zeros((*problem.mask.shape, 0)))
-    unseen = ~found.any((0, 1))
+    found = ask.slopes(x, COARSE) if problem.rough and len(limits.scale) else ask.jacobian
+    base, unseen = ask.white(x), ~found.any((0, 1))
     if unseen.any():
         # What the data say nothing of stays at null, unless that would change the motion after all.
         quiet = limits.x(np.where(unseen, limits.centre, limits.at(x)), start)
-        moved = white(quiet)
+        moved = ask.white(quiet)
         if loss(moved).sum() <= loss(base).sum() * (1 + 1e-9):
             x, base = quiet, moved
     return Fit(plant, x, base, found)
+
+
+class _Asked:
+    """What an optimiser asks of a fit: residuals and slopes at scaled coordinates; arguments as for `fit`.
+
+    Attributes:
+      limits: the box.
+      jacobian: (S, m, f) slopes that were asked for last.
+    """
+
+    def __init__(
+        self, problem: Problem, metric: Metric, plant: Plant, start: Array, known: Array | None, tick: Callable
+    ) -> None:
+        self.problem, self.metric, self.plant, self.start, self.known, self.tick = (
+            problem, metric, plant, start, known, tick,
+        )  # fmt: skip
+        self.limits = box(plant)
+        self.fresh = np.arange(0 if known is None else known.shape[-1], len(self.limits.scale))
+        self.jacobian = np.zeros((*problem.mask.shape, 0))
+        self._last: tuple[Array, Array] | None = None
+
+    def white(self, x: Array) -> Array:
+        """(S, m) whitened residual; the optimiser asks for slopes where it has just asked for the residual."""
+        if self._last is None or not np.array_equal(self._last[0], x):
+            self._last = x.copy(), self.metric.whiten(self.problem.residual(self.plant, x[None]))[0]
+        return self._last[1]
+
+    def residual(self, z: Array) -> Array:
+        """(S m + f,) whitened residual, and how far the weak priors are pulled."""
+        white = self.white(self.limits.x(z, self.start))
+        return np.concatenate([white.ravel(), (z - self.limits.centre) * self.limits.pull])
+
+    def derivative(self, z: Array, size: float) -> Array:
+        """(S m + f, f) its slopes, by differences of that size."""
+        self.tick()
+        self.jacobian = self.slopes(self.limits.x(z, self.start), size)
+        return np.concatenate([self.jacobian.reshape(-1, len(z)), np.diag(self.limits.pull)])
+
+    def slopes(self, x: Array, size: float) -> Array:
+        """(S, m, f) of the whitened residual; those that are known are not taken anew."""
+        found = jacobian(self.problem, self.metric, self.limits, x, self.white(x), self.fresh, size)
+        return found if self.known is None else np.concatenate([self.known, found], -1)
 
 
 def stand(problem: Problem, metric: Metric, plant: Plant, x: Array) -> Fit:
@@ -159,7 +180,7 @@ def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed:
     z = np.clip(limits.at(found.x), limits.floor, limits.roof)
     if len(z) == 1:  # CMA-ES wants two dimensions: a scan does for one
         draws = np.linspace(limits.floor, limits.roof, evaluations)
-        values = _values(problem, metric, limits, draws, found.x)
+        values = objective(problem, metric, limits, draws, found.x)
         best, value = draws[values.argmin()], float(values.min())
     else:
         bounds = [limits.floor.tolist(), limits.roof.tolist()]
@@ -167,14 +188,14 @@ def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed:
         search = cma.CMAEvolutionStrategy(z, _SPREAD, options)
         while not search.stop():
             draws = np.array(search.ask())
-            search.tell(list(draws), _values(problem, metric, limits, draws, found.x).tolist())
+            search.tell(list(draws), objective(problem, metric, limits, draws, found.x).tolist())
         best, value = np.asarray(search.result.xbest), float(search.result.fbest)
-    if value >= _values(problem, metric, limits, z[None], found.x)[0]:
+    if value >= objective(problem, metric, limits, z[None], found.x)[0]:
         return found
     return fit(problem, metric, found.plant, limits.x(best, found.x), 4)
 
 
-def _values(problem: Problem, metric: Metric, limits: Box, z: Array, around: Array) -> Array:
+def objective(problem: Problem, metric: Metric, limits: Box, z: Array, around: Array) -> Array:
     """(P,) what a fit minimises, at scaled coordinates (P, f)."""
     white = metric.whiten(problem.residual(limits.plant, limits.x(z, around)))
     return loss(white).sum(-1) + (((z - limits.centre) * limits.pull) ** 2).sum(-1)
@@ -190,6 +211,37 @@ def uncertainty(result: Fit, blocks: NDArray[np.intp]) -> Array:
     infinite.
     """
     limits = box(result.plant)
+    slopes = limits.slopes(result.x)
+    variances = [np.einsum("ni,ij,nj->n", slopes, c, slopes) for c in _covariances(result, limits, blocks)]
+    sd = np.sqrt(np.maximum(np.maximum(*variances), 0.0))
+    unseen = ~result.jacobian.any((0, 1)) & (limits.pull == 0)
+    return np.where((slopes[:, unseen] != 0).any(1), np.inf, sd)
+
+
+def differs(result: Fit, blocks: NDArray[np.intp], effect: Effect, level: float = 0.95) -> bool:
+    """Whether the sizes of a fitted effect, taken together, differ from those that do nothing (Wald's test, 1943).
+
+    One number alone may be uncertain because another can stand in for it; all of them at once cannot, in what is there.
+    """
+    limits = box(result.plant)
+    sizes = np.zeros(len(limits.free), bool)
+    at = len(result.plant.space)
+    for e in result.plant.effects:
+        if e is effect:
+            sizes[at : at + len(e.params)] = [not p.shape for p in e.params]
+        at += len(e.params)
+    away = (limits.at(result.x) - limits.at(result.plant.null))[sizes[limits.free]]
+    most = float(chi2.ppf(level, len(away)))
+    own = np.ix_(sizes[limits.free], sizes[limits.free])
+    plain, robust = _covariances(result, limits, blocks)
+    # Few clusters leave directions in which nothing scatters, and a distance along those would count for nothing.
+    usable = [plain, robust] if blocks.max() >= 2 * len(away) else [plain]
+    seen = [away @ np.linalg.pinv(c[own], hermitian=True) @ away for c in usable]
+    return bool(min(seen) > most)
+
+
+def _covariances(result: Fit, limits: Box, blocks: NDArray[np.intp]) -> tuple[Array, Array]:
+    """(f, f) each, in scaled coordinates: of a model that fits, and of any, from the scatter between the clusters."""
     weight = loss_weight(result.white) ** 2
     jac = result.jacobian
     hessian = np.einsum("smi,sm,smj->ij", jac, weight, jac) + np.diag(limits.pull**2)
@@ -197,8 +249,4 @@ def uncertainty(result: Fit, blocks: NDArray[np.intp]) -> Array:
     clustered = np.zeros((int(blocks.max()) + 1, len(limits.scale)))
     np.add.at(clustered, blocks, scores)
     inverse = np.linalg.pinv(hessian, rcond=1e-12, hermitian=True)
-    robust = inverse @ (clustered.T @ clustered) @ inverse
-    slopes = limits.slopes(result.x)
-    spread = lambda covariance: np.einsum("ni,ij,nj->n", slopes, covariance, slopes)  # noqa: E731
-    sd = np.sqrt(np.maximum(np.maximum(spread(inverse), spread(robust)), 0.0))
-    return np.where((slopes[:, ~hessian.any(0)] != 0).any(1), np.inf, sd)
+    return inverse, inverse @ (clustered.T @ clustered) @ inverse

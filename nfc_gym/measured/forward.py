@@ -12,7 +12,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.measured.observe import Observer, observer
-from nfc_gym.physics.activations import advance_activations
+from nfc_gym.physics.activations import Activations
 from nfc_gym.physics.effects.base import Context, Forces, overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.past import trace
@@ -122,6 +122,7 @@ def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[tuple[Arr
     act = np.zeros((*out.shape[:-1], model.na))
     if commanding or model.na:
         dt = tracks[0].dt
+        activations = Activations(model, dt)
         start = out[:, :, 0].copy()
         memories = {i: plant.effects[i].state0(start.shape[:-1], start, thetas[i], dt) for i in commanding}
         state = np.zeros((*start.shape[:-1], model.na))
@@ -131,6 +132,6 @@ def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[tuple[Arr
             for i in commanding:
                 u, memories[i] = plant.effects[i].action(u, thetas[i], memories[i], signals, dt)
             out[:, :, k] = u
-            advance_activations(model, u, state, dt, settle=k == 0)
+            activations.advance(u, state, settle=k == 0)
             act[:, :, k] = state
     return [(out[:, i, : len(t.time)], act[:, i, : len(t.time)]) for i, t in enumerate(tracks)]

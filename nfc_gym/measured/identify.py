@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import contains
-from nfc_gym.measured.fisher import Lens, flat, free_names, realistic, sized, span, without
+from nfc_gym.measured.fisher import Lens, flat, free_names, realistic, repeated, span, without
+from nfc_gym.measured.screen import sized
 from nfc_gym.measured.stakes import Stakes
 from nfc_gym.physics.effects.base import Effect
 
@@ -34,6 +35,7 @@ class _View:
     Attributes:
       thetas: (d, k) realistic sizes, or the fitted one of an accepted effect.
       columns: (n, d) what they change; of an accepted effect, what a change of it does, taken for its whole size.
+      steady: (d,) share of each column, beyond the fitted parameters, that repeats from other starts.
       spans: (n, r) changes each, one array a shape and size of the law: together they span what it can imitate.
       basis: (n, j) what the fitted parameters can imitate.
     """
@@ -41,6 +43,7 @@ class _View:
     effect: Effect
     thetas: Array
     columns: Array
+    steady: Array
     spans: list[Array]
     basis: Array
     claimed: bool = False
@@ -64,20 +67,22 @@ def table(
       `worst_mimic`: the other effect that imitates it best once the fitted parameters have taken their share;
         `similarity`: the cosine between the two, `angle`: in degrees;
       `distinguishable`: whether the contest could tell the two apart at that size, or at the size that is claimed;
-      `detectable_share`: what the fitted parameters leave of its column; `absorbed_by`: the one that takes most of it
+      `detectable_share`: what the fitted parameters leave of its column, and would again from starts a little off;
+        `absorbed_by`: the one that takes most of it
         where little is left;
       `linear`: whether a column at that size was as long as proportion says; the size is corrected by it either way;
         None where it was not tried, as is done for what is accepted and for the effects that show best;
       `claimed`: whether the effect is accepted.
     """
-    taken, whole = {e.id for e in lens.plant.effects}, lens.fitted()
+    taken, whole, twin = {e.id for e in lens.plant.effects}, lens.fitted(), lens.twin()
+    again = None if twin is None else (twin, twin.fitted())
     views = [_accepted(lens, effect) for effect in lens.plant.effects]
     for effect in candidates:
         if effect.id not in taken and not effect.generic:
             tick(effect)
-            views.append(_look(lens, effect, whole))
+            views.append(_look(lens, effect, whole, again))
     rivals = [_imitations(v, whole) for v in views]
-    found = [_detect(v, stakes) for v in views]
+    found = [_steadied(lens, again, v, _detect(v, stakes)) for v in views]
     strength = [
         np.linalg.norm(d.column) / stakes.needed(len(v.effect.params)) for v, d in zip(views, found, strict=True)
     ]
@@ -93,20 +98,29 @@ def _accepted(lens: Lens, effect: Effect) -> _View:
     """An accepted effect: seen from the fitted model, in which the motion is what it is with the effect."""
     theta = lens.x[lens.places(effect)]
     columns = _change(lens, effect, theta, _NUDGE, True) / _NUDGE
-    return _View(effect, theta[None], columns, [columns], lens.fitted(effect), True)
+    return _View(effect, theta[None], columns, np.ones(1), [columns], lens.fitted(effect), True)
 
 
-def _look(lens: Lens, effect: Effect, basis: Array) -> _View:
-    """A candidate at its realistic sizes, whole and parameter by parameter, in one batch."""
+def _look(lens: Lens, effect: Effect, basis: Array, again: tuple[Lens, Array] | None) -> _View:
+    """A candidate at its realistic sizes, whole and parameter by parameter, in one batch; again from other starts."""
     sets = realistic(effect, every_size=not lens.problem.rough)
-    change = flat(lens.columns(effect, np.concatenate([rows for pair in sets for rows in pair])))
-    at, columns, spans = 0, [], []
-    for whole, rows in sets:
-        count = len(whole) + len(rows)
-        columns.append(change[:, at : at + len(whole)])
-        spans.append(change[:, at : at + count])
+    change = lens.columns(effect, np.concatenate([rows for pair in sets for rows in pair]))
+    at, whole, spans = 0, [], []
+    for thetas, rows in sets:
+        count = len(thetas) + len(rows)
+        whole += range(at, at + len(thetas))
+        spans.append(flat(change[..., at : at + count]))
         at += count
-    return _View(effect, np.concatenate([whole for whole, _ in sets]), np.concatenate(columns, 1), spans, basis)
+    thetas, columns = np.concatenate([t for t, _ in sets]), change[..., whole]
+    steady = np.ones(len(thetas)) if again is None else _steadiness(lens, again, effect, thetas, columns)
+    return _View(effect, thetas, flat(columns), steady, spans, basis)
+
+
+def _steadiness(lens: Lens, again: tuple[Lens, Array], effect: Effect, thetas: Array, columns: Array) -> Array:
+    """(d,) share of columns (S, m, d), beyond the fitted parameters, that repeats from the twin's starts."""
+    twin, basis = again
+    here = without(flat(columns[lens.shared]), basis)
+    return repeated(here, without(flat(twin.columns(effect, thetas)), basis))
 
 
 def _change(lens: Lens, effect: Effect, theta: Array, share: float, claimed: bool) -> Array:
@@ -129,6 +143,7 @@ class _Detected:
 
     Attributes:
       theta: (k,) its realistic size; column: (n,) what is left of its column; share: how much that is.
+      steady: the part of that share that is for what repeats.
       size: smallest size that is sure to be found, as a share of theta; infinite where bounds or psi forbid it.
       ratio: length of a column at that size over the expected one; None where none was rolled out.
     """
@@ -136,13 +151,14 @@ class _Detected:
     theta: Array
     column: Array
     share: float
+    steady: float
     size: float
     ratio: float | None
 
 
 def _detect(view: _View, stakes: Stakes) -> _Detected:
     """By proportion, from realistic sizes."""
-    left = without(view.columns, view.basis)
+    left = without(view.columns, view.basis) * view.steady
     lengths, whole = np.linalg.norm(left, axis=0), np.linalg.norm(view.columns, axis=0)
     needed, first = stakes.needed(len(view.effect.params)), _first(view.effect)
     sizes = needed / np.maximum(lengths, 1e-12)
@@ -153,28 +169,42 @@ def _detect(view: _View, stakes: Stakes) -> _Detected:
     i = min(range(len(sizes)), key=lambda i: (not within[i], far[i], away[i]))
     share = float(lengths[i] / max(whole[i], 1e-12))
     hidden = not within[i] or share < _GONE
-    return _Detected(view.thetas[i], left[:, i], share, np.inf if hidden else float(sizes[i]), None)
+    size = np.inf if hidden else float(sizes[i])
+    return _Detected(view.thetas[i], left[:, i], share, float(view.steady[i]), size, None)
+
+
+def _steadied(lens: Lens, again: tuple[Lens, Array] | None, view: _View, found: _Detected) -> _Detected:
+    """The same where the smallest size is asked whether it repeats: the smaller an effect, the less of it does."""
+    if again is None or view.claimed or not np.isfinite(found.size):
+        return found
+    theta = sized(view.effect, found.theta, found.size)[None]
+    steady = float(_steadiness(lens, again, view.effect, theta, lens.columns(view.effect, theta))[0])
+    steady = min(max(steady, 1e-3), found.steady)
+    less = steady / found.steady
+    size = found.size / less if _fits(view.effect, found.theta, found.size / less) else np.inf
+    return replace(found, column=less * found.column, share=less * found.share, steady=steady, size=size)
 
 
 def _confirmed(lens: Lens, view: _View, found: _Detected, stakes: Stakes) -> _Detected:
     if not np.isfinite(found.size):
         return found
     needed, length = stakes.needed(len(view.effect.params)), float(np.linalg.norm(found.column))
-    size, ratio = _checked(lens, view, found.theta, found.size, needed, length)
+    size, ratio = _checked(lens, view, found, needed, length)
     return replace(found, size=size, ratio=ratio)
 
 
-def _checked(lens: Lens, view: _View, theta: Array, size: float, needed: float, length: float) -> tuple[float, float]:
+def _checked(lens: Lens, view: _View, found: _Detected, needed: float, length: float) -> tuple[float, float]:
     """Columns at the size found, which correct it until one is as long as needed; and how far off the first one was.
 
     Laws that bend (a dead zone, dry friction) make columns that grow with some other power of their size.
     """
+    theta, size = found.theta, found.size
     first, before = np.nan, (1.0, length)
     for _ in range(_TRIES):
         if not _fits(view.effect, theta, size):
             return np.inf, first
         column = _change(lens, view.effect, theta, size, view.claimed)[:, 0]
-        seen = max(float(np.linalg.norm(without(column, view.basis))), 1e-3 * needed)
+        seen = max(found.steady * float(np.linalg.norm(without(column, view.basis))), 1e-3 * needed)
         ratio = seen / needed
         first = ratio if np.isnan(first) else first
         step = np.log(size / before[0])

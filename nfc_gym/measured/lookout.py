@@ -14,6 +14,7 @@ from nfc_gym.physics.effects.conditions import MARK
 _FIELD, _THIN = 30, 3  # a larger pool of candidates is first thinned to so many, on every third block or fewer
 _COSTLY = 20  # the same where roll-outs are costly
 _ENOUGH = 12  # blocks that such a thinning must leave, and does leave where each is costly
+_WORST = 6  # blocks with the largest errors that join them there
 _FAINT = 0.05  # of the best gain: what the best of a family must reach there to be among the field whatever its rank
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
 _SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
@@ -54,7 +55,7 @@ class Lookout:
         if self.problem.rough:
             leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
             thin = self._thinned(screen)
-            whole = len(self.problem) / len(thin.problem)
+            whole = float(screen.current.losses.sum() / thin.current.losses.sum())
             look = lambda f: _times(whole, thin.scout(f, self.rng))  # noqa: E731
         else:
             leading, look = [f for f in found[:_PURSUED] if f.gain > 0], screen.pursue
@@ -64,13 +65,17 @@ class Lookout:
         return looked + [f for f in found if id(f.effect) not in chosen]
 
     def _thinned(self, screen: Screen) -> Screen:
-        """The same screen on some of the blocks, spread evenly, where there are enough of them."""
-        blocks = len(self.problem)
-        every = blocks // _ENOUGH if self.problem.rough else _THIN
+        """The same screen on some of the blocks, where there are enough of them.
+
+        They are spread evenly; where only few can be had, those with the largest errors join them: a limit that is
+        reached in three blocks of seventy shows in no others.
+        """
+        blocks, current = len(self.problem), screen.current
         if blocks < _THIN * _ENOUGH:
             return screen
-        index = np.arange(0, blocks, every)
-        current = screen.current
+        index = np.arange(0, blocks, blocks // _ENOUGH if self.problem.rough else _THIN)
+        if self.problem.rough:
+            index = np.union1d(index, np.argsort(current.losses)[-_WORST:])
         part = Fit(current.plant, current.x, current.white[index], current.jacobian[index])
         return Screen(self.problem.take(index), screen.metric.take(index), part)
 

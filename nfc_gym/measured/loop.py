@@ -18,7 +18,9 @@ from nfc_gym.core.files import require_writable, write_together
 from nfc_gym.core.log import Log
 from nfc_gym.measured.advice import advise
 from nfc_gym.measured.arena import Data
+from nfc_gym.measured.belief import read_belief
 from nfc_gym.measured.bench import Bench, candidates, make_bench
+from nfc_gym.measured.calibrate import calibrate, compared
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
@@ -35,7 +37,7 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.questions import Present, blocks_for
 from nfc_gym.measured.report import render_summary
 from nfc_gym.measured.search import Found, Options, Search, State
-from nfc_gym.measured.settle import TURNS, settle, slack
+from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
@@ -65,6 +67,8 @@ def close_loop(
     overwrite: bool = False,
     resume: bool = True,
     fold: str | None = None,
+    posterior: Path | None = None,
+    compare: bool = False,
     console: Console | None = None,
 ) -> dict[str, Any]:
     """Close the loop on the logs that a mapping file names.
@@ -78,6 +82,9 @@ def close_loop(
       overwrite: replace an earlier run's results, once there are new ones.
       resume: go on from the last finished stage of an interrupted run.
       fold: only this fold.
+      posterior: of psi given a window of this machine's motion (see `belief`): calibration starts from it, and the
+        report shows what it inferred beside what was fitted.
+      compare: calibrate once more from nominal values, to say how much time the posterior saved.
       console: where progress goes; None is silent.
 
     Returns:
@@ -88,25 +95,28 @@ def close_loop(
     """
     require_writable(out)
     with one_blas_thread():
-        return _close_loop(mapping, out, seed, jobs, overwrite, resume, fold, console)
+        # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
+        mujoco.set_mju_user_warning(lambda message: None)
+        dataset = require(mapping)[0]
+        bench = make_bench(dataset, jobs)
+        if posterior is not None:
+            bench.belief, bench.compare = read_belief(posterior, bench.plant.space, seed), compare
+        _require_stable(bench)
+        key = _key(bench, seed, mapping, *([posterior] if posterior else []))
+        return _close_loop(bench, dataset, out, seed, key, overwrite, resume, fold, console)
 
 
 def _close_loop(
-    mapping: Path,
+    bench: Bench,
+    dataset: Dataset,
     out: Path,
     seed: int,
-    jobs: int,
+    key: str,
     overwrite: bool,
     resume: bool,
     fold: str | None,
     console: Console | None,
 ) -> dict[str, Any]:
-    # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
-    mujoco.set_mju_user_warning(lambda message: None)
-    dataset = require(mapping)[0]
-    bench = make_bench(dataset, jobs)
-    _require_stable(bench)
-    key = _key(bench, mapping, seed)
     folds = [dataset.fold(fold)] if fold is not None else list(dataset.folds)
     if len(dataset.folds) == 1:
         return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)
@@ -141,14 +151,14 @@ def _close_loop(
     return whole
 
 
-def _key(bench: Bench, mapping: Path, seed: int) -> str:
-    """Digest of all that a report depends on: mapping, model with what it includes, logs, splits, seed, versions."""
+def _key(bench: Bench, seed: int, *files: Path) -> str:
+    """Digest of all that a report depends on: files, model with what it includes, logs, splits, seed, versions."""
     dataset = bench.dataset
     splits = [[f.name, dict(f.splits)] for f in dataset.folds]
     versions = [version(p) for p in ("nfc_gym", "mujoco", "numpy", "scipy")]
     model = model_path(dataset.mapping.model_file, dataset.folder)
     extra = json.dumps([seed, versions, splits, fingerprint(bench.plant.model)])
-    return digest(mapping, model, *dataset.files, extra=extra)
+    return digest(*files, model, *dataset.files, extra=extra)
 
 
 def _require_stable(bench: Bench) -> None:
@@ -195,6 +205,7 @@ def _fold(
     pool = candidates(bench, [*fitting, *selecting])
     known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
     outcome = report(bench, fold, found, final, step, bench.problem(verifying), whole, seed, tell)
+    outcome["posterior"] = compared(bench, stages.get("calibrated"), extended, whole, outcome["parameters"])
     outcome["identifiability"] = table(known.lens, pool, known.stakes)
     advice = advise(bench, [*fitting, *selecting], outcome, known, tell, seed)
     outcome["identifiability"] = advice.rows
@@ -214,21 +225,13 @@ def _fold(
     return outcome
 
 
-def _calibrate(run: _Run, problem: Problem) -> Array:
-    """(d,) psi, fitted alone."""
-    plant = run.bench.plant
-    tick = lambda turn: run.say(f"calibrating psi, pass {turn} of at most {TURNS}")  # noqa: E731
-    sigma = problem.covariance(plant, plant.null)
-    return settle(problem, sigma, plant, plant.null, run.seed, tick=tick)[0].x
-
-
 def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     """Calibrate, then search; a stage after calibration and after every round. A resumed run goes on from the last."""
     bench, plant = run.bench, run.bench.plant
     run.say(f"{len(work)} segments to fit, {len(select)} to select on")
     # A stage is read back from what is kept of it, just now or by an earlier process: both go on from the same bits.
     if run.stages.get("calibrated") is None:
-        run.stages.put("calibrated", {"x": _calibrate(run, work).tolist()})
+        run.stages.put("calibrated", calibrate(work, plant, run.seed, run.say, bench.belief, bench.compare))
     x = np.array(run.stages.get("calibrated")["x"], float)
     sigma = work.covariance(plant, x)
     calibrated = stand(work, metric(work, sigma), plant, x)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from nfc_gym import assets
 from nfc_gym.core import InputError
@@ -44,11 +45,23 @@ def read_spec(name: str, folder: Path) -> mujoco.MjSpec:
 
 
 def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
-    """The compiled model; raises `InputError` with MuJoCo's own words where it does not compile."""
+    """The compiled model.
+
+    Raises:
+      InputError: it does not compile, in MuJoCo's own words, or holds a number that is not finite.
+    """
     try:
-        return spec.compile()
+        model = spec.compile()
     except (ValueError, mujoco.FatalError) as e:
         raise InputError(f"model {name}: does not compile: {_one_line(e)}") from None
+    for owner, before in ((model.opt, "option "), (model, "")):
+        for field in dir(owner):
+            value = getattr(owner, field) if not field.startswith("_") else None
+            if isinstance(value, float | np.ndarray) and np.asarray(value).dtype.kind == "f":
+                odd = np.asarray(value)[~np.isfinite(value)]
+                if odd.size:
+                    raise InputError(f"model {name}: {before}{field} holds {odd.flat[0]}; want finite numbers")
+    return model
 
 
 def _one_line(error: Exception) -> str:

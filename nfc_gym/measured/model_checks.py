@@ -100,7 +100,7 @@ def _fields(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
 
 
 def _steps(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
-    """Physics steps in a segment and its history: a step far too short would fill the memory."""
+    """Physics steps in a segment and its history: a step far too short would fill the memory, a long one miss it."""
     segments = mapping.segments
     step = float(segments.timestep or model.opt.timestep)
     count = (segments.length + segments.history) / step if step > 0 else float("inf")
@@ -108,6 +108,9 @@ def _steps(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
         message = f"{segments.length:g} s and {segments.history:g} s of history are {count:.3g} steps of {step:g} s"
         advice = f"want at most {MOST_STEPS}: lengthen segments.timestep or the model's, or shorten the segments"
         yield Finding("error", "segments", message, advice)
+    if segments.mode == "rollout" and step > segments.length:
+        message = f"one step of {step:g} s is longer than a segment of {segments.length:g} s"
+        yield Finding("error", "segments", message, "give a shorter segments.timestep, or mend the model's")
 
 
 def _field_advice(field: str, model: mujoco.MjModel) -> str:

@@ -15,9 +15,10 @@ from nfc_gym.measured.bench import Bench, candidates
 from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.distances import Ask, Model
 from nfc_gym.measured.export import unpack
-from nfc_gym.measured.fisher import Lens, flat, realistic, sized, without
+from nfc_gym.measured.fisher import Lens, flat, realistic, without
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import loss, metric
+from nfc_gym.measured.screen import sized
 from nfc_gym.measured.search import Options
 from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.stakes import Stakes

@@ -48,6 +48,7 @@ def render(report: Row, shown: Row) -> str:
         effects=[_effect(e, report["effects"]) for e in report.get("effects") or []],
         proposals=[_effect(e, report["proposals"]) for e in report.get("proposals") or []],
         parameters=[_parameter(p) for p in report.get("parameters") or []],
+        posterior=story.believed(report.get("posterior")),
         rounds=[_round(r) for r in report.get("rounds") or []],
         places=_misfit_rows(misfit, "place", stages),
         logs_misfit=_misfit_rows(misfit, "log", stages),
@@ -173,7 +174,9 @@ def _effect(effect: Row, effects: Sequence[Row]) -> Row:
 def _parameter(p: Row) -> Row:
     value, span = wording.interval(p.get("estimate"), p.get("low"), p.get("high"))
     change = wording.change(p.get("nominal"), p.get("estimate"))
-    return p | {"value": value, "interval": span, "change": change}
+    told = p.get("inferred") or {}
+    median, inferred = wording.interval(told.get("median"), told.get("low"), told.get("high"))
+    return p | {"value": value, "interval": span, "change": change, "inferred": f"{median} ({inferred})"}
 
 
 def _round(r: Row) -> Row:

@@ -51,10 +51,20 @@ class Contest:
       screen, screened: their screening, the leading ones looked at closely.
       short: how many are refitted.
       worth: share of the misfit that an effect must explain to be named.
+      pool: all effects that may be named, screened or not.
     """
 
-    def __init__(self, arena: Arena, screen: Screen, screened: Sequence[Screened], short: int, worth: float) -> None:
+    def __init__(
+        self,
+        arena: Arena,
+        screen: Screen,
+        screened: Sequence[Screened],
+        short: int,
+        worth: float,
+        pool: Sequence[Effect] = (),
+    ) -> None:
         self.arena, self.screen, self.screened, self.short, self.worth = arena, screen, screened, short, worth
+        self.pool = {e.id: e for e in pool}
         self.rough = arena.fit_data.problem.rough
 
     def hold(self) -> tuple[Round, Judged | None]:
@@ -95,7 +105,9 @@ class Contest:
             return outcome, None
         outcome.accepted = [e.id for e in arena.new(best)]
         outcome.share = best.gain / max(float(arena.base.sum()), 1e-9)
-        outcome.equivalents = self._equivalents(judged, best, believed[0])
+        again = {arena.label(j) for j in judged}  # the others' fits are a first look
+        outcome.equivalents = [i for i in alike[len(outcome.accepted) :] if i in again]
+        outcome.equivalents += [i for i in self._known_as(best) if i not in outcome.equivalents]
         arena.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best
 
@@ -129,6 +141,14 @@ class Contest:
             for j in rivals
             if not any(contains(e, w) for e in arena.new(j) for laws in plainer for w in laws if w is not e)
         ]
+
+    def _known_as(self, best: Judged) -> list[str]:
+        """Ids of effects that are the accepted law by another name, whether or not they were screened in full."""
+        if not self.pool:
+            return []
+        thetas = dict(zip(map(id, best.fitted.plant.effects), best.fitted.plant.split(best.fitted.x)[1], strict=True))
+        names = [f"{family}:{e.place}" for e in self.arena.new(best) for family in e.known_as(thetas[id(e)])]
+        return [i for i in names if i in self.pool]
 
     def _apart(self, judged: Sequence[Judged]) -> list[Judged]:
         """Values of their own at each place: for what was accepted before, and for the leading laws at several places.
@@ -209,11 +229,21 @@ class Contest:
         return min(rivals, key=lambda j: (len(j.fitted.x), -len(arena.new(j)[0].where), -j.total))
 
     def _plainer(self, law: Effect) -> list[list[Screened]]:
-        """The sets of plainer laws that a law contains, screened at its place."""
+        """The sets of plainer laws that a law contains, screened at its place.
+
+        In a large pool they may have been left out of the screening, one by one, for all that they do together.
+        """
         by_id = {s.effect.id: s for s in self.screened}
+
+        def part(family: str) -> Screened | None:
+            name = f"{family}:{law.place}"
+            if name not in by_id and name in self.pool:
+                by_id[name] = self.screen.try_one(self.pool[name])
+            return by_id.get(name)
+
         out = []
         for families in law.simpler:
-            parts = [by_id[i] for f in families if (i := f"{f}:{law.place}") in by_id]
+            parts = [p for p in map(part, families) if p is not None]
             if isinstance(law, Each):
                 apart = [split(p.effect, self.screen.current.plant) for p in parts]
                 parts = [self.screen.try_one(a[0]) for a in apart if a is not None]

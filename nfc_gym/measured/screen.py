@@ -20,6 +20,7 @@ from nfc_gym.physics.effects.base import Effect, overrides
 
 Array = NDArray[np.float64]
 _FAR = 4.0  # probing sizes beyond which a secant is not believed
+_SHARES = (0.125, 0.25, 0.5, 1.0)  # of a realistic size that a scout tries with all else as it is
 _SCOUT = 0.7  # spread of a scout's draws, in scaled parameters
 
 
@@ -76,6 +77,26 @@ def probe_sets(effect: Effect, every_size: bool = True) -> list[Array]:
     return sets
 
 
+def sized(effect: Effect, theta: Array, share: float) -> Array:
+    """The effect's parameters (k,) at a share of the size that theta has, along the coordinates that a fit walks in."""
+    null = effect.null.copy()
+    shape = np.array([p.shape for p in effect.params])
+    null[shape] = theta[shape]
+    start = effect.chart(null)
+    return np.asarray(effect.unchart(start + share * (effect.chart(theta) - start)), np.float64)
+
+
+def ladder(effect: Effect, theta: Array) -> Array:
+    """(r, k) parameters at shares of a realistic size, to the side of null and with the shape that theta (k,) has."""
+    whole = theta.copy()
+    for i, p in enumerate(effect.params):
+        if not p.shape:
+            away = p.probes[len(p.probes) // 2] - p.null
+            whole[i] = p.null + (-away if (theta[i] - p.null) * away < 0 else away)
+    whole = np.clip(whole, effect.low, effect.high)
+    return np.stack([sized(effect, whole, share) for share in _SHARES])
+
+
 class Screen:
     """Screening against one fitted model: its residual, weights, and the tangent space of what is already fitted."""
 
@@ -121,14 +142,16 @@ class Screen:
         """Look around where a candidate's screening points, in all free parameters, and keep the best that was seen.
 
         Where bodies touch, straight lines from two probes lead astray: slip, for one, helps only with more friction
-        than a model without slip can bear.
+        than a model without slip can bear; and half the realistic size of a limit that few blocks reach may gain all
+        that there is to gain, where the whole size gains nothing.
         """
         plant = self.current.plant.with_effects([*self.current.plant.effects, found.effect])
         before, after = box(self.current.plant), box(plant)
         here = before.at(self.current.x)
-        starts = [
-            np.concatenate([before.x(here + s, self.current.x), found.theta]) for s in (0 * found.shift, found.shift)
-        ]
+        moved = np.concatenate([before.x(here + found.shift, self.current.x), found.theta])
+        rungs = [np.concatenate([self.current.x, t]) for t in (found.theta, *ladder(found.effect, found.theta))]
+        values = loss(self.metric.whiten(self.problem.residual(plant, np.stack(rungs)))).sum(-1)
+        starts = [rungs[int(values.argmin())], moved]
         z = np.stack([after.at(x) for x in starts])
         around = z[rng.integers(2, size=draws)] + _SCOUT * rng.normal(size=(draws, z.shape[1]))
         z = np.clip(np.concatenate([z, around]), after.floor, after.roof)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.contest import Judged
-from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.fit import Fit, differs, fit
 from nfc_gym.measured.halved import artefacts
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.metric import metric
@@ -126,7 +126,8 @@ class Search:
             arena = self._begin(state)
             screen = Screen(self.fit_data.problem, arena.under, arena.current)
             screened = self.lookout.closer(screen, self.lookout.screen(screen, self.named))
-            outcome, best = Contest(arena, screen, screened, self.options.short, self.options.worth).hold()
+            contest = Contest(arena, screen, screened, self.options.short, self.options.worth, self.named)
+            outcome, best = contest.hold()
             rounds.append(outcome)
             full = len(arena.current.plant.effects) >= self.options.most
             better = best.fitted if best is not None and not full else self._exchange(arena, rounds)
@@ -160,14 +161,22 @@ class Search:
         return out
 
     def _confirmed(self, arena: Arena, rounds: list[Round]) -> Arena:
-        """The arena without the effects that do not outlive half the physics step."""
-        while found := artefacts(arena, self.options.worth):
-            reason = f"dropped {found[0].id}: at half the physics step it explains nothing worth naming"
+        """The arena without the effects that do not outlive half the physics step, or whose sizes may be nothing."""
+        while doubt := self._doubtful(arena):
+            effect, why = doubt
+            reason = f"dropped {effect.id}: {why}"
             self.say(reason)
             rounds.append(Round([], 0.0, reason=reason))
-            bare = arena.without(found[0]).current
+            bare = arena.without(effect).current
             arena = self.settle(bare.plant, bare.x, polished=True)
         return arena
+
+    def _doubtful(self, arena: Arena) -> tuple[Effect, str] | None:
+        """An accepted effect that had better not be claimed, and why."""
+        if found := artefacts(arena, self.options.worth):
+            return found[0], "at half the physics step it explains nothing worth naming"
+        vague = [e for e in arena.current.plant.effects if not differs(arena.current, arena.blocks[0], e)]
+        return (vague[-1], "its fitted sizes do not differ from nothing") if vague else None
 
     def _exchange(self, arena: Arena, rounds: list[Round]) -> Fit | None:
         """A model in which another law took the place of an earlier one, if that is clearly better."""

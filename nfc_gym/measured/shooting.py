@@ -196,6 +196,10 @@ class RolloutProblem(Problem):
         """See `Problem`."""
         return self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
 
+    def touches(self, plant: Plant, x: Array) -> bool:
+        """Whether bodies touch in any roll-out at x (size,)."""
+        return bool(plant.shoot(x[None], self.segments).touched.any())
+
     def covariance(self, plant: Plant, x: Array) -> Array:
         """Sensor noise, start-state noise carried through the roll-out, and the discretisation's own error.
 
@@ -302,11 +306,15 @@ class RolloutProblem(Problem):
             noisy = quat_multiply(clean, vector_to_quat(noise)) if o.quaternion else clean + noise
             measured.append(noisy[stable])
             at += width
-        dq, dv = (rng.normal(size=sd.shape) * sd for sd in out._start_sd)
         out._measured = measured
-        out.segments = replace(
-            out.segments, qpos=integrate(self._kit.model, out.segments.qpos, dq), qvel=out.segments.qvel + dv
-        )
+        return out.redrawn(rng)
+
+    def redrawn(self, rng: np.random.Generator) -> "RolloutProblem":
+        """The same measurements, begun at starts that are off by as much again as the measured ones may be."""
+        out = self.take(np.arange(len(self)))
+        dq, dv = (rng.normal(size=sd.shape) * sd for sd in self._start_sd)
+        starts = self.segments
+        out.segments = replace(starts, qpos=integrate(self._kit.model, starts.qpos, dq), qvel=starts.qvel + dv)
         return out
 
 

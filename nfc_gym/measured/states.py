@@ -1,6 +1,6 @@
 """States of the model along a log, from whatever channels measure them, with the uncertainty that measuring leaves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -43,14 +43,15 @@ def channel_noise(log: Log, name: str) -> float:
     return estimate_noise(channel.values[index])
 
 
-def _smooth(log: Log, channel: Channel, values: Array, points: int) -> Local:
-    index = fresh_samples(log.time, channel.values, channel.rate)
-    return local_polynomial(log.time[index], values.reshape(len(log), -1)[index], log.time, points)
+def _smooth(log: Log, channel: Channel, values: Array, points: int, raw: bool) -> Local:
+    index, wide = fresh_samples(log.time, channel.values, channel.rate), values.reshape(len(log), -1)
+    fit = local_polynomial(log.time[index], wide[index], log.time, points)
+    return replace(fit, value=wide) if raw and len(index) == len(log) else fit
 
 
 class _Builder:
-    def __init__(self, model: mujoco.MjModel, log: Log, points: int) -> None:
-        self.model, self.log, self.points = model, log, points
+    def __init__(self, model: mujoco.MjModel, log: Log, points: int, raw: bool) -> None:
+        self.model, self.log, self.points, self.raw = model, log, points, raw
         rows = len(log)
         self.qpos = np.tile(model.qpos0, (rows, 1))
         self.qvel, self.qacc = np.zeros((rows, model.nv)), np.zeros((rows, model.nv))
@@ -70,13 +71,13 @@ class _Builder:
         self.observed[v] = position is not None or speed is not None
         if position is not None:
             key, channel = position
-            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points)
+            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points, self.raw)
             self.qpos[:, q], self.qpos_sd[:, v] = fit.value[:, 0], noise * fit.value_gain
             self.qvel[:, v], self.qvel_sd[:, v] = fit.slope[:, 0], noise * fit.slope_gain
             self.qacc[:, v] = fit.curvature[:, 0]
         if speed is not None:
             key, channel = speed
-            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points)
+            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points, self.raw)
             self.qvel[:, v], self.qvel_sd[:, v], self.qacc[:, v] = (
                 fit.value[:, 0],
                 noise * fit.value_gain,
@@ -104,7 +105,7 @@ class _Builder:
             self._vector(key, channel, values, v + 3)
         if position is not None:
             key, channel = position
-            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points)
+            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points, self.raw)
             self.qpos[:, q : q + 3], self.qpos_sd[:, v : v + 3] = fit.value, noise * fit.value_gain[:, None]
             self.qvel[:, v : v + 3], self.qvel_sd[:, v : v + 3] = fit.slope, noise * fit.slope_gain[:, None]
             self.qacc[:, v : v + 3] = fit.curvature
@@ -114,7 +115,7 @@ class _Builder:
             self._vector(key, channel, values, v)
 
     def _vector(self, key: str, channel: Channel, values: Array, v: int) -> None:
-        noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, values, self.points)
+        noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, values, self.points, self.raw)
         self.qvel[:, v : v + 3], self.qvel_sd[:, v : v + 3] = fit.value, noise * fit.value_gain[:, None]
         self.qacc[:, v : v + 3] = fit.slope
 
@@ -128,7 +129,7 @@ class _Builder:
         steps = quat_to_vector(quat_multiply(quat_conjugate(quat[index[:-1]]), quat[index[1:]]))
         # Body-frame increments add up to a curve whose slope is the body-frame rate to second order in the step.
         vectors[index[1:]] = np.cumsum(steps, 0)
-        fit = local_polynomial(self.log.time[index], vectors[index], self.log.time, self.points)
+        fit = _smooth(self.log, channel, vectors, self.points, self.raw)
         hold = index[np.searchsorted(index, np.arange(len(quat)), side="right") - 1]
         self.qpos[:, q + 3 : q + 7] = quat_multiply(quat[hold], vector_to_quat(fit.value - vectors[hold]))
         self.qpos_sd[:, v + 3 : v + 6] = noise * fit.value_gain[:, None]
@@ -136,16 +137,17 @@ class _Builder:
         self.qacc[:, v + 3 : v + 6] = fit.curvature
 
 
-def estimate_states(model: mujoco.MjModel, log: Log, points: int = 7) -> States:
+def estimate_states(model: mujoco.MjModel, log: Log, points: int = 7, raw: bool = False) -> States:
     """States along a log by local cubic fits to the channels that measure them.
 
     Args:
       points: samples in each local fit.
+      raw: take what was measured as it is, noise and all; what was not measured still comes from the fits.
 
     Raises:
       InputError: no channel of the log measures any degree of freedom of the model.
     """
-    build = _Builder(model, log, points)
+    build = _Builder(model, log, points, raw)
     for j in range(model.njnt):
         q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
         kind = int(model.jnt_type[j])

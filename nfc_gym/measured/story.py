@@ -72,6 +72,34 @@ def verdict_of(report: dict[str, Any]) -> Verdict:
     return VERDICTS.get(word, Verdict(word, "open", "?", ""))
 
 
+def believed(posterior: dict[str, Any] | None) -> dict[str, Any] | None:
+    """What calibration started from, if from a posterior: sentences, and both residual dynamics."""
+    parts = ("delta_s", "fitted_delta_s")
+    return posterior and {"sentences": _begun(posterior)} | {k: posterior.get(k) or [] for k in parts}
+
+
+def _begun(posterior: dict[str, Any]) -> list[str]:
+    """Where calibration began, what that was worth, and what the posterior speaks of in vain."""
+    misfit, seconds = posterior.get("misfit") or {}, posterior.get("seconds")
+    chosen = "the posterior" if posterior.get("start") == "posterior" else "nominal values, which fitted better"
+    told, given = (number(misfit.get(k)) for k in ("posterior", "nominal"))
+    out = [
+        f"Calibration began at {chosen} ({posterior.get('file')}): before any fitting the loss is {told} for each "
+        f"number compared, {given} at nominal values."
+    ]
+    saved = finite(posterior.get("seconds_saved"))
+    if saved is not None:
+        much = f"{quantity(abs(saved), 's')} {'saved' if saved >= 0 else 'lost'}"
+        alone = quantity(posterior.get("seconds_from_nominal"), "s")
+        out.append(f"It took {quantity(seconds, 's')}; from nominal values {alone}: {much}.")
+    elif finite(seconds) is not None:
+        out.append(f"It took {quantity(seconds, 's')}.")
+    others = posterior.get("not_declared") or []
+    if others:
+        out.append(f"The posterior also speaks of what is not declared here: {listed([str(n) for n in others], 6)}.")
+    return out
+
+
 def changes(report: dict[str, Any]) -> list[Change]:
     """Errors of every group at the longest horizon at which the calibrated model has one."""
     error = report.get("error") or {}

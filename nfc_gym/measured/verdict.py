@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from nfc_gym.core.errors import InputError
 from nfc_gym.measured.contest import bootstrap, clusters
 from nfc_gym.measured.fit import Fit, uncertainty
 from nfc_gym.measured.metric import metric
@@ -61,6 +62,9 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
     """Predict the verification logs with all three models, and what chi-squared a perfect model would show.
 
     The null replicas are the extended model's own motion with fresh noise, through the same pipeline.
+
+    Raises:
+      InputError: the extended model is unstable on all of these logs.
     """
     plant, x = models.extended
     sigma = problem.covariance(plant, x)
@@ -72,6 +76,11 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
     null = []
     for _ in range(replicas):
         twin = problem.synthetic(plant, x, rng)
+        if not len(twin):
+            raise InputError(
+                "the model that fits the other logs is unstable on every segment that verifies, at half the physics "
+                "step: look whether these logs are of the same machine, in the same units (`nfc-gym check`)"
+            )
         # Where bodies touch a covariance is dear, and a twin starts within the noise of what it is the twin of.
         alike = problem.rough and len(twin) == len(problem)
         under = measure if alike else metric(twin, twin.covariance(plant, x))
@@ -133,7 +142,7 @@ def spread(fitted: Fit, problem: Problem, step: Array) -> Array:
 
 
 def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any]]:
-    """Psi with intervals: estimate, 95 % bounds, whether the data show it, whether it left its prior; sd (size,)."""
+    """Psi with intervals: its place in the model, estimate, 95 % bounds, and whether the data show it; sd (size,)."""
     space = fitted.plant.space
     rows = []
     for i, p in enumerate(space.parameters):
@@ -142,6 +151,8 @@ def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any
             {
                 "name": p.name,
                 "unit": p.unit,
+                "field": p.field,
+                "of": list(p.of),
                 "nominal": float(nominal[i]),
                 "estimate": value,
                 "low": float(max(p.low, value - 1.96 * sd[i])),

@@ -9,17 +9,34 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def advance_activations(model: mujoco.MjModel, ctrl: Array, act: Array, dt: float, settle: bool) -> None:
-    """One step of first-order actuator states (..., na) under commands (..., nu), in place; `settle`: held for ever."""
-    filters = {int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)}
-    for i in range(model.nu):
-        if int(model.actuator_dyntype[i]) not in filters:
-            continue
-        limited = bool(model.actuator_ctrllimited[i])
-        target = np.clip(ctrl[..., i], *model.actuator_ctrlrange[i]) if limited else ctrl[..., i]
-        at = int(model.actuator_actadr[i])
-        keep = 0.0 if settle else float(np.exp(-dt / max(model.actuator_dynprm[i, 0], 1e-9)))
-        act[..., at] = target + keep * (act[..., at] - target)
+class Activations:
+    """First-order actuator states of a model, stepped outside of a simulation.
+
+    Args:
+      model: MuJoCo's dynamics of the types `filter` and `filterexact` are followed, and taken as exact.
+      dt: step, s.
+    """
+
+    def __init__(self, model: mujoco.MjModel, dt: float) -> None:
+        kinds = [int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)]
+        self._of = np.flatnonzero(np.isin(model.actuator_dyntype, kinds))
+        self._at = model.actuator_actadr[self._of]
+        limited = model.actuator_ctrllimited[self._of].astype(bool)
+        self._low, self._high = (
+            np.where(limited, model.actuator_ctrlrange[self._of, side], np.inf * sign)
+            for side, sign in ((0, -1), (1, 1))
+        )
+        self._keep = np.exp(-dt / np.maximum(model.actuator_dynprm[self._of, 0], 1e-9))
+
+    def __bool__(self) -> bool:
+        """Whether the model has any."""
+        return len(self._of) > 0
+
+    def advance(self, ctrl: Array, act: Array, settle: bool = False) -> None:
+        """One step of the states (..., na) under commands (..., nu), in place; `settle`: held for ever."""
+        if self:
+            target = np.clip(ctrl[..., self._of], self._low, self._high)
+            act[..., self._at] = target if settle else target + self._keep * (act[..., self._at] - target)
 
 
 def longest_delay(model: mujoco.MjModel) -> int:

@@ -89,6 +89,10 @@ class ModelFields:
         """How many simulations' fields these are; None for one model's own."""
         return self._target.nsim if isinstance(self._target, Batch) else None
 
+    def own(self, values: NDArray) -> NDArray:
+        """Of values (n, ...), one row for each simulation of the batch, those of the simulations of these fields."""
+        return values
+
     def nominal(self, name: str) -> NDArray:
         """The field in the unedited model, without batch dimension."""
         return np.asarray(
@@ -156,6 +160,10 @@ class RowFields(ModelFields):
     def count(self) -> int | None:
         """How many simulations' fields these are."""
         return len(self._ids)
+
+    def own(self, values: NDArray) -> NDArray:
+        """See `ModelFields`."""
+        return values[self._ids]
 
     def __getitem__(self, name: str) -> NDArray:
         """Copy of the simulations' values, (k, ...), to be written before `commit`."""

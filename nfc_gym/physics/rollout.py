@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.acting import Acting
-from nfc_gym.physics.activations import advance_activations, delayed, fill_delays, longest_delay
+from nfc_gym.physics.activations import Activations, delayed, fill_delays, longest_delay
 from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.fields import ModelFields
@@ -86,12 +86,14 @@ class Trajectory:
       qpos, qvel: (P, S, K + 1, nq), (P, S, K + 1, nv).
       sensordata: (P, S, K + 1, nsensordata), each at its own time, or None where not asked for.
       stable: (P, S) False where MuJoCo warned or a value is not finite; such rows hold no meaning.
+      touched: (P, S) whether bodies touched in any step.
     """
 
     qpos: Array
     qvel: Array
     sensordata: Array | None
     stable: NDArray[np.bool_]
+    touched: NDArray[np.bool_]
 
 
 class Plant:
@@ -195,6 +197,7 @@ class Plant:
             np.concatenate([p.qvel for p in parts]),
             np.concatenate([p.sensordata for p in parts if p.sensordata is not None]) if sensors else None,
             np.concatenate([p.stable for p in parts]),
+            np.concatenate([p.touched for p in parts]),
         )
 
     def _shoot(self, x: Array, segments: Segments, sensors: bool) -> Trajectory:
@@ -210,7 +213,9 @@ class _Run:
 
     def __init__(self, plant: Plant, rows: Array, count: int, segments: Segments, sensors: bool) -> None:
         self.plant, self.segments, self.sensors, self.count = plant, segments, sensors, count
+        self.copies = np.tile(np.arange(len(segments)), count)
         model = plant.model
+        self.activations = Activations(model, segments.dt)
         self.thetas = plant.split(rows)[1]
         self.batch = Batch(model, len(rows), plant.nthread)
         self.fields = ModelFields(self.batch, model)
@@ -220,14 +225,18 @@ class _Run:
         q, v = self._tile(segments.qpos), self._tile(segments.qvel)
         for effect, theta in zip(plant.effects, self.thetas, strict=True):
             q, v = effect.unsense(q, v, theta)
-        self.batch.qpos[...], self.batch.qvel[...] = q, v
+        # Live views: asking the batch for them anew costs as much as stepping a small machine.
+        self.qpos, self.qvel, self.ctrl, self.act = (self.batch.bind(n) for n in ("qpos", "qvel", "ctrl", "act"))
+        self.qpos[...], self.qvel[...] = q, v
         self.acting = Acting(model, plant.effects, self.thetas, self.fields, self.batch, segments.dt)
         self.reads = {s for e in plant.effects for s in e.signals}
+        self.contacts, self.touched = self.batch.bind("ncon"), np.zeros(len(rows), bool)
         if sensors:
             self.batch.bind("sensordata")
 
     def _tile(self, array: Array) -> Array:
-        return np.broadcast_to(array, (self.count, *array.shape)).reshape(self.count * len(array), *array.shape[1:])
+        """(P S, ...) copies of a segment's values (S, ...) for every parameter vector."""
+        return array[self.copies]
 
     def _write_known(self) -> list[tuple[Any, Array]]:
         """Constant known fields are written once; those that vary through a segment are returned."""
@@ -247,7 +256,7 @@ class _Run:
 
     def _exogenous(self, k: int) -> dict[str, Array]:
         signals = self.segments.exogenous
-        return {n: self._tile(signals[n][:, self.segments.history + k]) for n in signals if n in self.reads}
+        return {n: self._tile(signals[n][:, self.segments.history + k]) for n in self.reads & signals.keys()}
 
     def _serve(self, k: int, ctrl: Array, q: Array, v: Array) -> Array:
         """Firmware servos turn targets into commands."""
@@ -269,18 +278,19 @@ class _Run:
         qpos, qvel = np.empty((steps + 1, rows, model.nq)), np.empty((steps + 1, rows, model.nv))
         sensed = np.empty((steps + 1, rows, model.nsensordata)) if self.sensors else None
         if self.segments.settle:
-            start = batch.qpos.copy()
+            start = self.qpos.copy()
             for k in range(self.segments.settle):
                 self._advance(0, first=k == 0)
-            batch.qpos[...] = start
+            self.qpos[...] = start
             batch.qacc_warmstart[...] = 0
             self.acting.derived.clear()
         for k in range(steps):
-            qpos[k], qvel[k] = batch.qpos, batch.qvel
+            qpos[k], qvel[k] = self.qpos, self.qvel
             self._advance(k, first=k == 0)
+            self.touched |= self.contacts > 0
             if sensed is not None:
                 sensed[k] = batch.sensordata
-        qpos[steps], qvel[steps] = batch.qpos, batch.qvel
+        qpos[steps], qvel[steps] = self.qpos, self.qvel
         if sensed is not None:
             batch.forward()
             sensed[steps] = batch.sensordata
@@ -295,20 +305,30 @@ class _Run:
             for k in range(lead.shape[1]):
                 acting.command(self._tile(lead[:, k]), signals, step)
             acting.settle_quick()
-        model, recent = self.plant.model, deque[Array](maxlen=longest_delay(self.plant.model) + 1)
+        model = self.plant.model
+        tracking = past is not None and bool(acting.tracking)
+        longest = longest_delay(model)
+        if not (acting.commanding or tracking or self.activations or longest):
+            return  # nothing that remembers
+        recent = deque[Array](maxlen=longest + 1)
+        # Without an effect on them commands are the same for every parameter vector.
+        alike = not (acting.commanding or tracking)
+        act = np.zeros((len(segments), model.na)) if alike else self.act
         for k in range(-segments.history, 0):
             exogenous = self._exogenous(k)
-            ctrl = self._command(k, exogenous)
+            ctrl = segments.ctrl[:, segments.history + k] if alike else self._command(k, exogenous)
             recent.append(ctrl)
-            settle = k == -segments.history
-            advance_activations(model, delayed(model, recent, segments.dt), self.batch.act, segments.dt, settle)
-            if past is not None and acting.tracking:
+            self.activations.advance(delayed(model, recent, segments.dt), act, settle=k == -segments.history)
+            if past is not None and tracking:
                 q, v = map(self._tile, past.motion(k + segments.history))
                 for effect, theta in zip(self.plant.effects, self.thetas, strict=True):
                     if overrides(effect, "unsense"):
                         q, v = effect.unsense(q, v, theta)
                 acting.recall(q, v, self._serve(k, ctrl, q, v), exogenous)
-        if recent and longest_delay(model):
+        if alike and segments.history:
+            self.act[...] = self._tile(act)
+            recent = deque(map(self._tile, recent))
+        if recent and longest:
             fill_delays(model, recent, self.batch.bind("history"))
 
     def _advance(self, k: int, first: bool) -> None:
@@ -316,16 +336,16 @@ class _Run:
         model, batch, exogenous = self.plant.model, self.batch, self._exogenous(k)
         for bound, values in self.varying:
             write_field(self.fields, bound, self._tile(values[:, self.segments.history + k]))
-        batch.ctrl[...] = self._serve(k, self._command(k, exogenous), batch.qpos, batch.qvel)
+        self.ctrl[...] = self._serve(k, self._command(k, exogenous), self.qpos, self.qvel)
         # Without a history actuator states begin settled.
         if first and self.segments.history == 0 and self.segments.settle == 0:
-            advance_activations(model, batch.ctrl, batch.act, self.segments.dt, settle=True)
+            self.activations.advance(self.ctrl, self.act, settle=True)
             if longest_delay(model):
-                fill_delays(model, [batch.ctrl], batch.bind("history"))
+                fill_delays(model, [self.ctrl], batch.bind("history"))
         if self.acting.pushing:
             batch.qfrc_applied[...] = 0
             batch.xfrc_applied[...] = 0
-        self.acting.push(batch.ctrl, exogenous)
+        self.acting.push(self.ctrl, exogenous)
         batch.step()
 
     def _result(self, qpos: Array, qvel: Array, sensed: Array | None) -> Trajectory:
@@ -338,5 +358,6 @@ class _Run:
             return np.ascontiguousarray(a.reshape(len(a), self.count, size, -1).transpose(1, 2, 0, 3))
 
         return Trajectory(
-            shape(qpos), shape(qvel), None if sensed is None else shape(sensed), stable.reshape(self.count, size)
-        )
+            shape(qpos), shape(qvel), None if sensed is None else shape(sensed),
+            stable.reshape(self.count, size), self.touched.reshape(self.count, size),
+        )  # fmt: skip

@@ -53,7 +53,11 @@ def test_duration_and_interval() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"time": np.array([0.0, 0.2, 0.1])}, "time must increase, but goes from 0.2 to 0.1 s at row 2"),
+        (
+            {"time": np.array([0.0, 0.2, 0.1])},
+            "time must increase, by 1e-09 s or more, but goes from 0.2 to 0.1 s at row 2",
+        ),
+        ({"time": 1e-300 * np.arange(3)}, "by 1e-09 s or more, but goes from 0 to 1e-300 s at row 1"),
         ({"time": np.array([0.0, 0.1, 0.1])}, "from 0.1 to 0.1 s at row 2"),
         ({"time": np.array([0.0])}, "two or more samples"),
         ({"time": np.zeros((4, 2))}, "must be a vector"),

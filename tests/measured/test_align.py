@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from nfc_gym.core import InputError
@@ -19,7 +19,6 @@ def stream(name: str, seconds: np.ndarray, delay: float = 0.0, **columns: np.nda
     return Stream(name, stamps, stamps + round(delay * NS), "header.stamp", columns)
 
 
-@settings(deadline=None)
 @given(
     rate=st.floats(20, 400), base=st.floats(20, 400), offset=st.floats(0, 0.5), jitter=st.floats(0, 0.4),
     frequency=st.floats(0.1, 3), seed=st.integers(0, 2**32 - 1),

@@ -184,7 +184,7 @@ def test_a_folder_whose_files_hold_less_than_it_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=st.binary(min_size=1, max_size=300), honest=st.booleans())
 def test_garbage_never_raises_anything_else(tmp_path: Path, suffix: str, content: bytes, honest: bool) -> None:
     magic = {".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\x00", ".bag": b"#ROSBAG V2.0\n"}[suffix]
@@ -194,7 +194,7 @@ def test_garbage_never_raises_anything_else(tmp_path: Path, suffix: str, content
         read_table(path)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_refused_or_harmless(tmp_path: Path, at: float, bit: int) -> None:
     path = tmp_path / "run" / "run.mcap"

@@ -152,6 +152,12 @@ def test_a_model_that_does_not_compile(build: Build) -> None:
     assert "does not compile" in found or "not a model" in found
 
 
+def test_a_model_with_a_number_that_is_not_finite(build: Build) -> None:
+    body = "<body name='a'><joint/><geom size='0.1' mass='{}'/></body>"
+    found = "\n".join(errors(build(model=f"<mujoco><worldbody>{body.format('inf')}</worldbody></mujoco>")))
+    assert "body_inertia holds inf" in found
+
+
 def test_too_few_logs_to_split(build: Build) -> None:
     found = "\n".join(errors(build(logs=2)))
     assert "2 logs cannot be split 3 ways" in found

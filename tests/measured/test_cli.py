@@ -78,15 +78,13 @@ def test_check_of_a_truncated_parquet_file(tmp_path: Path, build: Build) -> None
 
 def test_options_reach_the_loop(loop: Any) -> None:
     calls = loop(None)
-    assert (
-        call("close-loop", "m.yaml", "--out", "o", "--seed", 3, "--jobs", 2, "--no-resume", "--fold", "a").exit_code
-        == 0
-    )
+    words = ["m.yaml", "--out", "o", "--seed", 3, "--jobs", 2, "--no-resume", "--fold", "a", "--posterior", "p.npz"]
+    assert call("close-loop", *words, "--time-saved").exit_code == 0
     (options,) = calls
     options.pop("console")
     assert options == {
         "mapping": Path("m.yaml"), "out": Path("o"), "seed": 3, "jobs": 2,
-        "overwrite": False, "resume": False, "fold": "a",
+        "overwrite": False, "resume": False, "fold": "a", "posterior": Path("p.npz"), "compare": True,
     }  # fmt: skip
 
 

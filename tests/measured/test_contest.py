@@ -19,6 +19,8 @@ from nfc_gym.measured.contest import (
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import loss, metric
 from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.measured.rounds import Contest
+from nfc_gym.physics.effects import FAMILIES
 
 
 class Line(Problem):
@@ -215,3 +217,13 @@ def test_friction_in_four_dresses_counts_as_one_mechanism_at_one_place() -> None
     assert [(s.effect.family, s.gain) for s in picked] == [
         ("stribeck", 100), ("coulomb", 90), ("load_friction", 70), ("slip", 10),
     ]  # fmt: skip
+
+
+def test_plainer_laws_are_tried_though_screening_left_them_out() -> None:
+    """Friction by direction is dry friction and a preload together, neither of which leads alone in a large pool."""
+    law, coulomb, force = (FAMILIES[f](("hinge",)) for f in ("directional_friction", "coulomb", "external_force"))
+    screen = SimpleNamespace(try_one=lambda effect: SimpleNamespace(effect=effect))
+    arena = SimpleNamespace(fit_data=SimpleNamespace(problem=SimpleNamespace(rough=False)))
+    contest = Contest(arena, screen, [], 8, 0.02, [law, coulomb, force])  # pyright: ignore[reportArgumentType]
+    sets = [[p.effect for p in parts] for parts in contest._plainer(law)]
+    assert sets == [[coulomb], [coulomb, force]]

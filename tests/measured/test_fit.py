@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
-from nfc_gym.measured.fit import Fit, box, fit, jacobian, uncertainty
+from nfc_gym.measured.fit import Fit, box, differs, fit, jacobian, uncertainty
 from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
+from nfc_gym.physics.effects import build as build_effect
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -96,6 +97,33 @@ def test_more_data_narrow_the_uncertainty(fitted: tuple[RolloutProblem, Metric, 
     n = len(problem)
     four = Fit(result.plant, result.x, np.tile(result.white, (4, 1)), np.tile(result.jacobian, (4, 1, 1)))
     np.testing.assert_allclose(uncertainty(four, np.arange(4 * n)), uncertainty(result, np.arange(n)) / 2, rtol=0.02)
+
+
+@pytest.mark.parametrize(("sizes", "shown"), [((0.02, 0.0), True), ((0.0, 0.0), False), ((1e-6, 0.0), False)])
+def test_sizes_differ_from_nothing_together(sizes: tuple[float, float], shown: bool) -> None:
+    """Two numbers that can stand in for each other: each is uncertain, their sum is not."""
+    _, plant, _ = build()
+    law = build_effect("damping_poly", "hinge", {"linear": 0.0, "quadratic": 0.0, "cubic": 0.0})[0]
+    plant = plant.with_effects([law])
+    rng = np.random.default_rng(2)
+    slopes = rng.normal(size=(40, 6, 5)) * [100.0, 100.0, 30.0, 0.01, 0.0]
+    slopes[..., 3] += slopes[..., 2]
+    x = np.concatenate([plant.space.nominal, sizes, [0.0]])
+    white = rng.normal(size=(40, 6))
+    fitted = Fit(plant, x, white, slopes)
+    assert differs(fitted, np.arange(40), law) == shown
+    assert not (np.abs(x[3:4]) > 2 * uncertainty(fitted, np.arange(40))[2:4]).any()
+
+
+def test_sizes_differ_though_clusters_are_fewer_than_they() -> None:
+    """A law of three sizes is not judged by two clusters: here they scatter in no direction at all."""
+    _, plant, _ = build()
+    law = build_effect("damping_poly", "hinge", {"linear": 0.0, "quadratic": 0.0, "cubic": 0.0})[0]
+    plant = plant.with_effects([law])
+    rng = np.random.default_rng(4)
+    x = np.concatenate([plant.space.nominal, [0.02, 0.02, 0.02]])
+    fitted = Fit(plant, x, np.zeros((40, 6)), 100 * rng.normal(size=(40, 6, 5)))
+    assert differs(fitted, np.arange(40) % 2, law)
 
 
 @pytest.mark.parametrize("start", [[0.25, 0.0], [0.95, 0.45], [0.5, 0.05]])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+from nfc_gym.adaptation.extended import read_found
 from nfc_gym.core import InputError
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.predict import predict
@@ -126,6 +127,7 @@ def test_the_hidden_friction_is_found_and_sized(closed: Closed) -> None:
     assert level["low"] < level["value"] < level["high"]
     (damping,) = report["parameters"]
     assert damping["estimate"] == pytest.approx(DAMPING, rel=0.15)
+    assert (damping["field"], damping["of"]) == ("dof_damping", ["hinge"])
     assert damping["identifiable"]
     assert not damping["left_prior"]
     chi2 = report["chi2"]
@@ -201,6 +203,11 @@ def test_effects_and_fit_files_agree_with_the_report(closed: Closed) -> None:
     assert fitted["calibrated"]["effects"] == []
     assert len(fitted["extended"]["effects"]) == 1
     assert fitted["extended"]["psi"]["damping"] == pytest.approx(closed.report["parameters"][0]["estimate"])
+    found = read_found(closed.out)  # what a policy is adapted to
+    assert [(n.id, n.effect.where) for n in found.effects] == [("coulomb:hinge", ("hinge",))]
+    assert [(p.field, p.of, p.value) for p in found.parameters] == [
+        ("dof_damping", ("hinge",), closed.report["parameters"][0]["estimate"])
+    ]
     page = (closed.out / "report.html").read_text()
     assert page.rstrip().endswith("</html>")
     assert not list(closed.out.rglob("*.part"))

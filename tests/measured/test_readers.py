@@ -60,7 +60,7 @@ def test_an_empty_file_is_refused(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".npz", ".mat"])
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=st.binary(min_size=1, max_size=300))
 def test_garbage_never_raises_anything_else(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"log{suffix}"

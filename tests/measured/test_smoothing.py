@@ -10,7 +10,7 @@ from nfc_gym.measured.smoothing import estimate_noise, fresh_samples, local_poly
 uneven = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.015, 80))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.lists(st.floats(-3, 3), min_size=4, max_size=4),
     st.integers(5, 11),

@@ -92,7 +92,7 @@ def test_what_pyulog_saves_of_a_log_that_was_cut_off_is_read(tmp_path: Path) -> 
     assert set(lengths) == {0, 1}
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=st.binary(min_size=1, max_size=300), honest=st.booleans())
 def test_garbage_never_raises_anything_else(tmp_path: Path, content: bytes, honest: bool) -> None:
     path = tmp_path / "log.ulg"
@@ -101,7 +101,7 @@ def test_garbage_never_raises_anything_else(tmp_path: Path, content: bytes, hone
         read_table(path)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_refused_or_harmless(tmp_path: Path, at: float, bit: int) -> None:
     path = tmp_path / "log.ulg"

@@ -6,6 +6,7 @@ import pytest
 from machines import make, plant_of, run
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects import build
 from nfc_gym.physics.rollout import Segments
 
 DT, MASS = 0.002, 2.0
@@ -32,6 +33,14 @@ def test_gain_and_loss_scale_the_force() -> None:
     np.testing.assert_allclose(_made("gain", {"gain": 1.3}, NOISE), 1.3 * NOISE)
     np.testing.assert_allclose(_made("loss", {"fraction": 0.4}, NOISE), 0.6 * NOISE)
     np.testing.assert_array_equal(_made("loss", {"fraction": 1.0}, NOISE), 0 * NOISE)
+
+
+@pytest.mark.parametrize(("fraction", "names"), [(0.4, ("gain",)), (0.9, ())])
+def test_a_loss_is_a_gain_below_one_by_another_name(fraction: float, names: tuple[str, ...]) -> None:
+    loss, gain = build("loss", "push", {"fraction": fraction})[0], build("gain", "push", {"gain": 1.0})[0]
+    assert loss.known_as(np.array([fraction])) == names  # a gain below 0.2 is no gain
+    assert gain.known_as(np.array([1 - fraction])) == ("loss",)
+    assert gain.known_as(np.array([1 + fraction])) == ()
 
 
 def test_gain_scales_a_servo_as_a_whole() -> None:

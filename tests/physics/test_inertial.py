@@ -35,7 +35,7 @@ def _edited(family: str, parameters: dict[str, float], text: str = BARE) -> mujo
     return model
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(0, 5), st.tuples(*[st.floats(-0.4, 0.4)] * 3))
 def test_payload_is_a_welded_point_mass(mass: float, place: tuple[float, float, float]) -> None:
     """Mass matrix, centre and inertia equal those of MuJoCo's own compilation of a point mass in a child body."""
@@ -108,7 +108,7 @@ def test_principal_of_a_diagonal_matrix_is_itself_bit_for_bit() -> None:
         np.testing.assert_array_equal(quat, [1, 0, 0, 0])
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-1, 1), min_size=9, max_size=9))
 def test_principal_rebuilds_the_matrix(values: list[float]) -> None:
     root = np.array(values).reshape(3, 3)

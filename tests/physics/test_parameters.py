@@ -80,7 +80,7 @@ def test_writing_starts_from_nominal_and_does_not_compound() -> None:
         np.testing.assert_array_equal(getattr(model, name), getattr(MODEL, name), err_msg=name)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 2**31))
 def test_single_model_equals_the_batch(seed: int) -> None:
     psi = SPACE.sample(np.random.default_rng(seed), 3)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from machines import candidates, plant_of, probe, zoo, zoo_segments
 
+from nfc_gym.physics.activations import Activations
 from nfc_gym.physics.effects import Effect, build
 from nfc_gym.physics.effects.base import Context, Forces, Param
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
-from nfc_gym.physics.rollout import Plant, Segments, Servo, advance_activations
+from nfc_gym.physics.rollout import Plant, Segments, Servo
 
 MODEL = zoo()
 NONE = np.zeros((1, 0))
@@ -22,9 +23,9 @@ def _plain(model: mujoco.MjModel, segments: Segments, s: int) -> tuple[np.ndarra
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = segments.qpos[s], segments.qvel[s]
     for k in range(segments.history):
-        advance_activations(model, segments.ctrl[s, k], data.act, segments.dt, settle=k == 0)
+        Activations(model, segments.dt).advance(segments.ctrl[s, k], data.act, settle=k == 0)
     if segments.history == 0:
-        advance_activations(model, segments.ctrl[s, 0], data.act, segments.dt, settle=True)
+        Activations(model, segments.dt).advance(segments.ctrl[s, 0], data.act, settle=True)
     rows = []
     for k in range(segments.steps):
         before = data.qpos.copy(), data.qvel.copy()
@@ -152,7 +153,7 @@ def test_known_fields_follow_the_log() -> None:
     model, data = zoo(), mujoco.MjData(MODEL)
     data.qpos[:], data.qvel[:] = segments.qpos[0], segments.qvel[0]
     for k in range(segments.history):
-        advance_activations(model, segments.ctrl[0, k], data.act, segments.dt, settle=k == 0)
+        Activations(model, segments.dt).advance(segments.ctrl[0, k], data.act, settle=k == 0)
     for k in range(segments.steps):
         model.dof_damping[model.joint("shoulder").dofadr[0]] = damping[segments.history + k]
         data.ctrl[:] = segments.ctrl[0, segments.history + k]
@@ -169,7 +170,7 @@ def test_firmware_servo_closes_its_loop_at_every_step() -> None:
     t = plant_of(MODEL).shoot(NONE, replace(segments, servo=[(servo, terms)]))
     data = mujoco.MjData(MODEL)
     data.qpos[:], data.qvel[:] = segments.qpos[0], segments.qvel[0]
-    advance_activations(MODEL, segments.ctrl[0, 0], data.act, segments.dt, settle=True)
+    Activations(MODEL, segments.dt).advance(segments.ctrl[0, 0], data.act, settle=True)
     for k in range(segments.steps):
         data.ctrl[:] = segments.ctrl[0, k]
         wish = 3.0 * (data.ctrl[servo.actuator] - data.qpos[servo.qpos]) - 0.2 * data.qvel[servo.dof]

@@ -60,7 +60,13 @@ def propose(
     named = [f for n, f in FAMILIES.items() if not f.generic and (not only or n in only)]
     generics = [f for f in FAMILIES.values() if f.generic and generic]
     chosen = [f for f in (*named, *generics) if f.family not in exclude]
-    return [effect for family in chosen for effect in family.propose(model, scales)]
+    proposed = [effect for family in chosen for effect in family.propose(model, scales)]
+    by_id = {e.id: e for e in proposed}
+    for effect in proposed:
+        alone = [by_id.get(f"{effect.family}:{name}") for name in effect.where]
+        if len(alone) > 1 and None not in alone:
+            effect.singles = tuple(e for e in alone if e is not None)
+    return proposed
 
 
 def build(family: str, where: Sequence[str] | str, parameters: Mapping[str, object]) -> tuple[Effect, Array]:

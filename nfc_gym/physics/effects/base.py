@@ -73,6 +73,8 @@ class Scales:
       exogenous: names of the exogenous signals that the logs carry, with their median value.
       channels: names of the measured channels, with (spread, noise) of each.
       low, high: (nq,) bounds of the motion's coordinates, None where unknown.
+      push: (nv,) force of its actuators that each degree of freedom is known to have seen at most, 0 or None where
+        nothing is known.
     """
 
     force: Array
@@ -84,6 +86,7 @@ class Scales:
     channels: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     low: Array | None = None
     high: Array | None = None
+    push: Array | None = None
 
 
 @dataclass
@@ -142,6 +145,8 @@ class Effect(ABC):
     slow: ClassVar[bool] = False
     # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
     PARAMS: ClassVar[tuple[Param, ...]] = ()
+    # Of an effect at several places: the same at each of them alone, with bounds and sizes that fit that place.
+    singles: "tuple[Effect, ...]" = ()
 
     def __init__(self, where: Sequence[str], params: Sequence[Param] | None = None) -> None:
         self.where = tuple(where)
@@ -178,6 +183,10 @@ class Effect(ABC):
     @property
     def signals(self) -> tuple[str, ...]:
         """Exogenous signals that the effect reads."""
+        return ()
+
+    def known_as(self, theta: Array) -> tuple[str, ...]:
+        """Families that are this very law by another name at the same place, at these parameters (k,)."""
         return ()
 
     @classmethod

@@ -96,6 +96,9 @@ class Gain(Effect):
         """Force over nominal force, (...,)."""
         return theta[..., 0]
 
+    def known_as(self, theta: Array) -> tuple[str, ...]:
+        return ("loss",) if len(self.where) == 1 and 0 <= self.factor(theta) <= 1 else ()
+
     def model(self, fields: ModelFields, theta: Array) -> None:
         scale_force(fields, self.rows, self.factor(theta))
 
@@ -122,6 +125,9 @@ class Loss(Gain):
 
     def factor(self, theta: Array) -> Array:
         return 1.0 - theta[..., 0]
+
+    def known_as(self, theta: Array) -> tuple[str, ...]:
+        return ("gain",) if self.factor(theta) >= Gain.PARAMS[0].low else ()
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:

@@ -137,7 +137,9 @@ def split(effect: Effect, plant: "Plant") -> tuple[Effect, NDArray[np.intp]] | N
     """A tied effect of several places as `Each`, and the old parameter each new one starts from; None if it cannot."""
     if isinstance(effect, Each | Conditioned) or len(effect.where) < 2 or effect.generic:
         return None
-    members = [type(effect)((name,), effect.params) for name in effect.where]
+    # What bounds all joints alike is no bound of one: a knee carries more than the typical joint of a leg.
+    own = [e.params for e in effect.singles] or [effect.params] * len(effect.where)
+    members = [type(effect)((name,), params) for name, params in zip(effect.where, own, strict=True)]
     together = each(members)
     together.bind(plant.model)
     return together, np.tile(np.arange(len(effect.params)), len(members))

@@ -15,7 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Rows, Scales, index, joint_dofs
-from nfc_gym.physics.effects.places import angle_unit, force_unit, joint_places, joint_scales, sized, with_units
+from nfc_gym.physics.effects.places import (
+    angle_unit,
+    force_unit,
+    joint_places,
+    joint_scales,
+    largest_push,
+    sized,
+    with_units,
+)
 from nfc_gym.physics.fields import ModelFields
 
 _IMPEDANCE = (0.99, 0.99, 0.001, 0.5, 2.0)
@@ -48,7 +56,7 @@ class _JointFriction(Effect):
         for where in joint_places(model):
             force, speed = joint_scales(model, scales, where)
             unit = force_unit(model, where[0])
-            params = sized(cls.PARAMS, **cls._sizes(force, speed))
+            params = sized(cls.PARAMS, **cls._sizes(force, speed, largest_push(model, scales, where)))
             angle = angle_unit(model, where[0])
             units = dict.fromkeys(cls.LEVELS, unit) | {"speed": f"{angle}/s", "square": f"1/({unit})"}
             units |= dict.fromkeys(("forward_viscous", "backward_viscous"), f"{unit} s/{angle}")
@@ -56,14 +64,20 @@ class _JointFriction(Effect):
         return out
 
     @classmethod
-    def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
-        return {n: level_size(force) for n in cls.LEVELS}
+    def _sizes(cls, force: float, speed: float, push: float) -> dict[str, dict[str, Any]]:
+        return {n: level_size(force, push) for n in cls.LEVELS}
 
 
-def level_size(force: float) -> dict[str, Any]:
-    """Bounds and probing sizes of a friction level, from the joint's typical force."""
-    # A joint that moves at all has less friction than what pushes it, and the largest push is about thrice the typical.
-    return {"probes": (0.05 * force, 0.2 * force), "high": 3 * force, "resolution": 2e-3 * force}
+def level_size(force: float, push: float = 0.0) -> dict[str, Any]:
+    """Bounds and probing sizes of a friction level.
+
+    Args:
+      force: typical of the joint.
+      push: largest that is known to have moved it, 0 if none is.
+    """
+    # A joint that moves at all has less friction than what pushes it. The largest push is about thrice the typical; a
+    # model without friction needs less force than the machine, whose own push is then the better bound.
+    return {"probes": (0.05 * force, 0.2 * force), "high": max(3 * force, push), "resolution": 2e-3 * force}
 
 
 class Coulomb(_JointFriction):
@@ -109,9 +123,9 @@ class Stribeck(_JointFriction):
         return self.at, level + rise * np.exp(-share * share)
 
     @classmethod
-    def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
+    def _sizes(cls, force: float, speed: float, push: float) -> dict[str, dict[str, Any]]:
         shape = {"probes": (0.1 * speed, 0.3 * speed, speed), "low": 0.01 * speed, "high": 5 * speed}
-        return super()._sizes(force, speed) | {"speed": shape}
+        return super()._sizes(force, speed, push) | {"speed": shape}
 
 
 class LoadFriction(_JointFriction):
@@ -141,9 +155,9 @@ class LoadFriction(_JointFriction):
         return self.at, theta[..., 0:1] + np.abs(drive + load) + theta[..., 3:4] * torque**2
 
     @classmethod
-    def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
+    def _sizes(cls, force: float, speed: float, push: float) -> dict[str, dict[str, Any]]:
         square = {"probes": (0.05 / force, 0.2 / force), "high": 1 / force, "resolution": 2e-3 / force}
-        return super()._sizes(force, speed) | {"square": square}
+        return super()._sizes(force, speed, push) | {"square": square}
 
 
 class DirectionalFriction(_JointFriction):
@@ -171,6 +185,6 @@ class DirectionalFriction(_JointFriction):
         return self.at, forward * ahead + backward * (1 - ahead)
 
     @classmethod
-    def _sizes(cls, force: float, speed: float) -> dict[str, dict[str, Any]]:
-        viscous = level_size(force / speed)
-        return super()._sizes(force, speed) | {"forward_viscous": viscous, "backward_viscous": viscous}
+    def _sizes(cls, force: float, speed: float, push: float) -> dict[str, dict[str, Any]]:
+        viscous = level_size(force / speed, push / speed)
+        return super()._sizes(force, speed, push) | {"forward_viscous": viscous, "backward_viscous": viscous}

@@ -21,7 +21,15 @@ import numpy as np
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index, joint_dofs
 from nfc_gym.physics.effects.friction import level_size
-from nfc_gym.physics.effects.places import angle_unit, force_unit, joint_places, joint_scales, sized, with_units
+from nfc_gym.physics.effects.places import (
+    angle_unit,
+    force_unit,
+    joint_places,
+    joint_scales,
+    largest_push,
+    sized,
+    with_units,
+)
 
 _STIFFEST = 0.25  # of M / dt^2, a joint's inertia over the squared step: stiffer springs no step can follow
 
@@ -68,7 +76,8 @@ class Hysteresis(Effect):
             force, reach = joint_scales(model, scales, where)[0], excursion(model, scales, where[0])
             shape = {"probes": tuple(s * reach for s in (0.03, 0.2, 0.7)), "low": 1e-3 * reach, "high": 3 * reach}
             units = {"level": force_unit(model, where[0]), "transition": angle_unit(model, where[0])}
-            out.append(cls(where, with_units(sized(cls.PARAMS, level=level_size(force), transition=shape), units)))
+            level = level_size(force, largest_push(model, scales, where))
+            out.append(cls(where, with_units(sized(cls.PARAMS, level=level, transition=shape), units)))
         return out
 
 

@@ -91,6 +91,11 @@ def joint_scales(model: mujoco.MjModel, scales: Scales, names: Sequence[str]) ->
     return typical(scales.force, dofs), typical(scales.speed, dofs, 1e-2)
 
 
+def largest_push(model: mujoco.MjModel, scales: Scales, names: Sequence[str]) -> float:
+    """Force of the actuators that the named joints are known to have seen, each at most; their median, 0 if unknown."""
+    return 0.0 if scales.push is None else float(np.median(scales.push[joint_dofs(model, names)]))
+
+
 def moving_bodies(model: mujoco.MjModel) -> list[str]:
     """Names of bodies that have mass and can move, one for each set of bodies welded together."""
     names = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)

@@ -1,0 +1,75 @@
+"""Sizes that candidates take from the logs."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nfc_gym.measured.bench import candidates, make_bench, scales
+from nfc_gym.measured.checks import require
+from nfc_gym.physics.effects.each import split
+
+PUSH = 20 * np.sin(0.05)  # of a servo of 10 N m/rad whose goal leads a swing of 1 rad by 0.1 rad of phase
+Build = Callable[..., Path]
+
+
+def with_ankle(machine: str) -> str:
+    """The machine with a second joint below the first."""
+    weight = '<geom name="weight" size="0.02" pos="0 0 -0.1" mass="0.1"/>'
+    foot = '<body name="foot"><joint name="ankle" axis="0 1 0"/><geom size="0.02" pos="0 0 -0.2" mass="0.05"/></body>'
+    assert weight in machine
+    return machine.replace(weight, weight + foot).replace(
+        "</actuator>", '<position name="second" joint="ankle" kp="10"/></actuator>'
+    )
+
+
+def test_the_largest_push_is_what_the_servo_made_of_the_error_it_saw(build: Build) -> None:
+    dataset = require(build())[0]
+    found = scales(make_bench(dataset, 1), dataset.logs)
+    assert found.push is not None
+    assert found.push[0] == pytest.approx(PUSH, rel=0.03)
+    assert not found.push[1:].any()  # nothing drives the base
+
+
+def test_noise_is_no_push(build: Build) -> None:
+    """Measured twenty times as coarsely, a goal that is reached exactly pushes nothing worth naming."""
+    rng = np.random.default_rng(0)
+
+    def spoil(table: dict[str, np.ndarray]) -> None:
+        table["goal"] = np.sin(3 * table["t"])
+        table["q"] = table["goal"] + 0.02 * rng.standard_normal(len(table["t"]))
+        table["v"] = 3 * np.cos(3 * table["t"])
+
+    dataset = require(build(spoil, ("unit: rad, noise: 0.001", "unit: rad, noise: 0.02")))[0]
+    bench = make_bench(dataset, 1)
+    raw = 10 * np.quantile(np.abs(table_error(dataset)), 0.99)
+    push = scales(bench, dataset.logs).push
+    assert push is not None
+    assert raw > 0.4
+    assert push[0] < 0.2 * raw
+
+
+def table_error(dataset) -> np.ndarray:
+    """Goal less measured angle of every sample."""
+    return np.concatenate([log.controls["ctrl:servo"] - log.channels["joint:hinge:pos"].values for log in dataset.logs])
+
+
+def test_values_of_their_own_have_bounds_of_their_own(build: Build, machine: str) -> None:
+    """What bounds both joints alike would be wrong for each."""
+    goal = '"ctrl:servo": {column: goal, unit: rad}'
+    path = build(still, (goal, f'{goal}\n  "ctrl:second": {{column: still, unit: rad}}'), model=with_ankle(machine))
+    dataset = require(path)[0]
+    bench = make_bench(dataset, 1)
+    pool = {e.id: e for e in candidates(bench, dataset.logs)}
+    apart = split(pool["coulomb:hinge+ankle"], bench.plant)
+    assert apart is not None
+    highs = {p.name: p.high for p in apart[0].params}
+    for joint in ("hinge", "ankle"):
+        assert highs[f"level@{joint}"] == pool[f"coulomb:{joint}"].params[0].high
+    assert highs["level@hinge"] > highs["level@ankle"]
+
+
+def still(table: dict[str, np.ndarray]) -> None:
+    """A goal for the ankle."""
+    table["still"] = np.zeros_like(table["t"])

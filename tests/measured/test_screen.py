@@ -1,0 +1,107 @@
+"""Looking closer where bodies may touch: sizes are climbed, and blocks with large errors are never left out."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nfc_gym.core import Channel, Log
+from nfc_gym.measured.fisher import Lens, repeated
+from nfc_gym.measured.fit import stand
+from nfc_gym.measured.lookout import Lookout
+from nfc_gym.measured.metric import loss, metric
+from nfc_gym.measured.screen import Screen, ladder
+from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.shooting import RolloutProblem
+from nfc_gym.measured.states import estimate_states
+from nfc_gym.physics.effects import build
+from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.physics.rollout import Plant
+
+DT, NOISE, REMOVED = 0.01, {"pos": 0.001, "vel": 0.01}, 0.3
+MODEL = """
+<mujoco>
+  <option timestep="0.01" integrator="implicitfast"/>
+  <worldbody>
+    <geom name="far" type="plane" size="1 1 1" pos="0 0 -9"/>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0" damping="0.1"/><geom name="bob" size="0.05" pos="0 0 -0.3"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+def record(model: mujoco.MjModel, seed: int, loud: bool) -> Log:
+    """An arm whose motor gives up at 70 % of its range, which only a loud log asks for."""
+    rng, data, rows = np.random.default_rng(seed), mujoco.MjData(model), []
+    wish = np.sin(rng.uniform(3, 8) * DT * np.arange(300) + rng.uniform(0, 6)) * (0.9 if loud else 0.5)
+    for u in wish:
+        rows.append((data.qpos[0], data.qvel[0]))
+        data.ctrl[0] = np.clip(u, REMOVED - 1, 1 - REMOVED)
+        mujoco.mj_step(model, data)
+    rows = np.array(rows) + rng.normal(size=(len(wish), 2)) * list(NOISE.values())
+    channels = {f"joint:hinge:{q}": Channel(rows[:, i], noise=n) for i, (q, n) in enumerate(NOISE.items())}
+    return Log(f"run_{seed}", DT * np.arange(len(wish)), {"ctrl:motor": wish}, channels)
+
+
+@pytest.fixture(scope="module")
+def screen() -> Screen:
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    logs = [record(model, s, s == 7) for s in range(9)]
+    layout = Layout(0.4, 0.0, (0.1, 0.4), 0.4, DT)
+    problem = RolloutProblem(model, logs, [estimate_states(model, log) for log in logs], layout)
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    under = metric(problem, problem.covariance(plant, plant.null))
+    return Screen(problem, under, stand(problem, under, plant, plant.null))
+
+
+def test_a_thinned_problem_keeps_the_blocks_with_the_largest_errors(screen: Screen) -> None:
+    thin = Lookout(screen.problem, np.random.default_rng(0), lambda text: None)._thinned(screen)
+    worst = np.sort(screen.current.losses)[-3:]
+    assert len(thin.problem) < len(screen.problem) / 2
+    assert set(worst) <= set(thin.current.losses)
+
+
+def test_a_scout_finds_a_limit_that_few_blocks_reach(screen: Screen) -> None:
+    law = build("saturation", "motor", {"removed": 0.0})[0]
+    plant = screen.current.plant.with_effects([law])
+    true = loss(screen.metric.whiten(screen.problem.residual(plant, np.array([[REMOVED]])))).sum()
+    best = float(screen.current.losses.sum() - true)
+    found = screen.scout(screen.try_one(law, every_size=False), np.random.default_rng(0))
+    assert found.gain > 0.5 * best > 0
+    assert found.theta[0] == pytest.approx(REMOVED, abs=0.1)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_ladder_keeps_to_bounds_and_to_the_side_that_was_found(side: float) -> None:
+    law = build("compliance", "ground", {"softness": 0.0, "damping": 0.0})[0]
+    rungs = ladder(law, np.array([side * 0.3, -side * 0.2]))
+    assert (np.sign(rungs) == [side, -side]).all()
+    assert ((rungs >= law.low) & (rungs <= law.high)).all()
+    assert (np.diff(np.abs(rungs), axis=0) > 0).all()
+
+
+def test_what_repeats_is_what_two_columns_share() -> None:
+    one = np.eye(3)
+    np.testing.assert_allclose(repeated(one, np.array([[2.0, 0, 0], [0, -1.0, 1.0], [0, 0, 1.0]])), [1, 0, 0.5**0.5])
+
+
+@pytest.mark.parametrize(("floor", "touches"), [("0 0 -9", False), ("0 0 -0.345", True)])
+def test_only_what_touches_has_a_twin(screen: Screen, floor: str, touches: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(MODEL.replace("0 0 -9", floor))
+    problem, plant = screen.problem, Plant(model, ParameterSpace(model, []), nthread=1)
+    assert problem.touches(plant, plant.null) == touches
+    assert (Lens(problem, screen.metric, plant, plant.null).twin() is not None) == touches
+
+
+def test_a_twin_begins_elsewhere_on_some_of_the_blocks(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RolloutProblem, "touches", lambda *model: True)
+    lens = Lens(screen.problem, screen.metric, screen.current.plant, screen.current.x)
+    twin = lens.twin()
+    assert twin is not None
+    apart = twin.problem.segments.qpos - screen.problem.segments.qpos[lens.shared]
+    assert np.std(apart) == pytest.approx(screen.problem._start_sd[0][lens.shared].mean(), rel=0.3)
+    law = build("saturation", "motor", {"removed": 0.0})[0]
+    here, there = (each.columns(law, np.array([[REMOVED]])) for each in (lens, twin))
+    assert repeated(here[lens.shared].reshape(-1, 1), there.reshape(-1, 1))[0] > 0.95

@@ -1,0 +1,46 @@
+"""What verification says where there is nothing to verify on."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from nfc_gym.core import Channel, InputError, Log
+from nfc_gym.core.files import require_writable
+from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.shooting import RolloutProblem
+from nfc_gym.measured.states import estimate_states
+from nfc_gym.measured.verdict import Models, verify
+from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.physics.rollout import Plant
+
+DT = 0.01
+MODEL = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" pos="0 0 -0.3"/></body></worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_model_that_is_unstable_on_every_segment_is_said_so() -> None:
+    """Angles of 1e160 rad, of another machine or in another unit."""
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    rng, time = np.random.default_rng(0), DT * np.arange(100)
+    huge = {"joint:hinge:pos": Channel(1e160 * (1 + rng.normal(size=100)), noise=1e-3)}
+    log = Log("run", time, {"ctrl:motor": np.zeros(100)}, huge)
+    layout = Layout(0.4, 0.0, (0.1, 0.4), 0.4, DT)
+    problem = RolloutProblem(model, [log], [estimate_states(model, log)], layout)
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    bare = (plant, plant.null)
+    with pytest.raises(InputError, match="unstable on every segment that verifies"), np.errstate(all="ignore"):
+        verify(problem, Models(bare, bare, bare), 2, rng)
+
+
+def test_an_option_is_no_place_to_write_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="--out --jobs looks like another option"):
+        require_writable(Path("--jobs"))
+    require_writable(tmp_path / "--jobs")
