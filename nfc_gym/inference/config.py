@@ -71,15 +71,23 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of a window: `horizon` H steps, `states` s, `actions` a; `layout` of joints, for the physics summaries."""
+    """Sizes of a window: `horizon` H steps, `states` s, `actions` a.
+
+    Attributes:
+      layout: of joints, for the physics summaries.
+      place: which states say where the robot is, which is then left out (`encoders.place.place_of`).
+    """
 
     horizon: int
     states: int
     actions: int
     layout: Mapping[str, Any] | None = None
+    place: Mapping[str, Any] | None = None
 
     @classmethod
-    def of(cls, batch: Batch, layout: Mapping[str, Any] | None = None) -> "Sizes":
+    def of(
+        cls, batch: Batch, layout: Mapping[str, Any] | None = None, place: Mapping[str, Any] | None = None
+    ) -> "Sizes":
         """Those of a batch of windows."""
         actions = batch["actions"]
-        return cls(actions.shape[1], batch["states"].shape[2], actions.shape[2], layout)
+        return cls(actions.shape[1], batch["states"].shape[2], actions.shape[2], layout, place)

@@ -110,7 +110,12 @@ class WindowDetector:
         kept = self._keep(before, act, after)
         due = (self._count >= self.scorer.horizon) & ((self._count - self.scorer.horizon) % self.every == 0)
         if due.any():
-            self._score[due] = self.scorer.score(*checked(self.scorer, kept[due], self._actions[due]))
+            windows, by_row = (
+                checked(self.scorer, kept[due], self._actions[due]),
+                getattr(self.scorer, "score_rows", None),
+            )
+            # Some scorers must know whose windows these are: which ground a row stands on.
+            self._score[due] = self.scorer.score(*windows) if by_row is None else by_row(*windows, np.flatnonzero(due))
         return float(self._score[0]) if single else self._score.copy()
 
     def _keep(self, before: Array, act: Array, after: Array) -> Array:

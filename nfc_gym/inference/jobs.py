@@ -14,6 +14,7 @@ from nfc_gym.core.files import replacing
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import StoredWindows
+from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import Window, load
 from nfc_gym.inference.progress import Report, quiet
@@ -67,14 +68,16 @@ def train_posterior(
     if config.families:
         config = replace(config, families=tuple(stored.manifest.families))
     about = stored.manifest
-    sizes = Sizes(about.horizon, len(about.state_names), len(about.action_names))
+    place = place_of(about.state_names)
+    sizes = Sizes(about.horizon, len(about.state_names), len(about.action_names), place=place)
     network = Network(config, sizes, prior, training.seed)
     first, held_out = StoredWindows(stored, maps=config.elevation).split(HELD_OUT)
     state = out.with_name(out.name + ".training")
     state.mkdir(parents=True, exist_ok=True)
     outcome = train(network, first, held_out, training, folder=state, device=device_of(device), report=report)
     notes = {
-        "environment": about.environment, "windows": len(stored), "best": outcome.best, "stopped": outcome.stopped,
+        "environment": about.environment, "states": list(about.state_names), "windows": len(stored),
+        "best": outcome.best, "stopped": outcome.stopped,
         "seconds": outcome.seconds, "held_out": outcome.held_out, "start": outcome.start,
     }  # fmt: skip
     checkpoint.save(out, network.cpu(), notes=notes)
@@ -112,13 +115,13 @@ class Told(NamedTuple):
 
 
 def infer(
-    posterior: Path, window: Path, *, samples: int = 1000, seed: int = 0, out: Path | None = None
+    posterior: Path, window: Path | Window, *, samples: int = 1000, seed: int = 0, out: Path | None = None
 ) -> tuple[Fidelity, list[Told]]:
     """Draw from a posterior given a window.
 
     Args:
       posterior: what `train_posterior` wrote.
-      window: see `read_window`.
+      window: see `read_window`; or the window itself.
       samples: how many.
       seed: of the draws.
       out: `.npz` for the draws (`psi`, and `delta_s` where it is inferred), or `.safetensors` for the posterior given
@@ -129,7 +132,7 @@ def infer(
     """
     if out is not None and out.suffix not in (".npz", ".safetensors"):
         raise InputError(f"{out}: draws are kept in .npz, the posterior given the window in .safetensors")
-    given = load(posterior).given(read_window(window))
+    given = load(posterior).given(window if isinstance(window, Window) else read_window(window))
     parts = [p for p in given.network.parts if p != "delta_e"]
     drawn = given.of(*parts).sample(samples, np.random.default_rng(seed))
     if out is not None and out.suffix == ".safetensors":

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from nfc_gym.inference.encoders.base import Standard
 
-_STRENGTHS = torch.logspace(-7, 2, 28, dtype=torch.float64)  # of the ridge, in units of the inputs' variance
+_STRENGTHS = torch.logspace(-7, 2, 28, dtype=torch.float64).tolist()  # of the ridge, in units of the inputs' variance
 
 
 class LinearBase(nn.Module):
@@ -71,8 +71,8 @@ class LinearBase(nn.Module):
         return self.scale(r).clamp(-10, 10)
 
     def forward(self, r: Tensor) -> Tensor:
-        """Means (B, D) of x."""
-        return self._inputs(r) @ self.weight.T + self.offset
+        """Means (B, D) of x; summed in double, whatever the products of networks are rounded to."""
+        return (self._inputs(r).double() @ self.weight.double().T + self.offset).float()
 
     def whiten(self, x: Tensor, mean: Tensor) -> Tensor:
         """y (..., w) of the first w entries x (..., w), w <= D."""

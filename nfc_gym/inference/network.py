@@ -11,6 +11,7 @@ from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import Batch
 from nfc_gym.inference.encoders import Joined, Regressions
 from nfc_gym.inference.encoders.base import TINY, Standard, Tamed
+from nfc_gym.inference.encoders.place import Place
 from nfc_gym.inference.heads.density import Chain, Density
 from nfc_gym.inference.heads.flow import Flow
 from nfc_gym.inference.heads.mixture import Mixture
@@ -51,6 +52,7 @@ class Network(Learner):
     """
 
     varies: Tensor
+    free: Tensor
 
     def __init__(self, config: NetworkConfig, sizes: Sizes, prior: PriorBox, seed: int = 0) -> None:
         super().__init__()
@@ -58,6 +60,7 @@ class Network(Learner):
         self.blocks = ("psi", "delta_s") if config.delta_s else ("psi",)
         self.parts = (*self.blocks, "delta_e") if config.delta_e else self.blocks
         with seeded(seed):
+            self.place = Place(sizes.place) if sizes.place else nn.Identity()
             plan = Regressions.of(sizes.layout, sizes.states, sizes.actions) if config.summaries else None
             self.encoder = Joined(
                 config.encoder, sizes.horizon, sizes.states, sizes.actions, width=config.width,
@@ -67,6 +70,7 @@ class Network(Learner):
             self.project = nn.Linear(self.encoder.features, width) if config.features else nn.Identity()
             self.delta_scale = Tamed(sizes.states)
             self.register_buffer("varies", torch.ones(sizes.states, dtype=torch.bool))
+            self.register_buffer("free", torch.tensor(prior.free).nonzero()[:, 0], persistent=False)
             self.density = self._density(width)
             size = self.density.width(None)
             self.terrain = Terrain(width, size, config.hidden) if config.delta_e else None
@@ -91,6 +95,7 @@ class Network(Learner):
           InputError: the windows are of other sizes than the network, or lack what it infers.
         """
         self.require(batch)
+        batch = batch | {"states": self.place(batch["states"])}
         self.encoder.fit(batch["states"], batch["actions"], batch.get("map"))
         if self.config.delta_s:
             self.delta_scale.fit(batch["delta_s"])
@@ -136,6 +141,7 @@ class Network(Learner):
 
     def encode(self, states: Tensor, actions: Tensor, elevation: Tensor | None = None) -> Encoded:
         """What is kept of windows as logged."""
+        states = self.place(states)
         features = self.project(self.encoder(states, actions, elevation))
         seen = None
         if self.terrain is not None and elevation is not None:
@@ -170,8 +176,7 @@ class Network(Learner):
 
         Entries of delta_s that never vary in training are N(0, 1) noise here, and come back as the constant they are.
         """
-        free = torch.tensor(self.prior.free, device=batch["psi"].device)
-        parts = [torch.special.ndtri(batch["psi"][:, free].clamp(EDGE, 1 - EDGE))]
+        parts = [torch.special.ndtri(batch["psi"][:, self.free].clamp(EDGE, 1 - EDGE))]
         if self.config.delta_s:
             scaled = self.delta_scale(batch["delta_s"])
             parts.append(torch.where(self.varies, scaled, torch.randn_like(scaled)))

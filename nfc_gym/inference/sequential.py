@@ -148,6 +148,7 @@ class TruncatedPrior:
 def sequential(
     network: Network, simulate: Simulator, window: Window, config: SequentialConfig | None = None,
     training: TrainConfig | None = None, *, device: str | torch.device = "cpu", report: Report = quiet,
+    scales: bool = True,
 ) -> Rounds:  # fmt: skip
     """Infer psi from one window in rounds of simulations that close in on it.
 
@@ -159,6 +160,7 @@ def sequential(
       training: of each round, on all windows so far.
       device: to train on.
       report: is told of the progress.
+      scales: see `train`; a network that was trained before on other windows is to keep its own.
 
     Raises:
       InputError: the simulator returns windows that are not the network's, or another number of them.
@@ -180,7 +182,7 @@ def sequential(
         first, last = new.split(config.held_out)
         train_set = first if train_set is None else train_set.append(first)
         held_out = last if held_out is None else held_out.append(last)
-        out.outcomes.append(train(network, train_set, held_out, training, device=device, report=report))
+        out.outcomes.append(train(network, train_set, held_out, training, device=device, report=report, scales=scales))
         out.posterior = NeuralPosterior(network).given(window)
         out.entropy.append(-float(TruncatedPrior(out.posterior, config, rng)._draws(config.samples, rng)[1].mean()))
         report.message(f"round {r + 1}: {len(train_set)} windows, posterior entropy {out.entropy[-1]:.3f} nats")

@@ -10,6 +10,7 @@ from time import monotonic
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.data import Batch, WindowSet
@@ -35,7 +36,7 @@ class TrainConfig:
       clip: largest norm of a gradient.
       patience: epochs without a better held-out loss after which training ends.
       mixed: bfloat16 in the networks on a GPU.
-      save_every: seconds between saved states, beside those at the ends of epochs.
+      save_every: seconds between saved states, beside the one at the end.
       seed: of the order, the noise and nothing else.
     """
 
@@ -82,12 +83,12 @@ class Outcome:
 
 def train(
     network: Learner, windows: WindowSet, held_out: WindowSet, config: TrainConfig | None = None, *,
-    folder: Path | None = None, device: str | torch.device = "cpu", report: Report = quiet,
+    folder: Path | None = None, device: str | torch.device = "cpu", report: Report = quiet, scales: bool = True,
 ) -> Outcome:  # fmt: skip
     """Train a network in place; it ends with the averaged weights of the best epoch.
 
     Args:
-      network: as built; its scales are taken from `windows` first.
+      network: as built, or trained before.
       windows: to train on.
       held_out: by which epochs are compared; none of `windows` belongs here.
       config: see `TrainConfig`.
@@ -95,12 +96,16 @@ def train(
         had not been. A state of another configuration is refused.
       device: to train on.
       report: is told of the progress.
+      scales: whether those of the inputs are taken from `windows` first; a network that was trained before on other
+        windows keeps its own, which its weights are made for.
 
     Raises:
       InputError: windows that are not the network's, no memory for the batch, or a saved state of something else.
     """
     config = config or TrainConfig()
     device = torch.device(device)
+    if scales:
+        _fit_scales(network, windows, config.seed)
     run = _Run(network, windows, held_out, config, device)
     file = None if folder is None else folder / "training.safetensors"
     if file is not None and file.is_file():
@@ -119,6 +124,17 @@ def train(
     return run.outcome
 
 
+def _fit_scales(network: Learner, windows: WindowSet, seed: int) -> None:
+    """Take the inputs' scales from some windows."""
+    if not len(windows):
+        return  # which is said when they are trained on
+    with torch.random.fork_rng():
+        most = _SCALE_MAPS if network.config.elevation else _SCALE_WINDOWS
+        first = next(iter(windows.batches(min(len(windows), most), mixed(seed, _EVALUATION))))
+    now = next(network.parameters()).device
+    network.fit_scales({k: t.to(now) for k, t in first.items()})
+
+
 class _Run:
     """A training run's whole state. All randomness is a function of (seed, step), so nothing else need be saved."""
 
@@ -130,15 +146,12 @@ class _Run:
         self.windows, self.held_out, self.config, self.device = windows, held_out, config, device
         self.epoch_steps = math.ceil(len(windows) / config.batch)
         self.total = self.epoch_steps * config.epochs
-        with torch.random.fork_rng():
-            most = _SCALE_MAPS if network.config.elevation else _SCALE_WINDOWS
-            first = next(iter(windows.batches(min(len(windows), most), mixed(config.seed, _EVALUATION))))
-        now = next(network.parameters()).device
-        network.fit_scales({k: t.to(now) for k, t in first.items()})
         self.network = network.to(device)
         self.average = deepcopy(self.network).eval().requires_grad_(False)
         self.best = deepcopy(self.average)
-        self.optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.decay)
+        self.optimiser = torch.optim.AdamW(
+            network.parameters(), lr=config.rate, weight_decay=config.decay, fused=device.type == "cuda"
+        )
         self.step, self.loss_sum = 0, 0.0
         self.outcome = Outcome()
 
@@ -164,16 +177,19 @@ class _Run:
                         f"{self.outcome.best} are kept; a smaller rate than {self.config.rate:g} may help"
                     )
                     break
-                if file is not None and monotonic() - saved > self.config.save_every:
-                    self.outcome.seconds = monotonic() - began
-                    save_state(file, self, self.describe())
-                    saved = monotonic()
+                if self.step % self.epoch_steps:
+                    saved = self.save(file, began, saved)
             else:
                 self.end_epoch(report)
-            self.outcome.seconds = monotonic() - began
-            if file is not None:
-                save_state(file, self, self.describe())
-                saved = monotonic()
+            saved = self.save(file, began, saved)
+
+    def save(self, file: Path | None, began: float, saved: float) -> float:
+        """The state, where it is over or time for it; gives when it was saved last."""
+        self.outcome.seconds = monotonic() - began
+        if file is None or (not self.outcome.stopped and monotonic() - saved <= self.config.save_every):
+            return saved
+        save_state(file, self, self.describe())
+        return monotonic()
 
     def rest_of_epoch(self) -> Iterator[Batch]:
         """The batches of the running epoch that have not been seen."""
@@ -190,11 +206,12 @@ class _Run:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
-        if not torch.isfinite(norm) or not torch.isfinite(loss):
+        size, value = torch.stack([norm, loss.detach().to(norm.dtype)]).tolist()  # waits for the device, once a step
+        if not math.isfinite(size) or not math.isfinite(value):
             return False
         self.optimiser.step()
         self.step += 1
-        self.loss_sum += float(loss.detach())
+        self.loss_sum += value
         self.follow()
         return True
 
@@ -213,8 +230,8 @@ class _Run:
     def follow(self) -> None:
         """Draw the averaged weights towards the present ones; early averages forget faster."""
         keep = min(self.config.average, (1 + self.step) / (10 + self.step))
-        for mean, now in zip(self.average.parameters(), self.network.parameters(), strict=True):
-            mean.lerp_(now, 1 - keep)
+        mean, now = tuple(self.average.parameters()), tuple(self.network.parameters())
+        get_ema_multi_avg_fn(keep)(mean, now, self.step)  # all at once: one by one they take a GPU as long as a step
 
     @torch.no_grad()
     def evaluate(self) -> float:

@@ -1,5 +1,7 @@
 """Encoders: causality, scales, closed forms of the kernels and of the regressions."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -144,3 +146,48 @@ def test_a_layout_that_does_not_fit_is_refused() -> None:
         Regressions.of({"velocity": [9]}, S, A)
     with pytest.raises(InputError, match="one velocity, position and action a joint"):
         Regressions.of({"velocity": [0, 1], "action": [0]}, S, A)
+
+
+NAMES = (
+    "body:base:quat.w", "body:base:quat.x", "body:base:quat.y", "body:base:quat.z", "body:base:pos.x",
+    "body:base:pos.y",
+    "body:base:pos.z", "body:base:linvel.x", "body:base:linvel.y", "body:base:linvel@body.x", "obs",
+)  # fmt: skip
+
+
+def moved(states: torch.Tensor, heading: float, by: tuple[float, float]) -> torch.Tensor:
+    """The same motion elsewhere, facing elsewhere."""
+    out, half = states.clone(), heading / 2
+    c, s = math.cos(half), math.sin(half)
+    w, x, y, z = states[..., :4].unbind(-1)
+    out[..., :4] = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
+    c, s = math.cos(heading), math.sin(heading)
+    for i, shift in ((4, by), (7, (0.0, 0.0))):
+        a, b = states[..., i], states[..., i + 1]
+        out[..., i], out[..., i + 1] = c * a - s * b + shift[0], s * a + c * b + shift[1]
+    return out
+
+
+def test_a_window_looks_the_same_wherever_it_happens() -> None:
+    from nfc_gym.inference.encoders.place import Place, place_of
+
+    entries = place_of(NAMES)
+    assert entries == {"quat": [0, 1, 2, 3], "pos": [4, 5], "turned": [[7, 8]]}
+    place, states = Place(entries), torch.randn(5, 7, len(NAMES), dtype=torch.float64)
+    states[..., :4] = torch.nn.functional.normalize(states[..., :4], dim=-1)
+    seen = place(states)
+    for heading, by in ((2.0, (3.0, -1.0)), (-0.7, (0.0, 5.0))):
+        torch.testing.assert_close(place(moved(states, heading, by)), seen)
+    torch.testing.assert_close(place(seen), seen)  # nothing is left to take out
+    assert seen[:, 0, 4:6].abs().max() < 1e-12
+    kept = [6, 9, 10]
+    assert torch.equal(seen[..., kept], states[..., kept])
+    torch.testing.assert_close(seen[..., :4].norm(dim=-1), torch.ones(5, 7, dtype=torch.float64))
+    torch.testing.assert_close(seen[..., 7:9].norm(dim=-1), states[..., 7:9].norm(dim=-1))
+
+
+def test_states_without_a_place_have_none() -> None:
+    from nfc_gym.inference.encoders.place import place_of
+
+    assert place_of(("body:base:quat.w", "body:base:linvel.x")) is None
+    assert place_of(("joint:hip:pos",)) is None

@@ -66,6 +66,10 @@ class Summaries(Encoder):
       regressions: what explains what; default each step by its own state and all actions.
     """
 
+    of_target: Tensor
+    of_states: Tensor
+    of_actions: Tensor
+
     def __init__(self, horizon: int, states: int, actions: int, regressions: Regressions | None = None) -> None:
         super().__init__()
         self.plan = regressions or Regressions.of(None, states, actions)
@@ -74,6 +78,9 @@ class Summaries(Encoder):
         per = len(self.plan.states[0]) + len(self.plan.actions[0]) + 2
         self.features = per * len(self.plan.target) + 2 * (states + actions)
         self.scale = Standard(self.features)
+        for name in ("target", "states", "actions"):  # on the device: lists would be sent there with every batch
+            index = torch.tensor(getattr(self.plan, name), dtype=torch.long)
+            self.register_buffer(f"of_{name}", index, persistent=False)
 
     def fit(self, states: Tensor, actions: Tensor, elevation: Tensor | None) -> None:
         """Scales of regressors, steps and features."""
@@ -89,20 +96,21 @@ class Summaries(Encoder):
         return self.scale(self.raw(states, actions)).clamp(-10, 10)
 
     def raw(self, states: Tensor, actions: Tensor) -> Tensor:
-        """(B, features) before they are standardised."""
+        """(B, features) before they are standardised; in double, whatever the products of networks are rounded to."""
         with torch.autocast(states.device.type, enabled=False):
-            x = self.inputs(torch.cat([states[:, :-1], actions], -1).float())
-            y = self.outputs(states.float().diff(dim=1))
+            x = self.inputs(torch.cat([states[:, :-1], actions], -1).double())
+            y = self.outputs(states.double().diff(dim=1))
             s, r = states.shape[-1], len(self.plan.target)
-            chosen = [x[..., self.plan.states]]  # (B, H, r, p)
+            chosen = [x[..., self.of_states]]  # (B, H, r, p)
             if self.plan.actions[0]:
-                chosen.append(x[..., [[s + i for i in row] for row in self.plan.actions]])
+                chosen.append(x[..., s + self.of_actions])
             design = torch.cat([*chosen, x.new_ones(*x.shape[:2], r, 1)], -1).movedim(2, 1)  # (B, r, H, p)
-            target = y[..., list(self.plan.target)].mT[..., None]  # (B, r, H, 1)
+            target = y[..., self.of_target].mT[..., None]  # (B, r, H, 1)
             gram = design.mT @ design / design.shape[-2]
             power = gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
-            eye = torch.eye(gram.shape[-1], device=x.device)
-            weights = torch.linalg.solve(gram + RIDGE * power * eye, design.mT @ target / design.shape[-2])
+            eye = torch.eye(gram.shape[-1], dtype=x.dtype, device=x.device)
+            # The ridge leaves nothing singular, so that no GPU need be waited for to ask.
+            weights = torch.linalg.solve_ex(gram + RIDGE * power * eye, design.mT @ target / design.shape[-2])[0]
             spread = (target - design @ weights).square().mean((-2, -1)).add(1e-12).log() / 2
             moments = torch.cat([x.mean(1), x.std(1, correction=0)], -1)
-            return torch.cat([weights.flatten(1).asinh(), spread, moments], -1)
+            return torch.cat([weights.flatten(1).asinh(), spread, moments], -1).float()

@@ -39,7 +39,7 @@ class Terrain(nn.Module):
         y, m = both
         condition = nn.functional.silu(self.condition(features) + self.time(time_features(phi)) + self.vector(y))
         of_map, summary = self.unet(torch.stack([m, elevation], 1), condition)
-        count = torch.tensor(len(score.sizes), device=y.device)
+        count = torch.full((), len(score.sizes), device=y.device)
         modulations = score.modulations(phi, score.condition(features) + self.tell(summary), count)
         return score.v(y, score.here(count), modulations), of_map
 
