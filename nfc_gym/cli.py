@@ -1,4 +1,4 @@
-"""`nfc-gym`: check, close-loop, predict, excite, simulate, train, infer, demo. Heavy imports are inside commands.
+"""`nfc-gym`: the commands; what is heavy is imported inside them.
 
 Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the same command resumes; 1 a fault of ours.
 """
@@ -19,9 +19,11 @@ import typer
 from rich.console import Console
 
 from nfc_gym import __version__
+from nfc_gym.adaptation import commands as policies
 from nfc_gym.core import InputError, NfcError
 
 if TYPE_CHECKING:
+    from nfc_gym.inference.posterior import Window
     from nfc_gym.measured.checks import Finding
 
 FAULT, BAD_INPUT, INTERRUPTED = 1, 2, 3
@@ -107,12 +109,22 @@ def close_loop(
     fold: Annotated[
         str | None, typer.Option(metavar="NAME", help="With `by: rotate`: only the fold that verifies NAME.")
     ] = None,
+    posterior: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Start from a posterior of this machine, which `nfc-gym infer --out` wrote."),
+    ] = None,
+    time_saved: Annotated[
+        bool, typer.Option("--time-saved", help="Calibrate without the posterior too, to say what it saved.")
+    ] = False,
 ) -> None:
     """Calibrate the model, find what it lacks, add it; report the error before and after on logs nobody fitted to."""
     with _outcome(ctx, resumes=True):
         from nfc_gym.measured.loop import close_loop as run
 
-        run(mapping, out, seed=seed, jobs=jobs, overwrite=overwrite, resume=resume, fold=fold, console=Console())
+        run(
+            mapping, out, seed=seed, jobs=jobs, overwrite=overwrite, resume=resume, fold=fold, posterior=posterior,
+            compare=time_saved, console=Console(),
+        )  # fmt: skip
 
 
 @app.command()
@@ -204,8 +216,12 @@ def simulate(
         typer.Option(metavar="FILE", help="Draw psi from this (.npz of psi, or a posterior) and not from the prior."),
     ] = None,
     policy: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="TorchScript (.pt), or .npz of a perceptron, that moves some windows."),
+        str | None,
+        typer.Option(
+            metavar="POLICY",
+            help="Moves some windows: .safetensors of `nfc-gym pretrain`, an id (its packaged policy), TorchScript "
+            "(.pt), or .npz of a perceptron.",
+        ),
     ] = None,
     policy_share: Annotated[
         float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of windows that it moves.")
@@ -234,8 +250,13 @@ def simulate(
     with _outcome(ctx, resumes=True):
         from nfc_gym.simulate import simulate as run
 
+        mover = policy
+        if policy is not None and Path(policy).suffix.lower() in ("", ".safetensors"):
+            from nfc_gym.adaptation import load_policy
+
+            mover = load_policy(policy).perceptron()  # plain arrays: any process can be sent them
         run(
-            environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=proposal, policy=policy,
+            environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=proposal, policy=mover,
             policy_share=policy_share, motor=motor, ray=ray, console=Console(),
         )  # fmt: skip
         if maps:
@@ -304,7 +325,10 @@ def infer(
     ctx: typer.Context,
     posterior: Annotated[Path, typer.Argument(metavar="FILE.safetensors", help="What `nfc-gym train` wrote.")],
     window: Annotated[
-        Path, typer.Argument(metavar="WINDOW.npz", help="Arrays `states` (n + 1, s) and `actions` (n, a).")
+        Path,
+        typer.Argument(
+            metavar="WINDOW", help=".npz with `states` (n + 1, s) and `actions` (n, a); or a mapping file of logs."
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -312,6 +336,8 @@ def infer(
     ] = None,
     samples: Annotated[int, typer.Option(min=1, help="Draws.")] = 1000,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    log: Annotated[str | None, typer.Option(metavar="NAME", help="Of a mapping's logs; default the first.")] = None,
+    until: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where the window ends in that log.")] = None,
 ) -> None:
     """Say what psi could have made a window of motion, and draw from that posterior.
 
@@ -320,7 +346,11 @@ def infer(
     longer than the training set's counts from its end. The table gives each parameter's median and 90 % interval; one
     that the window does not show stays as wide as the prior, and is marked.
 
-    Either kind of --out goes into RandomizePsi and into `nfc-gym simulate --proposal`.
+    A mapping file (or the folder that RecordLog wrote) names logs instead; what the robot would have observed is then
+    made of their channels, for robots that feel no forces: Jackal, Quadcopter, Quadruped.
+
+    Either kind of --out goes into RandomizePsi, into `nfc-gym simulate --proposal` and into `nfc-gym close-loop
+    --posterior`.
 
     Example: nfc-gym infer jackal.safetensors window.npz --out psi.npz
     """
@@ -334,13 +364,38 @@ def infer(
         except ImportError as e:
             raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
 
-        _, found = jobs.infer(posterior, window, samples=samples, seed=seed, out=out)
+        mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
+        seen = _window(posterior, window, log, until) if mapped else window
+        _, found = jobs.infer(posterior, seen, samples=samples, seed=seed, out=out)
         table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
         for each in found:
             note = "  not shown" if each.width >= jobs.AS_WIDE else ""
             interval = f"{each.low:.4g} to {each.high:.4g}"
             table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
         Console(highlight=False, width=None if sys.stdout.isatty() else 140).print(table)
+
+
+def _window(posterior: Path, mapping: Path, log: str | None, until: float | None) -> "Window":
+    """The window of motion that a posterior wants, from a log of a mapping."""
+    from nfc_gym.inference.checkpoint import load as read
+    from nfc_gym.inference.posterior import Window
+    from nfc_gym.measured.dataset import load
+    from nfc_gym.measured.states import estimate_states
+    from nfc_gym.simulate.machine import Machine
+    from nfc_gym.simulate.observed import commands, observed
+
+    environment = read(posterior)[2].get("environment")
+    if environment is None:
+        raise InputError(f"{posterior}: does not say of which environment it is: give the window as an .npz")
+    logs = {each.name: each for each in load(mapping / "mapping.yaml" if mapping.is_dir() else mapping).logs}
+    if log is not None and log not in logs:
+        raise InputError(f"{mapping}: no log {log!r}; there are: {', '.join(logs)}")
+    chosen = logs[log] if log is not None else next(iter(logs.values()))
+    machine = Machine(environment)
+    states = estimate_states(machine.model, chosen, raw=True)
+    end = len(chosen) if until is None else int((chosen.time <= until + 1e-9).sum())
+    parts = (chosen.time, states.qpos, states.qvel, commands(machine, chosen.controls))
+    return Window(*observed(machine, *(part[:end] for part in parts)))
 
 
 @app.command()
@@ -434,6 +489,9 @@ def _print_findings(findings: "list[Finding]") -> None:
     console.print(table)
     counts = [(s, sum(f.severity == s for f in findings)) for s in colours]
     console.print(", ".join(f"{n} {s}{'s' * (n != 1)}" for s, n in counts))
+
+
+policies.register(app, _outcome)
 
 
 def main() -> None:

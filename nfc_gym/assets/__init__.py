@@ -1,6 +1,7 @@
 """The robots: one folder each with its MJCF (`<robot>.xml`) and its prior over physical parameters (`psi.toml`).
 
-Everything here is data. `restitution.toml` maps a coefficient of restitution to the damping ratio of a contact.
+Everything here is data. `restitution.toml` maps a coefficient of restitution to the damping ratio of a contact;
+`policies` holds pretrained policies, which `nfc_gym.adaptation` reads.
 """
 
 from pathlib import Path
@@ -24,3 +25,8 @@ def path(robot: str) -> Path:
     if robot not in ROBOTS:
         raise InputError(f"no robot is called {robot!r}; the robots are {', '.join(ROBOTS)}")
     return _HERE / robot / f"{robot}.xml"
+
+
+def policy(environment: str) -> Path:
+    """Where the pretrained policy of an environment, `AntFlat-v0`, lies if there is one."""
+    return _HERE / "policies" / f"{environment}.safetensors"

@@ -1,6 +1,6 @@
 """Jackal: a skid-steered rover that drives to goals, or follows a figure of eight."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
@@ -50,12 +50,18 @@ class Now(NamedTuple):
 
 
 class Jackal(Robot):
-    """Two actions: forward speed and yaw rate, turned into wheel speeds of either side."""
+    """Two actions: forward speed and yaw rate, turned into wheel speeds of either side.
+
+    Attributes:
+      loop, lap: half the length of the figure of eight [m], and the time for one round [s].
+    """
 
     name = "jackal"
     tasks = ("goal", "figure8")
     terrain_scale = 0.3  # steps of difficulty 0.5 are then 0.03 m, a third of a wheel's radius: what it can climb
     action_size, proprio_size, goal_size, place_size, draws = 2, 15, 2, 2, 5
+    loop: ClassVar[float] = LOOP
+    lap: ClassVar[float] = LAP
 
     def __init__(self, model: mujoco.MjModel, task: str) -> None:
         super().__init__(model, task)
@@ -102,7 +108,7 @@ class Jackal(Robot):
         frame = axes(view.qpos[..., 3:7])
         x, y = components(view.qpos[..., :2])
         if self.task == "figure8":
-            gx, gy = figure_eight(view.task["clock"] / LAP, LOOP, *components(view.task["start"]))
+            gx, gy = figure_eight(view.task["clock"] / self.lap, self.loop, *components(view.task["start"]))
         else:
             gx, gy = components(view.task["goal"])
         dx, dy = gx - x, gy - y

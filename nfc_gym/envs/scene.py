@@ -4,7 +4,7 @@ All heightfields of a scene have one size and one place, and that size leaves ro
 `HIGHEST`. So a map is changed by its data alone and chosen by `geom_dataid` alone, with nothing to recompute.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
@@ -21,17 +21,21 @@ LOWEST, HIGHEST = -5.0, 11.0  # m: what a map may hold; in float32 that still re
 SOLID = 1.0  # m of ground below LOWEST
 
 
-def build(mjcf: Path, maps: int) -> mujoco.MjModel:
+def build(mjcf: Path, maps: int, change: Callable[[mujoco.MjSpec], None] | None = None) -> mujoco.MjModel:
     """Compile a robot's MJCF with ground below it.
 
     Args:
       mjcf: the robot; a ground of its own is replaced, light and sky are added where it has none.
       maps: how many heightfields, named `terrain_0`, ...; 0 gives a plane.
+      change: edits the description before it is compiled: what a robot's machine has and its MJCF does not say.
     """
     rows, cols = SHAPE
     size = ((cols - 1) * RESOLUTION / 2, (rows - 1) * RESOLUTION / 2, HIGHEST - LOWEST, SOLID)
     flat = HfieldAsset(rows, cols, size, np.zeros(rows * cols, np.float32), (0, 0, LOWEST))
-    model = _describe(mjcf, [flat] * maps).compile()
+    described = _describe(mjcf, [flat] * maps)
+    if change is not None:
+        change(described)
+    model = described.compile()
     for k in range(maps):
         write(model, k, np.zeros(SHAPE, np.float32))
     return model

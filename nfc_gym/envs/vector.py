@@ -162,6 +162,11 @@ class RobotVectorEnv(VectorEnv):
         return self._sims.terrains(self._sims.perceived)
 
     @property
+    def places(self) -> NDArray[np.float64]:
+        """(n, place_size) world places of the goals [m], of robots that have some."""
+        return self.robot.desired(self._view).copy()
+
+    @property
     def proprio_components(self) -> list[str]:
         """What each entry of `proprio` is, in the names of logs: how a residual of it reaches the state."""
         return self.robot.components(self.model)

@@ -13,7 +13,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium.vector import VectorEnv
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.acting import Acting
@@ -80,6 +80,22 @@ def check_signals(effects: Sequence[Effect], exogenous: Mapping[str, Signal]) ->
                 raise InputError(f"ApplyEffects: {effect.id} reads {name!r}: give it in `exogenous`; given: {given}")
 
 
+def own_values(effects: Sequence[Effect], each: Sequence[ArrayLike], shape: tuple[int, ...]) -> list[Array]:
+    """Values (*shape, k) of each effect.
+
+    Raises:
+      InputError: of another number or shape, or not finite.
+    """
+    if len(each) != len(effects):
+        raise InputError(f"ApplyEffects: values of {len(each)} effects are given, and there are {len(effects)}")
+    found = [np.array(v, float) for v in each]
+    for effect, theta in zip(effects, found, strict=True):
+        want = (*shape, len(effect.params))
+        if theta.shape != want or not np.isfinite(theta).all():
+            raise InputError(f"ApplyEffects: values of {effect.id} must be finite, of shape {want}, got {theta.shape}")
+    return found
+
+
 class Application:
     """Effects wired into a simulation, one or a batch.
 
@@ -87,14 +103,18 @@ class Application:
       sim: the simulation.
       given: as `ApplyEffects` takes them.
       exogenous, condition: as `ApplyEffects` takes them.
+      each: as `VectorApplyEffects` takes `values`.
     """
 
     def __init__(
-        self, sim: Simulation, given: Given, exogenous: Mapping[str, Signal] | None, condition: str | None = None
-    ) -> None:
+        self, sim: Simulation, given: Given, exogenous: Mapping[str, Signal] | None, condition: str | None = None,
+        each: Sequence[ArrayLike] | None = None,
+    ) -> None:  # fmt: skip
         self.sim, self.exogenous = sim, dict(exogenous or {})
         self.effects, values = bound(given, sim.nominal, condition)
         self.thetas = [np.broadcast_to(t, (*sim.shape, len(t))) for t in values]
+        if each is not None:
+            self.thetas = own_values(self.effects, each, sim.shape)
         check_signals(self.effects, self.exogenous)
         self.reads = any(e.signals for e in self.effects)
         dt = float(sim.nominal.opt.timestep)
@@ -118,8 +138,7 @@ class Application:
 
     def _edit(self, fields: ModelFields) -> None:
         for effect, theta in zip(self.effects, self.thetas, strict=True):
-            # Values are the same in every simulation, so any that many as `fields` holds will do.
-            effect.model(fields, theta[: fields.count] if fields.batched else theta)
+            effect.model(fields, fields.own(theta))
 
     def _begin(self) -> None:
         """Before a control step: forget the hidden states of episodes that begin."""
@@ -228,7 +247,8 @@ class ApplyEffects(EnvWrapper):
 class VectorApplyEffects(VectorEnvWrapper):
     """The same around a vector environment on `mujoco.batch`: each simulation has hidden states of its own.
 
-    Signals that are functions are given the episodes' times (n,).
+    Signals that are functions are given the episodes' times (n,). With `values`, an array (n, k) for each effect, every
+    simulation has values of its own in place of those in `effects`; what sensors report keeps the latter.
     """
 
     def __init__(
@@ -237,13 +257,16 @@ class VectorApplyEffects(VectorEnvWrapper):
         effects: Given,
         exogenous: Mapping[str, Signal] | None = None,
         condition: str | None = None,
+        values: Sequence[ArrayLike] | None = None,
     ) -> None:
-        super().__init__(env, effects=effects, exogenous=exogenous, condition=condition)
+        super().__init__(env, effects=effects, exogenous=exogenous, condition=condition, values=values)
         self.sim = batch_simulation_of(env, "ApplyEffects")
-        self.application = Application(self.sim, effects, exogenous, condition)
+        self.application = Application(self.sim, effects, exogenous, condition, values)
 
     def recorded(self, name: str, value: Any) -> Any:
         """See `EnvWrapper`."""
+        if name == "values":
+            return None if value is None else [np.asarray(v, float).tolist() for v in value]
         return recorded(value) if name == "effects" else super().recorded(name, value)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

@@ -10,6 +10,7 @@ from nfc_gym.envs import jackal, quadcopter
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import goal_reward
 from nfc_gym.envs.rotations import axes, to_robot, to_world, turned, yaw
+from nfc_gym.envs.vector import RobotVectorEnv
 
 
 def made(name: str, **kwargs: Any) -> gymnasium.Env:
@@ -242,3 +243,28 @@ def test_rotations_agree_with_each_other() -> None:
     about_z = turned(np.array([1.0, 0, 0, 0]), angle)
     np.testing.assert_allclose(yaw(about_z), angle, atol=1e-12)
     np.testing.assert_array_equal(np.array(axes(quat[7])), np.array(frame)[:, 7])
+
+
+def test_places_of_goals_can_be_read_back() -> None:
+    envs = gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=3, context=["psi"])
+    observation, _ = envs.reset(seed=0)
+    base = envs.unwrapped
+    turn = 2 * np.arctan2(*observation["proprio"][:, [3, 0]].T)  # upright at the start: yaw alone
+    ahead, left = observation["goal"].T
+    gap = np.stack([np.cos(turn) * ahead - np.sin(turn) * left, np.sin(turn) * ahead + np.cos(turn) * left], 1)
+    assert base.places == pytest.approx(observation["proprio"][:, 10:12] + gap, abs=1e-4)
+
+
+def test_a_subclass_sets_the_size_of_the_figure_of_eight() -> None:
+    class Small(jackal.Jackal):
+        loop, lap = 1.5, 10.0
+
+    envs = RobotVectorEnv(Small, num_envs=1, task="figure8", context=["psi"])
+    envs.reset(seed=0)
+    places = [envs.places[0]]
+    for _ in range(500):
+        envs.step(np.zeros((1, 2)))
+        places.append(envs.places[0])
+    away = np.linalg.norm(np.array(places) - places[0], axis=1)
+    assert away[-1] == pytest.approx(0, abs=1e-6)  # a lap of 10 s
+    assert away.max() == pytest.approx(1.5, abs=1e-3)

@@ -1,0 +1,48 @@
+"""Policies: pretraining on TorchRL, adaptation in the calibrated simulator (the paper's Algorithm 1).
+
+Needs the extra `rl`. Importing this package loads neither torch nor TorchRL; its names do.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from nfc_gym.core import MissingExtra
+
+if TYPE_CHECKING:
+    from nfc_gym.adaptation.afterwards import LearnConfig, Learned, learn_from_mission
+    from nfc_gym.adaptation.agent import Agent, ppo_agent, sac_agent
+    from nfc_gym.adaptation.algorithm import AdaptConfig, Adapted, adapt
+    from nfc_gym.adaptation.finetuning import FineTuneConfig
+    from nfc_gym.adaptation.handover import hand_over
+    from nfc_gym.adaptation.policy import Policy, load_policy
+    from nfc_gym.adaptation.pretraining import pretrain
+
+_HOME = {
+    "AdaptConfig": "algorithm",
+    "Adapted": "algorithm",
+    "Agent": "agent",
+    "FineTuneConfig": "finetuning",
+    "LearnConfig": "afterwards",
+    "Learned": "afterwards",
+    "Policy": "policy",
+    "adapt": "algorithm",
+    "hand_over": "handover",
+    "learn_from_mission": "afterwards",
+    "load_policy": "policy",
+    "ppo_agent": "agent",
+    "pretrain": "pretraining",
+    "sac_agent": "agent",
+}
+__all__ = [
+    "AdaptConfig", "Adapted", "Agent", "FineTuneConfig", "LearnConfig", "Learned", "Policy", "adapt", "hand_over",
+    "learn_from_mission", "load_policy", "ppo_agent", "pretrain", "sac_agent",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    except ModuleNotFoundError as e:
+        raise MissingExtra(f"nfc_gym.adaptation needs {e.name}: pip install 'nfc_gym[rl]'") from None

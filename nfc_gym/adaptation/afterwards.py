@@ -1,0 +1,255 @@
+"""After a mission: the posterior network and the detector learn from what was gathered (Algorithm 1, last line).
+
+    learned = learn_from_mission("runs/axle", posterior=posterior, detector=detector)
+
+**The posterior** needs windows whose psi is known, and of the mission's own nobody knows it. Its motion is therefore
+simulated again, from where it began and under the actions that were given, with psi drawn from the prior. Psi is never
+drawn from the network's own belief: a network that is fed what it believes grows surer of it with each mission, right
+or wrong. What the mission adds is the motion and the ground; what it told about one psi is in the beliefs themselves,
+and `Sequential` narrows those.
+
+**The detector** takes windows of the mission for normal, by default those of trajectories without an alarm (`normal`).
+
+Both are judged on trajectories that nothing was learned from, and stay as they were where there are too few.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import nn
+
+from nfc_gym.adaptation import normal as normality
+from nfc_gym.adaptation import resume
+from nfc_gym.adaptation.normal import Normal, quiet_trajectories
+from nfc_gym.adaptation.relearning import relearned
+from nfc_gym.adaptation.trajectory import Dataset, Trajectory
+from nfc_gym.adaptation.worlds import full_id
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import require_writable, write_whole
+from nfc_gym.inference import detector_file
+from nfc_gym.inference.contrast import Contrast
+from nfc_gym.inference.data import WindowSet
+from nfc_gym.inference.detector import WindowDetector
+from nfc_gym.inference.jobs import device_of
+from nfc_gym.inference.posterior import NeuralPosterior, load
+from nfc_gym.inference.progress import Spoken, quiet
+from nfc_gym.inference.rates import Threshold
+from nfc_gym.inference.train import TrainConfig
+from nfc_gym.simulate.machine import MOTOR
+
+Array = NDArray[np.float64]
+REPORT, STATE = "learned.json", "state.safetensors"
+RATE = 0.05  # false-positive rate of windows, where a detector does not say which it was set for
+_TRAINING = TrainConfig(epochs=20, batch=128, rate=1e-4, warmup=20, average=0.99, patience=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnConfig:
+    """Settings of learning from a mission.
+
+    Attributes:
+      rate: wanted false-positive rate of windows; None is the one that the detector was calibrated for, or `RATE`.
+      simulations: windows that the posterior learns from.
+      effects: share of them with an effect that the model lacks.
+      motor: standard deviation of the motors' noise, a share of the actions' range.
+      training: of either; smaller steps than from the start, so that what was learned before is not lost.
+      seed: of everything.
+    """
+
+    rate: float | None = None
+    simulations: int = 4096
+    effects: float = 0.5
+    motor: float = MOTOR
+    training: TrainConfig = field(default_factory=lambda: _TRAINING)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.simulations < 100:
+            raise InputError(f"learning: simulations must be 100 or more, got {self.simulations}")
+
+
+@dataclass
+class Learned:
+    """What a mission left behind.
+
+    Attributes:
+      posterior, detector: to go on with; those that were given where nothing was changed.
+      report: for `posterior` and `detector`, whether it was `changed`, `why` not, and what it was judged by before and
+        after, with standard errors: `gain`, nats a parameter on motion and psi that it did not see; `false_alarms`,
+        their share on normal windows that it did not see, and `finds_injected`, AUROC. `windows` counts those.
+    """
+
+    posterior: NeuralPosterior | None
+    detector: WindowDetector | None
+    report: dict[str, Any]
+
+
+def learn_from_mission(
+    mission: str | Path | Dataset | Sequence[Trajectory], *, posterior: NeuralPosterior | str | Path | None = None,
+    detector: WindowDetector | str | Path | None = None, environment: str | None = None,
+    normal: Normal = quiet_trajectories, beside: WindowSet | None = None, config: LearnConfig | None = None,
+    folder: str | Path | None = None, jobs: int = 0, device: str = "auto", console: Console | None = None,
+) -> Learned:  # fmt: skip
+    """Train the posterior network and the detector further on what a mission gathered.
+
+    Args:
+      mission: the folder of `adapt`, or its data set.
+      posterior: a network's, or its file; None leaves it out. It stays as it is, a copy learns.
+      detector: of windows, or its file; likewise.
+      environment: id of the simulator; default the mission's own, if its folder says so.
+      normal: which control steps of a trajectory are normal motion, as a flag for each.
+      beside: windows that both were trained on before; as many of them are learned from again, so that nothing is
+        forgotten.
+      config: see `LearnConfig`.
+      folder: where what was learned is kept, and from where the same call goes on when it was interrupted; default
+        `learned` in the mission's folder. A data set without one keeps nothing.
+      jobs: processes of simulation; 0 takes all cores.
+      device: of training: auto, cpu or cuda.
+      console: is told.
+
+    Raises:
+      InputError: no such mission or file, one of another robot, or the folder holds what was learned otherwise.
+    """
+    config = config or LearnConfig()
+    trajectories, environment, folder = _mission(mission, environment, folder)
+    old = load(posterior) if isinstance(posterior, str | Path) else posterior
+    watch = detector_file.load(detector) if isinstance(detector, str | Path) else detector
+    _check(old, watch)
+    of = _described(trajectories, old, watch, config)
+    done = None if folder is None else _finished(folder, of, old, watch)
+    if done is not None:
+        return done
+    told = quiet if console is None else Spoken(console)
+    out, report = Learned(old, watch, {}), {"of": of}
+    if watch is not None:
+        rate = config.rate or (watch.calibration.rate if watch.calibration else RATE)
+        out.detector, report["detector"] = normality.tuned(
+            watch, trajectories, normal, rate, training=config.training, beside=beside,
+            folder=_part(folder, "detector"), report=told, seed=config.seed, device=device_of(device),
+        )  # fmt: skip
+        told.message(_says("detector", report["detector"]))
+    if old is not None:
+        out.posterior, report["posterior"] = relearned(
+            old, trajectories, environment, simulations=config.simulations, effects=config.effects,
+            motor=config.motor, training=config.training, beside=beside, folder=_part(folder, "posterior"),
+            report=told, seed=config.seed, jobs=jobs, device=device_of(device),
+        )  # fmt: skip
+        told.message(_says("posterior", report["posterior"]))
+    out.report = report
+    if folder is not None:
+        _keep(folder, out)
+    return out
+
+
+def _check(posterior: Any, detector: Any) -> None:
+    if posterior is None and detector is None:
+        raise InputError("learn_from_mission: give a posterior, a detector or both")
+    if posterior is not None and not isinstance(posterior, NeuralPosterior):
+        raise InputError(f"learn_from_mission: the posterior must be a network's, got a {type(posterior).__name__}")
+    if detector is not None and not isinstance(detector, WindowDetector):
+        raise InputError(f"learn_from_mission: want a WindowDetector, got a {type(detector).__name__}")
+
+
+def _mission(
+    mission: str | Path | Dataset | Sequence[Trajectory], environment: str | None, folder: str | Path | None
+) -> tuple[list[Trajectory], str, Path | None]:
+    """Trajectories, the simulator's id, and where to keep what is learned."""
+    if isinstance(mission, str | Path):
+        path = Path(mission)
+        state = path / STATE
+        if not state.is_file():
+            raise InputError(f"{path}: no mission; want a folder that `adapt(..., folder=...)` wrote")
+        environment = environment or resume.described(state).get("environment")
+        trajectories = list(Dataset(path, int(resume.plain(state)["t"])))
+        folder = path / "learned" if folder is None else folder
+    else:
+        trajectories = list(mission)
+    if not trajectories:
+        raise InputError("learn_from_mission: the mission has no trajectory")
+    if environment is None:
+        raise InputError("learn_from_mission: say which simulator's mission this was: environment='nfc_gym/...'")
+    if folder is not None:
+        require_writable(Path(folder))
+    return trajectories, full_id(environment), None if folder is None else Path(folder)
+
+
+def _described(
+    trajectories: Sequence[Trajectory], posterior: NeuralPosterior | None, detector: WindowDetector | None,
+    config: LearnConfig,
+) -> dict[str, Any]:  # fmt: skip
+    """What another call must have in common with this one to go on from it."""
+    digest = hashlib.sha256()
+    for t in trajectories:
+        digest.update(t.states.tobytes() + t.actions.tobytes() + t.scores.tobytes())
+    for net in (posterior and posterior.network, detector and detector.scorer):
+        if isinstance(net, nn.Module):
+            for tensor in net.state_dict().values():
+                digest.update(tensor.detach().cpu().numpy().tobytes())
+    parts = {"posterior": posterior is not None, "detector": detector is not None}
+    plain = {**asdict(config), **parts, "trajectories": len(trajectories), "digest": digest.hexdigest()[:16]}
+    return json.loads(json.dumps(plain))
+
+
+def _part(folder: Path | None, name: str) -> Path | None:
+    if folder is None:
+        return None
+    (folder / name).mkdir(parents=True, exist_ok=True)
+    return folder / name
+
+
+def _says(what: str, found: dict[str, Any]) -> str:
+    if not found["changed"]:
+        return f"{what}: not changed. {found['why']}"
+    parts = [
+        f"{name.replace('_', ' ')} {found[name]['before'][0]:.3g} -> {found[name]['after'][0]:.3g}"
+        for name in ("false_alarms", "finds_injected", "gain") if name in found
+    ]  # fmt: skip
+    return f"{what}: {', '.join(parts)}"
+
+
+def _keep(folder: Path, out: Learned) -> None:
+    """Write what was changed, then the report, which says that all is there."""
+    if out.detector is not None and isinstance(out.detector.scorer, Contrast) and out.report["detector"]["changed"]:
+        detector_file.save(folder / "detector.safetensors", out.detector)
+    if out.posterior is not None and out.report["posterior"]["changed"]:
+        out.posterior.save(folder / "posterior.safetensors")
+    write_whole(folder / REPORT, json.dumps(out.report, indent=1))
+
+
+def _finished(
+    folder: Path, of: dict[str, Any], posterior: NeuralPosterior | None, detector: WindowDetector | None
+) -> Learned | None:
+    """What an earlier call came to, if it ended.
+
+    Raises:
+      InputError: it was about something else.
+    """
+    path = folder / REPORT
+    if not path.is_file():
+        return None
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+        differ = [name for name, value in of.items() if report["of"].get(name) != value]
+    except (ValueError, KeyError, AttributeError) as e:
+        raise InputError(f"{path}: no report of what was learned ({e}): remove it to learn anew") from None
+    if differ:
+        raise InputError(
+            f"{path} is of another mission or other settings ({', '.join(differ)}): remove the folder, or use another"
+        )
+    out = Learned(posterior, detector, report)
+    if posterior is not None and report["posterior"]["changed"]:
+        out.posterior = load(folder / "posterior.safetensors", posterior.prior)
+    if detector is not None and report["detector"]["changed"]:
+        if isinstance(detector.scorer, Contrast):
+            out.detector = detector_file.load(folder / "detector.safetensors", detector.scorer.prior)
+        else:
+            threshold = Threshold(**report["detector"]["threshold"])
+            out.detector = WindowDetector(detector.scorer, threshold, detector.every)
+    return out

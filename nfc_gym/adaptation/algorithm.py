@@ -1,0 +1,275 @@
+"""The paper's Algorithm 1: informative sim-to-real adaptation with NFC.
+
+`adapt` is the loop, line by line; what a line does is a function of its own below, or a module beside this one. The
+policy is touched only after an anomaly. A world that never shows one leaves it as it was, to the bit, and says so.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from gymnasium.vector import VectorEnv
+from rich.console import Console
+from torch import nn
+
+from nfc_gym.adaptation import resume
+from nfc_gym.adaptation.agent import Agent
+from nfc_gym.adaptation.beliefs import Inference, inference_of, width
+from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portable, spread
+from nfc_gym.adaptation.hallucination import hallucination
+from nfc_gym.adaptation.imagined import imagined
+from nfc_gym.adaptation.network import Gaussian
+from nfc_gym.adaptation.optimise import optimise, pi_h_for
+from nfc_gym.adaptation.record import Record, in_words
+from nfc_gym.adaptation.sight import Sight, VectorSight
+from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute
+from nfc_gym.adaptation.worlds import full_id
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.posterior import Sampler
+from nfc_gym.inference.random import mixed
+from nfc_gym.wrappers.anomaly import opened
+
+STATE = "state.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptConfig:
+    """Settings of adaptation.
+
+    Attributes:
+      missions: trajectories that are executed.
+      worlds: N, simulations that are drawn from the belief.
+      steps: control steps of all of them together, after each anomaly.
+      episode: control steps of an episode in them; None is the environment's own.
+      hallucinate: train pi_h too, which leans the draws in the policy's favour.
+      parts: of the fidelity, those that are used where the belief speaks of them; ("psi",) is the paper's "w/o delta
+        fidelity".
+      beta: how far, in standard deviations of the belief, pi_h = 1 leads.
+      seed: of everything.
+    """
+
+    missions: int = 10
+    worlds: int = 256
+    steps: int = 500_000
+    episode: int | None = None
+    hallucinate: bool = True
+    parts: Sequence[str] = ("psi", "delta_s", "delta_e")
+    beta: float = 1.0
+    seed: int = 0
+
+
+@dataclass
+class Adapted:
+    """What adaptation came to; the agent that was given has learned in place.
+
+    Attributes:
+      dataset: every trajectory, anomalous or not.
+      posterior: what infers now.
+      belief: after the last anomaly; None without one.
+      anomalies: trajectories that were anomalous.
+      history: for each trajectory its return and what was done about it.
+    """
+
+    dataset: Dataset
+    posterior: Inference
+    belief: Sampler | None = None
+    anomalies: int = 0
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+
+def adapt(
+    agent: Agent, world: Any, posterior: Any, detector: Any, *, config: AdaptConfig | None = None,
+    environment: str | None = None, folder: str | Path | None = None, threshold: float | None = None, threads: int = 0,
+    settings: Mapping[str, Any] | None = None, ray: str | None = None, workers: int = 0,
+    console: Console | None = None,
+) -> Adapted:  # fmt: skip
+    """Adapt an agent to a world.
+
+    Args:
+      agent: any TorchRL actor and loss (see `Agent`); it learns in place.
+      world: the environment to do well in, single, with whatever around it makes it another than the simulator.
+      posterior: what infers (see `beliefs`).
+      detector: of anomalies, as for `MonitorAnomaly`, or the path of one.
+      config: see `AdaptConfig`.
+      environment: id of the simulator; default the world's own.
+      folder: where trajectories, curves and the state are kept; the same call goes on from there. None keeps nothing.
+      threshold: of the detector; default its own.
+      threads: of the physics; 0 takes every core. On a cluster of each worker, and 0 is one.
+      settings: of the simulator.
+      ray, workers: a Ray cluster on which the worlds of the belief are simulated, as of `pretrain`.
+      console: is told.
+
+    Raises:
+      InputError: the agent does not fit the world, or one of the arguments is none.
+    """
+    config = config or AdaptConfig()
+    cluster = cluster_of(ray, workers, threads, config.worlds)
+    run = _Run(agent, world, posterior, detector, config, environment, folder, threshold, threads,
+               dict(settings or {}), cluster, console)  # fmt: skip
+    while run.mission_goes_on():
+        tau = run.execute()
+        if tau.anomalous:
+            belief = run.infer(tau)  # psi, phi ~ q(psi, phi | tau)
+            worlds = run.hallucinate(belief)  # N of p(psi, phi | tau, pi_h)
+            run.optimise(worlds)  # pi', pi_h' = Policy-Opt(pi, pi_h, psi, phi)
+            run.update(tau, belief)  # q <- q({psi}, {phi} | {tau}): sequential NFC
+        run.store(tau)  # T = T + tau
+    return run.finish()  # fine-tune NFC with T
+
+
+class _Run:
+    """The state of `adapt`, and its lines."""
+
+    def __init__(
+        self, agent: Agent, world: Any, posterior: Any, detector: Any, config: AdaptConfig, environment: str | None,
+        folder: str | Path | None, threshold: float | None, threads: int, settings: dict[str, Any],
+        cluster: Cluster | None, console: Console | None,
+    ) -> None:  # fmt: skip
+        check_fit(agent, world)
+        self.agent, self.world, self.config, self.threads, self.cluster = agent, world, config, threads, cluster
+        self.environment = full_id(environment or world.spec.id)
+        self.settings = settings
+        self.detector, self.threshold = opened(detector, threshold)
+        self.inference = inference_of(posterior)
+        self.folder = None if folder is None else Path(folder)
+        self.record = Record(None if self.folder is None else self.folder / "log", console)
+        self.pi_h: Gaussian | None = None
+        self.t = self.steps = 0
+        self.belief: Sampler | None = None
+        self.history: list[dict[str, Any]] = []
+        self.now: dict[str, Any] = {}
+        self._go_on()
+
+    # ---- the lines of the algorithm -------------------------------------------------------------------------------
+
+    def mission_goes_on(self) -> bool:
+        """Whether there is another trajectory to execute."""
+        return self.t < self.config.missions
+
+    def execute(self) -> Trajectory:
+        """One episode in the world, watched by the detector."""
+        seed = mixed(self.config.seed, self.t) % 2**31
+        tau = execute(self.agent, self.world, self.detector, self.threshold, seed)
+        self.now = {
+            "return": tau.total, "length": len(tau), "reached": tau.reached, "anomalous": tau.anomalous,
+            "score": float(tau.scores.max()) / self.threshold,
+        }  # fmt: skip
+        return tau
+
+    def infer(self, tau: Trajectory) -> Sampler:
+        """What the trajectory tells about psi and residual fidelity."""
+        self.belief = belief = self.inference.infer(tau)
+        space = self.world.unwrapped.psi_space
+        self.now["width"] = width(belief, space.low, space.high)
+        return belief
+
+    def hallucinate(self, belief: Sampler) -> VectorSight | RayWorlds:
+        """N simulations of the belief; with pi_h each episode's psi and phi are mean + beta L pi_h."""
+        config = self.config
+        sent = belief if self.cluster is None else portable(belief)
+        make = partial(
+            imagined, self.environment, sent, hallucinate=config.hallucinate, parts=config.parts, beta=config.beta,
+            episode=config.episode or self.world.spec.max_episode_steps or 1000, sight=self.agent.sight,
+            settings=self.settings,
+        )  # fmt: skip
+        worlds = spread(make, config.worlds, self.threads, mixed(config.seed, self.t) % 2**31, self.cluster)
+        fresh = pi_h_for(self.agent, worlds, mixed(config.seed, self.t, 1))
+        if fresh is None or self.pi_h is None or self.pi_h.log_std.shape != fresh.log_std.shape:
+            self.pi_h = fresh
+        return worlds
+
+    def optimise(self, worlds: VectorSight | RayWorlds) -> None:
+        """Policy-Opt: pi and pi_h for the return in these worlds. A loss that comes apart changes nothing."""
+        try:
+            self.now |= optimise(
+                self.agent, worlds, self.config.steps, pi_h=self.pi_h, seed=mixed(self.config.seed, self.t, 2),
+                record=self.record, before=self.steps,
+            )  # fmt: skip
+        finally:
+            worlds.close()
+        self.steps += self.config.steps
+        if "diverged" in self.now:
+            self.record.say(f"mission {self.t}: {self.now['diverged']}; the policy is as before")
+
+    def update(self, tau: Trajectory, belief: Sampler) -> None:
+        """Sequential NFC."""
+        self.inference = self.inference.updated(tau, belief)
+
+    def store(self, tau: Trajectory) -> None:
+        """Every trajectory, anomalous or not; and the state to go on from."""
+        self.dataset.add(tau)
+        self.history.append(self.now)
+        self.record.scalars(self.t, {k: float(v) for k, v in self.now.items() if isinstance(v, int | float)})
+        shown = {k: v for k, v in self.now.items() if k in ("return", "length", "score", "width")}
+        what = "anomalous: adapted" if tau.anomalous else "no anomaly: the policy is not touched"
+        reached = "" if not self.world.unwrapped.robot.place_size else f"  reached {tau.reached}"
+        self.record.say(f"mission {self.t}: {in_words(shown)}{reached}  {what}")
+        self.t += 1
+        self._save()
+
+    def finish(self) -> Adapted:
+        """After the mission: what infers learns from all of it, where it can."""
+        anomalies = sum(tau.anomalous for tau in self.dataset)
+        tune = getattr(self.inference, "fine_tuned", None)
+        if anomalies and tune is not None:
+            self.inference = tune(self.dataset)
+        if not anomalies:
+            self.record.say(f"no anomaly in {len(self.dataset)} trajectories: nothing was changed")
+        return Adapted(self.dataset, self.inference, self.belief, anomalies, self.history)
+
+    # ---- inside ---------------------------------------------------------------------------------------------------
+
+    def _modules(self) -> dict[str, nn.Module]:
+        modules: dict[str, nn.Module] = {"agent": self.agent.weights or self.agent.actor}
+        return modules if self.pi_h is None else {**modules, "pi_h": self.pi_h}
+
+    def _described(self) -> dict[str, Any]:
+        config = {k: v for k, v in asdict(self.config).items() if k != "missions"}
+        return {"environment": self.environment, **config, "settings": self.settings, "threshold": self.threshold}
+
+    def _save(self) -> None:
+        if self.folder is None:
+            return
+        size = 0 if self.pi_h is None else len(self.pi_h.log_std)
+        plain = {"t": self.t, "steps": self.steps, "pi_h": size, "history": self.history}
+        resume.save(self.folder / STATE, self._modules(), None, plain, self._described())
+
+    def _go_on(self) -> None:
+        """From the state in the folder, if there is one; what infers is brought there by the same updates."""
+        path = None if self.folder is None else self.folder / STATE
+        if path is None or not path.is_file():
+            self.dataset = Dataset(self.folder)
+            return
+        size = int(resume.plain(path)["pi_h"])
+        if size:
+            self.pi_h = hallucination(self.agent.sight.size, size).to(self.agent.device)
+        plain = resume.load(path, self._modules(), None, self._described())
+        self.t, self.steps, self.history = plain["t"], plain["steps"], plain["history"]
+        self.dataset = Dataset(self.folder, self.t)
+        for tau in self.dataset:
+            if tau.anomalous:
+                self.belief = belief = self.inference.infer(tau)
+                self.inference = self.inference.updated(tau, belief)
+        self.record.say(f"going on from mission {self.t} of {self.config.missions}")
+
+
+def check_fit(agent: Agent, world: Any) -> None:
+    """Refuse an agent that cannot act in a world.
+
+    Raises:
+      InputError: the world is a vector environment or none of this package's, of another robot, or has another action.
+    """
+    if isinstance(world, VectorEnv) or not hasattr(world.unwrapped, "psi_space"):
+        raise InputError("adapt: the world is one environment of this package, single, with wrappers around it")
+    theirs, mine = Sight.of(world), agent.sight
+    if (mine.proprio, mine.goal) != (theirs.proprio, theirs.goal):
+        raise InputError(f"adapt: the agent is of another robot than {theirs.environment}: {mine.says()}")
+    if mine.cells is not None and theirs.cells is None:
+        raise InputError(f"adapt: the agent looks at elevation, and {theirs.environment} is flat ground")
+    size = agent.action_size()
+    if world.action_space.shape != (size,):
+        raise InputError(
+            f"adapt: the agent's actions have {size} entries, those of {theirs.environment} {world.action_space.shape}"
+        )

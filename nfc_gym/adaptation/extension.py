@@ -1,0 +1,228 @@
+"""An environment as close-loop found the machine to be: calibrated psi and the named effects, in many simulations.
+
+What of the calibrated parameters is psi of the environment becomes its psi, so that the critic sees it; the rest is
+written into the model (`corrected`). With `vary`, each simulation has sizes of its own, within their intervals.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+from nfc_gym.adaptation.corrected import Fields, Parameters, model_like, value_in
+from nfc_gym.adaptation.extended import Calibrated, Found, Named
+from nfc_gym.adaptation.worlds import full_id, vector_env
+from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.conditions import Conditioned
+from nfc_gym.simulate.machine import Machine
+from nfc_gym.wrappers import VectorApplyEffects, VectorRandomizePsi
+from nfc_gym.wrappers.effects import check_signals
+
+Array = NDArray[np.float64]
+_DRAWS = 4096  # psi that episodes draw from
+_MOVING = ("model", "action", "friction", "modulate", "force")  # hooks that change how a robot moves
+_RESTITUTION = "geom_restitution"  # MuJoCo has none: it cannot be read from a model
+
+
+@dataclass(frozen=True)
+class Bound:
+    """An effect in an environment.
+
+    Attributes:
+      id, sentence: as it was found.
+      effect: bound to the model.
+      theta, low, high: (k,) its values and their 95 % intervals.
+      acts: whether it changes motion; effects on sensors do not change what a policy sees.
+    """
+
+    id: str
+    sentence: str
+    effect: Effect
+    theta: Array
+    low: Array
+    high: Array
+    acts: bool
+
+
+class Extension:
+    """What was found, in an environment.
+
+    Args:
+      found: see `read_found`.
+      environment: id.
+      condition: whose values effects have that differ between conditions of the logs.
+      signals: exogenous signals that effects read: name -> number.
+
+    Attributes:
+      effects: that were named.
+      psi, psi_low, psi_high: (d,) the environment's psi.
+      moved: names of the calibrated parameters, psi or not, that are not nominal.
+
+    Raises:
+      InputError: an effect or a parameter names what the robot lacks; a model of another robot; a condition or a signal
+        that is missing.
+    """
+
+    def __init__(
+        self, found: Found, environment: str, *, condition: str | None = None,
+        signals: Mapping[str, float] | None = None,
+    ) -> None:  # fmt: skip
+        self.found, self.environment, self.signals = found, full_id(environment), dict(signals or {})
+        machine = Machine(self.environment)
+        self.model, self.space = machine.model, machine.space
+        try:
+            self.effects = tuple(self._bound(each, condition) for each in found.effects)
+            check_signals([e.effect for e in self.effects], self.signals)
+            self.psi = self.space.vector(dict(found.psi))
+            self.psi_low, self.psi_high = self.psi.copy(), self.psi.copy()
+            self._ties = np.arange(len(self.psi))
+            left = self._take(found.parameters)
+            self.rest = self._rest(left)
+        except InputError as e:
+            text = str(e)
+            told = text if text.startswith(str(found.source)) else f"{found.source}: {text}"
+            raise InputError(f"{told} (of {self.environment})") from None
+        self.moved = self._moved(left)
+
+    def require_something(self) -> None:
+        """Raises `InputError` where nothing was found that a policy could be adapted to."""
+        found = self.found
+        if not self.effects and not self.moved:
+            said = f"; the verdict is {found.verdict!r}" if found.verdict else ""
+            raise InputError(
+                f"{found.source}: there is nothing to adapt to: no effect is named and every calibrated parameter is "
+                f"nominal{said}"
+            )
+
+    def _bound(self, each: Named, condition: str | None) -> Bound:
+        effect, theta, low, high = each.effect, each.theta, each.low, each.high
+        if isinstance(effect, Conditioned):
+            if condition is None:
+                known = ", ".join(effect.conditions)
+                raise InputError(f"{each.id} differs between conditions: say --condition, one of {known}")
+            theta, low, high = (effect.inside(v, condition) for v in (theta, low, high))
+            effect = effect.inner
+        effect.bind(self.model)
+        return Bound(each.id, each.sentence, effect, theta, low, high, any(overrides(effect, h) for h in _MOVING))
+
+    def _take(self, parameters: Sequence[Calibrated]) -> list[Calibrated]:
+        """Calibrated values into psi, object by object; what is no psi is left."""
+        left = []
+        for p in parameters:
+            taken: set[str] = set()
+            first = -1
+            for i, mine in enumerate(self.space.parameters):
+                if mine.field == p.field and set(mine.of) <= set(p.of):
+                    self.psi[i], self.psi_low[i], self.psi_high[i] = p.value, p.low, p.high
+                    first = i if first < 0 else first
+                    self._ties[i] = first
+                    taken |= set(mine.of)
+            of = tuple(o for o in p.of if o not in taken)
+            if of or not p.of:
+                left.append(replace(p, of=of))
+        return left
+
+    def _rest(self, left: Sequence[Calibrated]) -> list[tuple[Effect, Array, Array, Array]]:
+        """What is written into the model after psi, with values and intervals."""
+        rest: list[tuple[Effect, Array, Array, Array]] = []
+        if left:
+            value, low, high = (np.array([getattr(p, k) for p in left], float) for k in ("value", "low", "high"))
+            rest.append((Parameters(left), value, low, high))
+        if self.found.model is not None:
+            theirs = model_like(self.found.model, self.model, self.environment)
+            self._read_psi(theirs)
+            rest.append((Fields(theirs), np.zeros(0), np.zeros(0), np.zeros(0)))
+        for effect, *_ in rest:
+            effect.bind(self.model)
+        return rest
+
+    def _read_psi(self, theirs: mujoco.MjModel) -> None:
+        """Psi as a corrected model has it."""
+        for i, p in enumerate(self.space.parameters):
+            if p.field == _RESTITUTION or p.name in self.found.psi:
+                continue
+            value = value_in(theirs, p)
+            if not np.isclose(value, self.space.nominal[i], rtol=1e-6):
+                self.psi[i] = self.psi_low[i] = self.psi_high[i] = value
+
+    def _moved(self, left: Sequence[Calibrated]) -> tuple[str, ...]:
+        off = ~np.isclose(self.psi, self.space.nominal, rtol=1e-6)
+        names = [n for n, o in zip(self.space.names, off, strict=True) if o]
+        names += [
+            p.name for p in left
+            if p.field == _RESTITUTION or not np.isclose(p.value, value_in(self.model, p), rtol=1e-6)
+        ]  # fmt: skip
+        return tuple(names + [f for e, *_ in self.rest if isinstance(e, Fields) for f in e.values])
+
+    def told(self) -> list[dict[str, Any]]:
+        """The calibrated parameters that are not nominal, as reports have them; `psi`: whether the environment's."""
+        x = self.space
+        rows = list(zip(x.names, x.units, x.nominal, self.psi, self.psi_low, self.psi_high, strict=True))
+        ours = len(rows)
+        for effect, theta, low, high in self.rest:
+            if isinstance(effect, Parameters):
+                nominal = [None if p.field == _RESTITUTION else value_in(self.model, p) for p in effect.given]
+                names, units = ([getattr(p, k) for p in effect.params] for k in ("name", "unit"))
+                rows += zip(names, units, nominal, theta, low, high, strict=True)
+        return [
+            {"name": name, "unit": unit, "nominal": None if nominal is None else float(nominal)}
+            | {"estimate": float(value), "low": float(low), "high": float(high), "psi": k < ours}
+            for k, (name, unit, nominal, value, low, high) in enumerate(rows)
+            if nominal is None or not np.isclose(value, nominal, rtol=1e-6)
+        ]
+
+    def without(self, effect: str) -> "Extension":
+        """The same without one of the effects, by its id."""
+        other = object.__new__(Extension)
+        other.__dict__.update(self.__dict__)
+        other.effects = tuple(e for e in self.effects if e.id != effect)
+        return other
+
+    def envs(
+        self, n: int, *, vary: float = 0.0, seed: int = 0, episode: int | None = None, threads: int = 0,
+        settings: Mapping[str, Any] | None = None,
+    ) -> VectorEnv:  # fmt: skip
+        """n simulations, made for `VectorSight`.
+
+        Args:
+          n: how many.
+          vary: sizes are uniform over this multiple of their 95 % intervals, psi anew in each episode, effects one in
+            each simulation; 0 is the fitted sizes in all.
+          seed: of these draws.
+          episode, threads, settings: as `vector_env`.
+        """
+        envs = vector_env(self.environment, n, threads=threads, episode=episode, **(settings or {}))
+        rng = np.random.default_rng(seed)
+        if not np.allclose(self.psi, self.space.nominal, rtol=1e-9):
+            psi = _drawn(self.psi, self.psi_low, self.psi_high, vary, _DRAWS, rng, self._ties) if vary else self.psi
+            envs = VectorRandomizePsi(envs, np.where(self._massive, np.maximum(psi, 1e-6), psi))
+        acting = [*self.rest, *((e.effect, e.theta, e.low, e.high) for e in self.effects)]
+        if not acting:
+            return envs
+        values = [_drawn(theta, low, high, vary, n, rng) for _, theta, low, high in acting]
+        values = [_within(e, theta, v) for (e, theta, *_), v in zip(acting, values, strict=True)]
+        return VectorApplyEffects(envs, [(e, t) for e, t, *_ in acting], self.signals, values=values)
+
+    @property
+    def _massive(self) -> NDArray[np.bool_]:
+        return np.array([p.field == "body_mass" for p in self.space.parameters])
+
+
+def _drawn(
+    value: Array, low: Array, high: Array, vary: float, n: int, rng: np.random.Generator,
+    ties: NDArray[np.intp] | None = None,
+) -> Array:  # fmt: skip
+    """(n, k) draws, uniform over `vary` times the interval about the value; those with the same tie go together."""
+    u = rng.random((n, len(value)))
+    low, high = value - vary * (value - low), value + vary * (high - value)
+    return low + (high - low) * (u if ties is None else u[:, ties])
+
+
+def _within(effect: Effect, theta: Array, values: Array) -> Array:
+    """Draws (n, k) inside the bounds that an effect has; a fit (k,) that went beyond widens them."""
+    return np.clip(values, np.minimum(effect.low, theta), np.maximum(effect.high, theta))

@@ -1,0 +1,83 @@
+"""The worlds that a policy is adapted in: simulations with psi, delta_s and delta_e as a posterior believes them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from nfc_gym.adaptation.sight import Sight, VectorSight
+from nfc_gym.adaptation.worlds import VectorStaggered, vector_env
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.fidelity import PARTS, Fidelity
+from nfc_gym.core.posterior import Sampler
+from nfc_gym.wrappers import VectorHallucinate, VectorRandomizePsi, VectorResidualDynamics, VectorResidualTerrain
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A posterior that speaks of some parts of a fidelity alone.
+
+    Attributes:
+      posterior: to draw from.
+      parts: that are kept of its draws.
+    """
+
+    posterior: Sampler
+    parts: tuple[str, ...]
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        """See `Sampler`."""
+        drawn = self.posterior.sample(n, rng)
+        return Fidelity(**{part: getattr(drawn, part) for part in self.parts})
+
+
+def spoken(posterior: Sampler, wanted: Sequence[str]) -> tuple[str, ...]:
+    """Of the parts that are wanted those that a posterior speaks of.
+
+    Raises:
+      InputError: of none.
+    """
+    wrong = [p for p in wanted if p not in PARTS]
+    if wrong:
+        raise InputError(f"adapt: a fidelity has no part {wrong[0]!r}; it has: {', '.join(PARTS)}")
+    given = posterior.sample(2, np.random.default_rng(0)).given
+    found = tuple(p for p in wanted if p in given)
+    if not found:
+        raise InputError(f"adapt: the posterior speaks of {', '.join(given) or 'nothing'}, not of {', '.join(wanted)}")
+    return found
+
+
+def imagined(
+    environment: str, belief: Sampler, n: int, *, hallucinate: bool, parts: Sequence[str], beta: float, episode: int,
+    threads: int, seed: int, sight: Sight | None = None, settings: dict[str, Any] | None = None,
+) -> VectorSight:  # fmt: skip
+    """n simulations whose episodes are drawn from a belief, or from it as pi_h leans it.
+
+    Args:
+      environment: id.
+      belief: a posterior given what was observed.
+      n: simulations.
+      hallucinate: widen the action by pi_h; else each episode draws from the belief itself.
+      parts: of the fidelity, those that are used where the belief speaks of them.
+      beta: see `Hallucinate`.
+      episode: control steps.
+      threads: of the physics.
+      seed: of the first episodes' ends.
+      sight: what is seen of them.
+      settings: of the environment.
+    """
+    found = spoken(belief, parts)
+    envs: VectorEnv = vector_env(environment, n, threads=threads, episode=episode, **(settings or {}))
+    if "delta_e" in found and envs.unwrapped.rough:  # type: ignore[attr-defined]
+        envs = VectorResidualTerrain(envs, Parts(belief, ("delta_e",)))
+    moving = tuple(p for p in found if p != "delta_e")
+    if hallucinate and moving:
+        envs = VectorHallucinate(envs, Parts(belief, moving), beta=beta)
+    else:
+        if "psi" in moving:
+            envs = VectorRandomizePsi(envs, Parts(belief, ("psi",)))
+        if "delta_s" in moving:
+            envs = VectorResidualDynamics(envs, Parts(belief, ("delta_s",)))
+    return VectorSight(VectorStaggered(envs, episode, seed), sight)

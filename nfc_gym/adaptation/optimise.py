@@ -1,0 +1,81 @@
+"""Policy-Opt: an agent, with pi_h beside it or without, learns in some worlds."""
+
+import copy
+from contextlib import closing
+from typing import Any
+
+import torch
+
+from nfc_gym.adaptation.agent import Agent
+from nfc_gym.adaptation.gathering import RayWorlds, gathered
+from nfc_gym.adaptation.hallucination import hallucination, widened
+from nfc_gym.adaptation.network import Gaussian
+from nfc_gym.adaptation.ppo import Diverged
+from nfc_gym.adaptation.record import Episodes, Record, in_words
+from nfc_gym.adaptation.sight import VectorSight
+from nfc_gym.core.errors import InputError
+from nfc_gym.inference.random import mixed
+
+
+def pi_h_for(agent: Agent, worlds: VectorSight | RayWorlds, seed: int) -> Gaussian | None:
+    """An untrained pi_h for the entries that the worlds' action has beyond the agent's; None where there are none.
+
+    Raises:
+      InputError: the worlds' action is shorter than the agent's.
+    """
+    more = int(worlds.single_action_space.shape[0]) - agent.action_size()  # type: ignore[index]
+    if more < 0:
+        raise InputError(f"optimise: the agent's actions have {-more} entries more than the worlds take")
+    torch.manual_seed(seed)
+    return hallucination(agent.sight.size, more).to(agent.device) if more else None
+
+
+def optimise(
+    agent: Agent, worlds: VectorSight | RayWorlds, steps: int, *, pi_h: Gaussian | None = None, seed: int = 0,
+    record: Record | None = None, before: int = 0,
+) -> dict[str, Any]:  # fmt: skip
+    """Train an agent for the return in some worlds; it learns in place.
+
+    Where the worlds hallucinate, `pi_h` learns with it. A loss that comes apart leaves both as they were.
+
+    Args:
+      agent: which.
+      worlds: vector environment; made by `imagined`, or any other: the true world itself for an oracle; or on a
+        cluster (`RayWorlds`).
+      steps: control steps of all simulations together.
+      pi_h: see `pi_h_for`.
+      seed: of actions and of the worlds' draws.
+      record: what is written down.
+      before: steps that were taken in earlier calls, by which curves are drawn.
+
+    Returns:
+      `imagined_before` and `imagined_after`, mean returns of the first and the last episodes that ended; where the loss
+      came apart `diverged`, why.
+    """
+    size = int(worlds.single_action_space.shape[0])  # type: ignore[index]
+    actor = agent.actor if pi_h is None else widened(agent.actor, pi_h)
+    learner = agent.learner(actor, size)
+    kept = [(m, copy.deepcopy(m.state_dict())) for m in (learner.loss, actor)]
+    record, episodes, first, done = record or Record(None, None), Episodes(), {}, 0
+    torch.manual_seed(mixed(seed, 0))
+    if isinstance(worlds, RayWorlds):
+        worlds.restarted = episodes.forget
+    try:
+        with closing(gathered(worlds, actor, learner.horizon, agent.device, mixed(seed, 1))) as drawn:
+            while done < steps:
+                batch = next(drawn)
+                if pi_h is not None and pi_h.scale.count == 0:
+                    pi_h.scale.see(batch["observation"])
+                values = learner.learn(batch)
+                episodes.see(batch)
+                done += batch.numel()
+                found = episodes.means()
+                first = first or found
+                record.scalars(before + done, {f"worlds/{k}": v for k, v in (values | found).items()})
+                said = f"{done:,}/{steps:,} steps in {worlds.num_envs} worlds  {in_words(found)}"
+                record.line(said, done >= steps)
+    except Diverged as e:
+        for module, state in kept:
+            module.load_state_dict(state)
+        return {"diverged": str(e)}
+    return {"imagined_before": first.get("return"), "imagined_after": episodes.means().get("return")}

@@ -1,0 +1,118 @@
+"""Watch a policy: episodes in its environment, as a video or a sheet of pictures, and what they came to."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from nfc_gym.adaptation.policy import Policy, load_policy
+from nfc_gym.adaptation.worlds import full_id
+from nfc_gym.core.errors import InputError, MissingExtra
+
+VIDEOS, PICTURES = (".mp4", ".avi"), (".png", ".jpg", ".jpeg")
+_SHEET = (3, 4)  # rows and columns
+_SIZE = (480, 360)  # width and height of a frame
+EVERY_VIDEO, EVERY_SHEET = 2, 10  # control steps between two frames: 25 a second, or enough to choose from
+Frame = NDArray[np.uint8]
+
+
+def play(
+    environment: str, policy: str | Path | None = None, out: str | Path | None = None, *, episodes: int = 1,
+    seed: int = 0, console: Console | None = None,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Run whole episodes in the nominal world.
+
+    Args:
+      environment: id.
+      policy: file; default the environment's pretrained one.
+      out: a video, or a picture with a dozen moments of the first episode; None shows nothing.
+      episodes: how many; the k-th begins from seed + k.
+      seed: see above.
+      console: is told.
+
+    Returns:
+      For each episode `return`, `length`, where there is a goal `success` (it was reached at any time).
+
+    Raises:
+      InputError: no such environment or policy, one that does not fit, or an `out` of another kind.
+      MissingExtra: nothing can be rendered here.
+    """
+    name, path = full_id(environment), None if out is None else Path(out)
+    if path is not None and path.suffix.lower() not in VIDEOS + PICTURES:
+        raise InputError(f"{path}: want a video ({', '.join(VIDEOS)}) or a picture ({', '.join(PICTURES)})")
+    loaded = load_policy(name if policy is None else policy)
+    look: dict[str, Any] = {} if path is None else {"render_mode": "rgb_array", "width": _SIZE[0], "height": _SIZE[1]}
+    context = ["psi", "elevation"] if loaded.sight.cells else ["psi"]
+    env = gymnasium.make(name, context=context, **look)
+    loaded.require(env)
+    console = console or Console()
+    found, frames = [], []
+    for k in range(episodes):
+        keep = path is not None and (k == 0 or path.suffix.lower() in VIDEOS)
+        every = EVERY_VIDEO if path is None or path.suffix.lower() in VIDEOS else EVERY_SHEET
+        score, seen = episode(env, loaded, seed + k, every if keep else 0)
+        found.append(score)
+        frames += seen
+        console.print(f"episode {k}: " + ", ".join(f"{key} {value:.4g}" for key, value in score.items()))
+    env.close()
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write = video if path.suffix.lower() in VIDEOS else sheet
+        write(path, frames)
+        console.print(f"{path}: {len(frames)} frames")
+    return found
+
+
+def episode(
+    env: Any, policy: Policy | Callable[[Any], Any], seed: int, every: int
+) -> tuple[dict[str, Any], list[Frame]]:
+    """One episode, and a frame each so many control steps; 0 renders nothing."""
+    observation, info = env.reset(seed=seed)
+    frames: list[Frame] = []
+    total, length, over, reached = 0.0, 0, False, False
+    while not over:
+        if every and length % every == 0:
+            frames.append(rendered(env))
+        observation, reward, ended, truncated, info = env.step(policy(observation))
+        total, length, over = total + float(reward), length + 1, bool(ended or truncated)
+        reached |= bool(info.get("success", False))
+    score: dict[str, Any] = {"return": total, "length": length}
+    return (score | {"success": reached} if "success" in info else score), frames
+
+
+def rendered(env: Any) -> Frame:
+    """A picture; raises `MissingExtra` where there is no graphics library."""
+    try:
+        return env.render()
+    except InputError:
+        raise
+    except Exception as e:
+        raise MissingExtra(
+            f"nothing can be rendered here ({e}): install a graphics library (EGL or OSMesa) and set MUJOCO_GL, or "
+            "leave out --out"
+        ) from None
+
+
+def video(path: Path, frames: list[Frame]) -> None:
+    """In real time."""
+    code = cv2.VideoWriter.fourcc(*("mp4v" if path.suffix.lower() == ".mp4" else "MJPG"))
+    writer = cv2.VideoWriter(str(path), code, 50.0 / EVERY_VIDEO, (frames[0].shape[1], frames[0].shape[0]))
+    if not writer.isOpened():
+        raise InputError(f"{path}: no video can be written there; try .avi, or a picture (.png)")
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
+
+
+def sheet(path: Path, frames: list[Frame]) -> None:
+    """A dozen moments, evenly spread, from left to right and from top to bottom."""
+    rows, columns = _SHEET
+    chosen = [frames[round(k)] for k in np.linspace(0, len(frames) - 1, rows * columns)]
+    whole = np.concatenate([np.concatenate(chosen[r * columns : (r + 1) * columns], 1) for r in range(rows)], 0)
+    if not cv2.imwrite(str(path), cv2.cvtColor(whole, cv2.COLOR_RGB2BGR)):
+        raise InputError(f"{path}: cannot be written")

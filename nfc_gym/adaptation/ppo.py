@@ -1,0 +1,176 @@
+"""PPO on TorchRL's clipped loss, advantage estimator and replay buffer; the step size follows the divergence."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
+from torchrl.objectives import ClipPPOLoss, LossModule, ValueEstimators
+
+from nfc_gym.core.errors import NfcError
+
+Actor = ProbabilisticTensorDictSequential
+_TOLD = ("loss_critic", "kl_approx", "clip_fraction")
+_SLOWEST, _FASTEST = 1e-5, 2e-3  # step sizes
+_RUNAWAY = 5.0  # nats between two policies of one iteration: nothing that was learned so far is left
+_FORGET = 0.98  # an iteration's share of the past in the size of rewards
+
+
+class Diverged(NfcError):
+    """Training came apart; the message says how, and the weights are those from before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig:
+    """Settings of PPO.
+
+    Attributes:
+      gamma, trace: discount a control step, and lambda of the generalised advantage.
+      clip: of the ratio of densities.
+      epochs, minibatches: passes over an iteration's steps, and parts of each.
+      rate: first step size.
+      divergence: nats that the policy should move an iteration; the step size is led there.
+      entropy: weight of the bonus.
+      norm: gradients are cut to this.
+    """
+
+    gamma: float = 0.99
+    trace: float = 0.95
+    clip: float = 0.2
+    epochs: int = 5
+    minibatches: int = 4
+    rate: float = 3e-4
+    divergence: float = 0.01
+    entropy: float = 0.002
+    norm: float = 1.0
+
+
+def summed(losses: TensorDictBase) -> Tensor:
+    """What a TorchRL loss wants minimised: the sum of its terms."""
+    return torch.stack([v.mean() for k, v in losses.items() if str(k).startswith("loss_")]).sum()
+
+
+class Power(nn.Module):
+    """Running mean square of rewards."""
+
+    value: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("value", torch.zeros(()))
+
+    @torch.no_grad()
+    def forward(self, reward: Tensor) -> Tensor:
+        """Rewards over their root mean square, these included."""
+        square = reward.square().mean()
+        self.value.copy_(square if self.value == 0 else _FORGET * self.value + (1 - _FORGET) * square)
+        return reward / (self.value.sqrt() + 1e-8)
+
+
+def clipped(actor: Actor, critic: TensorDictModule, config: PPOConfig) -> ClipPPOLoss:
+    """PPO's loss of an actor and a critic.
+
+    It is not functional: the modules stay one with those that collect and those that are saved.
+    """
+    return ClipPPOLoss(
+        actor, critic, clip_epsilon=config.clip, entropy_coeff=config.entropy, critic_coeff=1.0,
+        loss_critic_type="l2", normalize_advantage=True, clip_value=config.clip, functional=False,
+    )  # fmt: skip
+
+
+class OnPolicy:
+    """Improves an actor and a critic from batches of steps that the actor took, by any loss that wants advantages.
+
+    Rewards are divided by their running root mean square and by the horizon 1 / (1 - gamma), so that values are of
+    order one whatever a robot's reward is measured in.
+
+    Args:
+      loss: a TorchRL loss with a critic of state values, `clipped` or another of its on-policy ones.
+      config: see `PPOConfig`; `clip` and `entropy` are of the loss.
+
+    Attributes:
+      horizon: control steps of each simulation that it wants in a batch.
+    """
+
+    horizon = 32
+
+    def __init__(self, loss: LossModule, config: PPOConfig) -> None:
+        self.config, self.loss = config, loss
+        loss.make_value_estimator(ValueEstimators.GAE, gamma=config.gamma, lmbda=config.trace)
+        self.optimiser = torch.optim.Adam(loss.parameters(), lr=config.rate, eps=1e-5)
+        self.power = Power().to(next(loss.parameters()).device)
+
+    @property
+    def rate(self) -> float:
+        """The present step size."""
+        return self.optimiser.param_groups[0]["lr"]
+
+    @rate.setter
+    def rate(self, value: float) -> None:
+        for group in self.optimiser.param_groups:
+            group["lr"] = min(max(value, _SLOWEST), _FASTEST)
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """One iteration.
+
+        Args:
+          batch: (n, T) steps in the order in which they were taken.
+
+        Returns:
+          Means over the updates: losses, `divergence` in nats, `clipped` share, step size.
+
+        Raises:
+          Diverged: a loss is not finite, or the policy ran away.
+        """
+        steps = self._prepared(batch)
+        buffer = self._filled(steps)
+        rows = [self._update(buffer.sample()) for _ in range(self.config.epochs * self.config.minibatches)]
+        mean = torch.tensor(rows).mean(0).tolist()
+        return dict(zip(("loss", "critic_loss", "divergence", "clipped"), mean, strict=True)) | {"rate": self.rate}
+
+    def _filled(self, steps: TensorDictBase) -> ReplayBuffer:
+        """A buffer of these steps; a new one each time, whose order follows from the present seed alone."""
+        buffer = ReplayBuffer(
+            storage=LazyTensorStorage(len(steps), device=steps.device or "cpu"), sampler=SamplerWithoutReplacement(),
+            batch_size=max(1, len(steps) // self.config.minibatches),
+        )  # fmt: skip
+        buffer.extend(steps)
+        return buffer
+
+    @torch.no_grad()
+    def _prepared(self, batch: TensorDictBase) -> TensorDictBase:
+        """(n T,) steps with advantages."""
+        scaled = batch.copy()
+        scaled["next", "reward"] = (1 - self.config.gamma) * self.power(batch["next", "reward"])
+        loss: Any = self.loss
+        params = loss.critic_network_params  # None where the loss is not functional
+        loss.value_estimator(
+            scaled,
+            params=None if params is None else params.detach(),
+            target_params=loss.target_critic_network_params,
+        )
+        return scaled.exclude("next", "done", "terminated", "truncated", "success", "collector").reshape(-1)
+
+    def _update(self, steps: TensorDictBase) -> tuple[float, float, float, float]:
+        losses = self.loss(steps)
+        total = summed(losses)
+        told = [losses.get(key, torch.zeros(())).mean().to(total.device) for key in _TOLD]
+        row = torch.stack([total, *told])
+        loss, critic, divergence, clipped = row.detach().tolist()
+        if not row.isfinite().all():
+            raise Diverged(f"the loss is not finite ({loss:g}; of the critic {critic:g}, {divergence:g} nats moved)")
+        if divergence > _RUNAWAY:
+            raise Diverged(f"the policy moved by {divergence:.3g} nats within an iteration, more than {_RUNAWAY:g}")
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        nn.utils.clip_grad_norm_(self.loss.parameters(), self.config.norm)
+        self.optimiser.step()
+        if divergence > 2 * self.config.divergence:
+            self.rate /= 1.5
+        elif divergence < self.config.divergence / 2:
+            self.rate *= 1.5
+        return loss, critic, divergence, clipped

@@ -1,0 +1,99 @@
+"""What is written down while a policy learns: episodes, scalars through TorchRL's loggers, a progress line."""
+
+import logging
+from collections import deque
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from tensordict import TensorDictBase
+from torchrl.record import CSVLogger, TensorboardLogger
+from torchrl.record.loggers import Logger
+
+_RECENT = 200  # episodes that means are over
+
+
+class Episodes:
+    """Returns, lengths and successes of the episodes that end, from batches of steps (n, T).
+
+    An episode is a success if its goal was reached in it at any time.
+    """
+
+    def __init__(self) -> None:
+        self._sums: torch.Tensor | None = None
+        self._recent: deque[tuple[float, float, float]] = deque(maxlen=_RECENT)
+        self.goals = False
+        self.count = 0
+
+    @torch.no_grad()
+    def see(self, batch: TensorDictBase) -> None:
+        """Steps in the order in which they were taken."""
+        reward, done = batch["next", "reward"][..., 0], batch["next", "done"][..., 0]
+        self.goals = ("next", "success") in batch.keys(True)
+        reached = batch["next", "success"] if self.goals else torch.zeros_like(done)
+        parts = torch.stack([reward, torch.ones_like(reward), reached.to(reward.dtype)]).cpu()
+        done = done.cpu()
+        sums = torch.zeros(3, len(done)) if self._sums is None else self._sums
+        for t in range(done.shape[1]):
+            sums = sums + parts[:, :, t]
+            over = done[:, t]
+            if over.any():
+                self._recent.extend((r, n, float(s > 0)) for r, n, s in sums[:, over].T.tolist())
+                self.count += int(over.sum())
+                sums = torch.where(over, 0.0, sums)
+        self._sums = sums
+
+    def forget(self, rows: slice) -> None:
+        """The running episodes of some simulations, which begin anew without having ended."""
+        if self._sums is not None:
+            self._sums[:, rows] = 0.0
+
+    def means(self) -> dict[str, float]:
+        """Over the last episodes; nothing before the first ends."""
+        if not self._recent:
+            return {}
+        returns, lengths, reached = torch.tensor(list(self._recent)).mean(0).tolist()
+        return {"return": returns, "length": lengths} | ({"success": reached} if self.goals else {})
+
+
+class Record:
+    """Scalars by step into CSV files, into TensorBoard where that is installed, and on one line of the terminal.
+
+    Args:
+      folder: of the files; None writes none.
+      console: None says nothing.
+    """
+
+    def __init__(self, folder: Path | None, console: Console | None) -> None:
+        logging.getLogger("torchrl").setLevel(logging.WARNING)  # the size of each buffer is no news
+        self.console = console
+        self._loggers: list[Logger] = []
+        if folder is not None:
+            self._loggers.append(CSVLogger("csv", log_dir=str(folder)))
+            if find_spec("tensorboard") is not None:
+                self._loggers.append(TensorboardLogger("tensorboard", log_dir=str(folder)))
+            else:
+                self.say("no TensorBoard here, the curves go into CSV files alone: pip install tensorboard")
+
+    def scalars(self, step: int, values: dict[str, float]) -> None:
+        """Write values down."""
+        for logger in self._loggers:
+            for name, value in values.items():
+                logger.log_scalar(name, value, step=step)
+
+    def line(self, text: str, last: bool = False) -> None:
+        """A line that the next one replaces on a terminal."""
+        if self.console is not None:
+            end = "\r" if self.console.is_terminal and not last else "\n"
+            self.console.print(text, end=end, highlight=False, markup=False, soft_wrap=True)
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        self.line(text, last=True)
+
+
+def in_words(values: dict[str, Any]) -> str:
+    """`return 123.4  success 0.85 ...`"""
+    return "  ".join(f"{k} {v:.4g}" for k, v in values.items())

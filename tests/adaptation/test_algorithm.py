@@ -1,0 +1,167 @@
+"""Algorithm 1: nothing is touched without an anomaly, all is kept, a run that stopped ends as one that did not."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+
+from nfc_gym import InputError
+from nfc_gym.adaptation import AdaptConfig, Agent, adapt, load_policy, ppo_agent, sac_agent
+from nfc_gym.adaptation.agent import OffPolicyConfig
+from nfc_gym.adaptation.sight import Sight
+from nfc_gym.adaptation.trajectory import Trajectory
+from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.wrappers import RandomizePsi
+
+CONFIG = AdaptConfig(missions=2, worlds=8, steps=512, episode=40)
+
+
+class Alarm:
+    """A detector that finds the k-th transition of each episode unusual; None finds none so."""
+
+    threshold = 1.0
+
+    def __init__(self, at: int | None) -> None:
+        self.at, self.count = at, 0
+
+    def reset(self, rows: Any = None) -> None:
+        self.count = 0
+
+    def update(self, obs: Any, action: Any, next_obs: Any) -> float:
+        self.count += 1
+        return 2.0 if self.count == self.at else 0.1
+
+
+def world(name: str = "JackalFlat", **kwargs: Any) -> gym.Env:
+    """Other than the simulator: its base is heavy."""
+    env = gym.make(f"nfc_gym/{name}-v0", context=["psi"], max_episode_steps=30, **kwargs)
+    return RandomizePsi(env, {"base_mass": (30.0, 30.0)}) if name == "JackalFlat" else env
+
+
+def belief(delta_s: bool = True) -> Fidelity:
+    """Samples around the world's psi, and a residual of the speed."""
+    rng, space = np.random.default_rng(0), gym.make("nfc_gym/JackalFlat-v0").unwrapped.psi_space
+    psi = np.tile(space.nominal, (64, 1))
+    psi[:, 0] = 30 + rng.standard_normal(64)
+    residual = np.zeros((64, 15))
+    residual[:, 4] = 0.01 * rng.standard_normal(64)
+    return Fidelity(psi, residual) if delta_s else Fidelity(psi)
+
+
+def state(module: nn.Module) -> dict[str, torch.Tensor]:
+    return {k: v.clone() for k, v in module.state_dict().items()}
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(v, b[k]) for k, v in a.items())
+
+
+def test_a_world_without_anomalies_changes_nothing(jackal: Path, tmp_path: Path) -> None:
+    policy, said = load_policy(jackal), Console(record=True, width=200, file=open("/dev/null", "w"))  # noqa: SIM115
+    before = state(policy.network)
+    done = adapt(
+        ppo_agent(policy), world(), belief(), Alarm(None), config=CONFIG, folder=tmp_path, threads=1, console=said
+    )
+    assert same(state(policy.network), before)
+    assert (done.anomalies, len(done.dataset), done.belief) == (0, 2, None)
+    assert "no anomaly in 2 trajectories: nothing was changed" in said.export_text()
+    kept = Trajectory.load(tmp_path / "trajectory_00001.npz")
+    np.testing.assert_array_equal(kept.states, done.dataset[1].states)
+    assert len(kept) == 30
+    assert kept.states.shape == (31, 15)
+
+
+@pytest.mark.parametrize("hallucinate", [True, False])
+def test_an_anomaly_adapts_the_policy_and_is_kept_like_the_rest(jackal: Path, hallucinate: bool) -> None:
+    policy = load_policy(jackal)
+    before = state(policy.network)
+    config = AdaptConfig(missions=1, worlds=8, steps=512, episode=40, hallucinate=hallucinate)
+    done = adapt(ppo_agent(policy), world(), belief(), Alarm(20), config=config, threads=1)
+    after = state(policy.network)
+    assert done.anomalies == 1
+    assert done.history[0]["width"] < 0.1, "of psi as the belief has it, over the prior's"
+    assert (after["gaussian.body.0.weight"] != before["gaussian.body.0.weight"]).any()
+    assert torch.equal(after["scale.mean"], before["scale.mean"])
+    assert len(done.dataset[0].until_alarm()) == 20
+
+
+def test_a_run_that_stopped_ends_as_one_that_did_not(jackal: Path, tmp_path: Path) -> None:
+    whole, halves = load_policy(jackal), load_policy(jackal)
+    one = adapt(ppo_agent(whole), world(), belief(), Alarm(9), config=CONFIG, folder=tmp_path / "a", threads=1)
+    first = AdaptConfig(**{**CONFIG.__dict__, "missions": 1})
+    adapt(ppo_agent(halves), world(), belief(), Alarm(9), config=first, folder=tmp_path / "b", threads=1)
+    fresh = load_policy(jackal)  # another process knows only the file that it was given
+    two = adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=CONFIG, folder=tmp_path / "b", threads=1)
+    assert same(state(whole.network), state(fresh.network))
+    assert one.history == two.history
+    other = AdaptConfig(**{**CONFIG.__dict__, "seed": 1})
+    with pytest.raises(InputError, match="another run"):
+        adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=other, folder=tmp_path / "b", threads=1)
+
+
+def test_sac_adapts_too(jackal: Path) -> None:
+    policy = load_policy(jackal)
+    before = state(policy.network.gaussian)
+    agent = sac_agent(policy, OffPolicyConfig(batch=64, updates=2, critic_first=4))
+    done = adapt(agent, world(), belief(False), Alarm(20), config=CONFIG, threads=1)
+    assert done.anomalies == 2
+    assert not same(state(policy.network.gaussian), before)
+    assert all(v.isfinite().all() for v in policy.network.state_dict().values())
+
+
+def test_an_agent_of_a_script_that_knows_nothing_of_us() -> None:
+    """Written against `GymEnv("nfc_gym:nfc_gym/JackalFlat-v0", context=[])` alone."""
+    net = nn.Sequential(nn.Linear(17, 32), nn.Tanh(), nn.Linear(32, 4), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(net, ["observation"], ["loc", "scale"]), in_keys=["loc", "scale"],
+        distribution_class=TanhNormal, return_log_prob=True,
+    )  # fmt: skip
+    critic = ValueOperator(nn.Linear(17, 1), in_keys=["observation"])
+    before = copy.deepcopy(net.state_dict())
+    agent = Agent(actor, lambda a, size: ClipPPOLoss(a, critic, entropy_bonus=False), Sight.of(world()))
+    adapt(agent, world(), belief(), Alarm(20), config=CONFIG, threads=1)
+    assert any((before[k] != v).any() for k, v in net.state_dict().items())
+
+
+def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path) -> None:
+    policy = load_policy(jackal)
+    agent, before = ppo_agent(policy), state(policy.network)
+
+    class Broken(ClipPPOLoss):
+        def forward(self, tensordict: Any) -> Any:
+            out = super().forward(tensordict)
+            self.seen = getattr(self, "seen", 0) + 1
+            return out if self.seen < 30 else out.apply(lambda x: x * float("nan"))
+
+    agent.loss = lambda actor, size: Broken(actor, policy.network.critic, functional=False)
+    done = adapt(agent, world(), belief(), Alarm(20), config=CONFIG, threads=1)
+    assert "not finite" in done.history[0]["diverged"]
+    assert same(state(policy.network), before)
+
+
+def test_what_does_not_fit_is_named(jackal: Path) -> None:
+    agent = ppo_agent(load_policy(jackal))
+    with pytest.raises(InputError, match="another robot than nfc_gym/AntFlat-v0"):
+        adapt(agent, world("AntFlat"), belief(), Alarm(None))
+    with pytest.raises(InputError, match="single"):
+        adapt(agent, gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=2), belief(), Alarm(None))
+    with pytest.raises(InputError, match="a posterior has sample"):
+        adapt(agent, world(), object(), Alarm(None))
+    with pytest.raises(InputError, match="reset"):
+        adapt(agent, world(), belief(), object())
+    with pytest.raises(InputError, match="not of delta_e"):
+        adapt(agent, world(), belief(), Alarm(5), config=AdaptConfig(parts=("delta_e",)), threads=1)
+    wide = Agent(agent.actor, agent.loss, agent.sight)
+    narrow = gym.wrappers.RescaleAction(world(), -1.0, 1.0)
+    narrow.action_space = gym.spaces.Box(-1, 1, (3,))
+    with pytest.raises(InputError, match="2 entries"):
+        adapt(wide, narrow, belief(), Alarm(None))

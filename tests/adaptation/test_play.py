@@ -1,0 +1,41 @@
+"""Watching a policy: what an episode came to, pictures and videos of it."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from nfc_gym import InputError
+from nfc_gym.adaptation import play
+from nfc_gym.adaptation.play import sheet, video
+
+
+def test_an_episode_is_what_it_is_without_looking(jackal: Path) -> None:
+    first, second = play.play("JackalFlat", jackal, episodes=2, seed=3)
+    assert first["length"] == 1000
+    assert {"return", "length", "success"} == set(first)
+    assert play.play("JackalFlat", jackal, seed=4) == [second]
+
+
+def test_a_sheet_shows_a_dozen_moments_in_their_order(tmp_path: Path) -> None:
+    frames = [np.full((6, 8, 3), [k, 0, 0], np.uint8) for k in range(100)]
+    sheet(tmp_path / "sheet.png", frames)
+    seen = cv2.imread(str(tmp_path / "sheet.png"))
+    assert seen.shape == (18, 32, 3)
+    tiles = seen[::6, ::8, 2].reshape(-1)
+    assert (tiles[0], tiles[-1]) == (0, 99)
+    assert (np.diff(tiles.astype(int)) > 0).all()
+
+
+def test_a_video_plays_in_real_time(tmp_path: Path) -> None:
+    video(tmp_path / "v.mp4", [np.full((48, 64, 3), 5 * k, np.uint8) for k in range(50)])
+    read = cv2.VideoCapture(str(tmp_path / "v.mp4"))
+    assert read.get(cv2.CAP_PROP_FRAME_COUNT) / read.get(cv2.CAP_PROP_FPS) == pytest.approx(2.0, abs=0.1)
+
+
+def test_bad_input_is_named(jackal: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"\.gif: want a video"):
+        play.play("JackalFlat", jackal, tmp_path / "x.gif")
+    with pytest.raises(InputError, match="cannot act in AntFlat"):
+        play.play("AntFlat", jackal)

@@ -1,0 +1,173 @@
+"""Pretraining: a task that is learned in seconds, files, resuming, and a loss that comes apart."""
+
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from nfc_gym import InputError
+from nfc_gym.adaptation import load_policy, pretrain
+from nfc_gym.adaptation.evaluate import evaluate
+from nfc_gym.adaptation.network import ActorCritic, Sizes
+from nfc_gym.adaptation.policy import Policy, taught
+from nfc_gym.adaptation.ppo import Diverged
+from nfc_gym.adaptation.pretraining import Run, Training
+from nfc_gym.adaptation.record import Episodes, Record
+from nfc_gym.adaptation.sight import VectorSight
+from nfc_gym.adaptation.worlds import vector_env
+
+SMALL = {"envs": 32, "threads": 1, "device": "cpu"}
+
+
+@pytest.fixture(autouse=True)
+def _few_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nfc_gym.adaptation.pretraining.EPISODES", 2)
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    with safe_open(path, "pt") as file:
+        return {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (no dict)
+
+
+def test_a_rover_learns_to_approach_its_goal(tmp_path: Path) -> None:
+    path = tmp_path / "jackal.safetensors"
+    policy = pretrain("JackalFlat", path, steps=40_000, envs=64, threads=1, device="cpu")
+    envs = VectorSight(vector_env("JackalFlat", 32, threads=1, episode=300))
+    learned = evaluate(policy, envs).returns
+    still = evaluate(lambda obs: np.zeros((32, 2), np.float32), envs).returns
+    assert learned.mean() > still.mean() + 1.0  # a metre nearer, and more
+    assert (tmp_path / "jackal.safetensors.log" / "csv" / "scalars" / "return.csv").is_file()
+
+
+def test_a_policy_acts_the_same_from_its_file_and_through_torchrl(jackal: Path) -> None:
+    policy = load_policy(jackal)
+    env, plain = gym.make("nfc_gym/JackalFlat-v0"), gym.make("nfc_gym/JackalFlat-v0", context=[])
+    policy.require(env)
+    observation, flat = env.reset(seed=3)[0], plain.reset(seed=3)[0]
+    action = policy(observation)
+    np.testing.assert_array_equal(action, policy(flat))
+    np.testing.assert_allclose(policy(np.stack([flat, flat])), np.stack([action, action]), atol=1e-6)
+    step = torch.as_tensor(flat)
+    np.testing.assert_allclose(policy.actor(observation=step)[0].detach(), action, atol=1e-6)
+    assert env.action_space.contains(action)
+    assert policy.about["training"]["environment"] == "nfc_gym/JackalFlat-v0"
+    assert policy.about["nominal"]["episodes"] == 2
+
+
+def test_a_run_that_stopped_goes_on_and_one_with_other_arguments_does_not(tmp_path: Path) -> None:
+    path = tmp_path / "p.safetensors"
+    pretrain("JackalFlat", path, steps=2048, **SMALL)
+    first = weights(path)
+    policy = pretrain("JackalFlat", path, steps=4096, **SMALL)
+    assert policy.about["steps"] == 4096
+    assert any((first[k] != v).any() for k, v in weights(path).items())
+    count = policy.network.scale.count
+    again = pretrain("JackalFlat", path, steps=4096, **SMALL)
+    assert again.network.scale.count == count, "nothing was left to do"
+    with pytest.raises(InputError, match=r"another run .*seed 0, now 1"):
+        pretrain("JackalFlat", path, steps=4096, seed=1, **SMALL)
+
+
+def test_the_state_on_disk_is_all_that_going_on_needs(tmp_path: Path) -> None:
+    """Weights, moments, step sizes and scales come back to the bit."""
+    run = Run(Training(environment="nfc_gym/JackalFlat-v0", envs=16), torch.device("cpu"), 1, Record(None, None))
+    batch = next(run.batches(16))
+    run.iterate(batch)
+    run.save_state(tmp_path / "state")
+    other = Run(run.training, torch.device("cpu"), 1, Record(None, None))
+    other.load_state(tmp_path / "state")
+    torch.manual_seed(1)
+    run.iterate(batch)
+    torch.manual_seed(1)
+    other.iterate(batch)
+    assert run.steps == other.steps
+    assert all(torch.equal(v, other.network.state_dict()[k]) for k, v in run.network.state_dict().items())
+
+
+def test_a_loss_that_comes_apart_leaves_the_last_good_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "p.safetensors"
+    pretrain("JackalFlat", path, steps=2048, **SMALL)
+    good, learn = weights(path), Run.iterate
+
+    def broken(self: Run, batch):
+        learn(self, batch)
+        batch["next", "reward"][0, 0] = float("nan")
+        return learn(self, batch)
+
+    monkeypatch.setattr(Run, "iterate", broken)
+    with pytest.raises(Diverged, match=r"not finite.*weights of step 2,048"):
+        pretrain("JackalFlat", path, steps=8192, **SMALL)
+    assert all(torch.equal(v, good[k]) for k, v in weights(path).items())
+    assert "not finite" in load_policy(path).about["diverged"]
+
+
+def test_rough_ground_begins_with_a_flat_policy(tmp_path: Path, jackal: Path) -> None:
+    """Whatever the cells of elevation show, the first actions and values are the flat policy's."""
+    flat = load_policy(jackal)
+    envs = VectorSight(vector_env("JackalRough", 2, threads=1, terrain_pool=1))
+    sizes = Sizes(envs.sight.size, 17, 2, flat.network.sizes.hidden)
+    network = ActorCritic(sizes)
+    assert taught(network, envs.sight, flat) == 17
+    seen = torch.randn(5, envs.sight.size)
+    psi = torch.rand(5, 17)
+    torch.testing.assert_close(network.gaussian(seen)[0], flat.network.gaussian(seen[:, :17])[0])
+    torch.testing.assert_close(network.value(seen, psi), flat.network.value(seen[:, :17], psi))
+    with pytest.raises(InputError, match="sees cells that this one does not"):
+        taught(ActorCritic(flat.network.sizes), flat.sight, Policy(envs.sight, network))
+    with pytest.raises(InputError, match=r"layers \(256, 128\)"):
+        taught(ActorCritic(Sizes(17, 17, 2, (8,))), flat.sight, flat)
+    again = pretrain("JackalFlat", tmp_path / "p.safetensors", steps=2048, start=jackal, **SMALL)
+    assert again.about["started_from"] == {"environment": "nfc_gym/JackalFlat-v0", "steps": 2048}
+    assert again.network.scale.count > flat.network.scale.count
+
+
+def test_bad_input_is_named(tmp_path: Path, jackal: Path) -> None:
+    policy = load_policy(jackal)
+    for other, says in (("AntFlat", "cannot act in AntFlat"), ("QuadcopterFlat", "proprio 15, goal 2")):
+        with pytest.raises(InputError, match=says):
+            policy.require(gym.make(f"nfc_gym/{other}-v0"))
+    with pytest.raises(InputError, match=r"ends in \.safetensors"):
+        pretrain("JackalFlat", tmp_path / "policy.pt", steps=10)
+    with pytest.raises(InputError, match="strictly inside"):
+        pretrain("JackalFlat", tmp_path / "p.safetensors", steps=10, spread=1.0)
+    with pytest.raises(InputError, match="paper, small"):
+        pretrain("JackalFlat", tmp_path / "p.safetensors", steps=10, net="large")
+    with pytest.raises(InputError, match="no such file"):
+        load_policy(tmp_path / "missing.safetensors")
+
+
+def test_files_that_are_no_policies_are_refused(tmp_path: Path, jackal: Path) -> None:
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(jackal.read_bytes()[:1000])
+    with pytest.raises(InputError, match="truncated"):
+        load_policy(cut)
+    foreign = tmp_path / "foreign.safetensors"
+    save_file({"x": torch.zeros(1)}, foreign, {"format": "other"})
+    with pytest.raises(InputError, match="format 'other'"):
+        load_policy(foreign)
+    with safe_open(jackal, "pt") as file:
+        about = json.loads(file.metadata()["about"])
+    about["sizes"]["hidden"] = [8]
+    wrong = tmp_path / "wrong.safetensors"
+    save_file(weights(jackal), wrong, {"format": "nfc_gym-policy-1", "about": json.dumps(about)})
+    with pytest.raises(InputError, match="no policy that this version knows"):
+        load_policy(wrong)
+
+
+def test_episodes_are_counted_across_batches() -> None:
+    from tensordict import TensorDict
+
+    episodes = Episodes()
+    for done_at in (None, 1):
+        done = torch.zeros(2, 3, 1, dtype=torch.bool)
+        if done_at is not None:
+            done[0, done_at] = True
+        after = TensorDict({"reward": torch.ones(2, 3, 1), "done": done, "success": done[..., 0]}, [2, 3])
+        episodes.see(TensorDict({"next": after}, [2, 3]))
+    assert episodes.means() == {"return": 5.0, "length": 5.0, "success": 1.0}
+    assert episodes.count == 1
