@@ -1,16 +1,21 @@
 """The paper's Table I: posteriors of a simulator's parameters by robot, ground and method, beside their ceiling.
 
     python benchmarks/posterior_table.py --out DIR [--robots Jackal Ant ...] [--terrain Flat Rough] [--windows 100000]
-        [--methods mdn-rff mdn-tcn sde-nn sde-rff sde-fks sde-tcn sbi-npe sbi-npse] [--inputs window summaries]
-        [--seeds 0] [--epochs 100] [--budget SECONDS] [--extras ceiling residuals axle rounds plots]
+        [--methods mdn-rff mdn-tcn sde-nn sde-rff sde-fks sde-tcn flow-tcn sbi-npe sbi-npse]
+        [--inputs window summaries] [--effects 0] [--seeds 0] [--epochs 100] [--budget SECONDS]
+        [--extras ceiling residuals axle rounds plots]
     python benchmarks/posterior_table.py --quick
 
 Windows are simulated once into DIR and used by every method; a cell (robot, ground, method, inputs, seed) that is
 finished is kept in DIR/cells, and one that was interrupted goes on from its last saved state, so that the same
 command may be given again and again until all is there. `--budget` is the training time of a cell: ours get as many
 epochs as fit into it, sbi's stop when it is used up. `--stop SECONDS` begins no new cell after that time.
-DIR/table.md is written anew after every command from all cells that there are. `--quick` is a toy in a temporary
-folder, whose figures mean nothing.
+DIR/table.md is written anew after every cell from all that there are; several of these commands may work on one DIR
+at the same time, as `posterior_queue.py` has them do. `--quick` is a toy in a temporary folder, whose figures mean
+nothing.
+
+The windows are of the simulator as it is, as the ceiling's are; `--effects 0.5` gives half of them an effect that the
+model lacks. The residual heads learn from windows of their own, of which half have one.
 
 Gain is the mean log density of the true parameters on windows not trained on, in nats a parameter, the prior having 0.
 """
@@ -31,10 +36,10 @@ from posteriors import extras, plots, report
 from posteriors.ceilings import ceiling_of
 from posteriors.fit import Plan, fit
 from posteriors.judge import judge, latency
-from posteriors.keep import Kept
+from posteriors.keep import Kept, write_text
 from posteriors.methods import INPUTS, METHODS, possible
 from posteriors.paper import ROBOTS, TERRAINS
-from posteriors.sets import JUDGE, TRAIN, Held, environment, prior_of, stored
+from posteriors.sets import Sets, environment, prior_of
 
 from nfc_gym.core.errors import InputError, MissingExtra
 from nfc_gym.inference.progress import Spoken
@@ -60,6 +65,19 @@ class Run:
     def over(self) -> bool:
         return time.monotonic() > self.ends
 
+    def sets(self, robot: str, terrain: str) -> Sets:
+        """Its windows, which are simulated where they are not there and held on the device when they are needed."""
+        args, env = self.args, environment(robot, terrain)
+        return Sets(
+            args.data, env, args.windows, args.judges, args.effects, "map" in args.inputs, args.jobs, self.device
+        )
+
+    def show(self) -> str:
+        """Write the table of all that there is, and give it."""
+        text = report.table(self.kept.values())
+        write_text(self.args.out / "table.md", text)
+        return text
+
 
 def main() -> None:
     """Command line."""
@@ -69,10 +87,8 @@ def main() -> None:
         args.data = args.data or args.out
         device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device
                               if args.device != "auto" else "cpu")  # fmt: skip
-        plan = Plan(args.epochs, args.budget, args.batch, args.rate, args.small)
-        kept = Kept(
-            args.out, {"windows": args.windows, "judges": args.judges, "samples": args.samples, **plan._asdict()}
-        )
+        plan = Plan(args.epochs, args.budget, args.batch, args.rate, args.draws, args.small)
+        kept = Kept(args.out, {"judges": args.judges, "samples": args.samples, **plan._asdict()})
         run = Run(args, kept, plan, device, time.monotonic() + args.stop if args.stop else float("inf"))
         print(f"torch {torch.__version__} on {device}, {torch.get_num_threads()} threads, {args.out}", flush=True)
         for robot in args.robots:
@@ -81,41 +97,41 @@ def main() -> None:
                     print("time is up: the same command goes on")
                 else:
                     robot_on(run, robot, terrain)
-        text = report.table(kept.values())
-        (args.out / "table.md").write_text(text)
-        print(text)
+        print(run.show())
 
 
 def robot_on(run: Run, robot: str, terrain: str) -> None:
     """Every cell of one environment, then what else was asked for."""
-    args, env = run.args, environment(robot, terrain)
-    maps = "map" in args.inputs or "residuals" in args.extras
-    train_on = stored(args.data, env, args.windows, TRAIN, args.jobs, maps)
-    judged = stored(args.data, env, args.judges, JUDGE, args.jobs, maps)
-    windows, judges = (Held.of(w, run.device, maps) for w in (train_on, judged))
-    if "ceiling" in args.extras:
-        run.kept.once(f"{robot}{terrain}_ceiling", lambda: ceiling_of(
-            args.data, env, judged, args.ceiling_windows, args.jobs, *args.ceiling_draws))  # fmt: skip
+    args, env, sets = run.args, environment(robot, terrain), run.sets(robot, terrain)
     for seed in args.seeds:
         for inputs in args.inputs:
             for method in args.methods:
                 if not run.over and not possible(METHODS[method], inputs):
-                    run.kept.once(f"{robot}{terrain}_{method}_{inputs}_{seed}", lambda m=method, i=inputs, s=seed: cell(
-                        run, env, m, i, s, windows, judges))  # fmt: skip
+                    run.kept.once(
+                        f"{robot}{terrain}_{method}_{inputs}_{seed}",
+                        lambda m=method, i=inputs, s=seed: cell(run, env, m, i, s, sets),
+                        trained_on=args.windows, effects=args.effects,
+                    )  # fmt: skip
+                    run.show()
+    if "ceiling" in args.extras and not run.over:
+        run.kept.once(f"{robot}{terrain}_ceiling", lambda: ceiling_of(
+            args.data, env, sets.judged, args.ceiling_windows, args.jobs, *args.ceiling_draws))  # fmt: skip
     for extra in args.extras:
         if extra != "ceiling" and not run.over:
-            extras.EXTRAS[extra](run, robot, terrain, windows, judges)
+            extras.EXTRAS[extra](run, robot, terrain, sets)
+            run.show()
 
 
-def cell(run: Run, env: str, method: str, inputs: str, seed: int, windows: Held, judges: Held) -> dict[str, Any]:
+def cell(run: Run, env: str, method: str, inputs: str, seed: int, sets: Sets) -> dict[str, Any]:
     """Train and judge one method; a peer that is not installed says so instead, and is tried again."""
     prior, folder = prior_of(env), run.folder(f"{env[8:-3]}_{method}_{inputs}_{seed}")
     spoken = Spoken()
     spoken.message(f"{env}: {METHODS[method].name}, {inputs}, seed {seed}")
     try:
-        done = fit(method, inputs, windows, prior, run.plan, seed, folder, run.device, spoken)
+        done = fit(method, inputs, sets.windows, prior, run.plan, seed, folder, run.device, spoken)
     except MissingExtra as e:
         return {"missing": str(e)}
+    judges = sets.judges
     plots.keep_draws(done.fitted, judges, folder)
     few = min(run.args.judges, run.args.peer_judges) if method == "sbi-npse" else None
     found = judge(done.fitted, judges, prior, run.args.samples, few)
@@ -138,6 +154,10 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--extras", nargs="*", choices=EXTRAS, default=["ceiling"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--windows", type=int, default=100_000, help="to train on")
+    parser.add_argument(
+        "--effects", type=float, default=0.0, help="share of the windows with an effect not in the model"
+    )
+    parser.add_argument("--residual-windows", type=int, default=20_480, help="that the residual heads learn from")
     parser.add_argument("--judges", type=int, default=2000, help="windows not trained on")
     parser.add_argument("--peer-judges", type=int, default=200, help="of those, for NPSE, whose densities take long")
     parser.add_argument("--samples", type=int, default=512, help="draws a window")
@@ -146,6 +166,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--stop", type=float, default=0, help="begin nothing new after these seconds")
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--rate", type=float, default=5e-4)
+    parser.add_argument("--draws", type=int, default=8, help="of noise a window and step, of score models")
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
     parser.add_argument("--jobs", type=int, default=0, help="processes of the simulation; 0 takes all cores")
     parser.add_argument("--device", default="auto", help="cpu, cuda, or auto")

@@ -25,7 +25,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from standin import plan
 from standin.robots import ROBOTS
-from standin.row import Row, Task, to_json
+from standin.row import Row, Task, from_json, to_json
 from standin.summary import summarise, table
 
 STAGES = ("nominal", "psi only", "sysid", "network")
@@ -33,24 +33,29 @@ STAGES = ("nominal", "psi only", "sysid", "network")
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = parse(argv)
+    if args.begin:
+        taken_over(args)
     seed = master_seed(args)
-    tasks = planned(args, seed)
+    tasks, kept = planned(args, seed), plan.Kept(args.out)
+    planned_count = len(tasks)
+    if args.kept:
+        tasks = [t for t in tasks if kept.get(t) is not None]
     print(f"seed {seed} (drawn at run time unless given); {len(tasks)} trials, {args.jobs} at a time", flush=True)
     threads = args.threads if args.threads is not None else (0 if args.jobs == 1 else 1)
     began = time.monotonic()
     rows: list[Row] = []
     try:
-        rows += shown(plan.run(tasks, args.jobs, threads, plan.Kept(args.out)))
+        rows += shown(plan.run(tasks, args.jobs, threads, kept))
     except KeyboardInterrupt:
-        sys.exit("stopped" + (f"; the same command with --out {args.out} goes on from here" if args.out else ""))
+        print("stopped" + (f"; the same command with --out {args.out} goes on from here" if args.out else ""))
     results = summarise(rows, seed)
     print(table(results))
-    print(f"{len(rows)} of {len(tasks)} trials, {time.monotonic() - began:.0f} s; seed {seed}")
+    print(f"{len(rows)} of {planned_count} trials, {time.monotonic() - began:.0f} s; seed {seed}")
     for path in (args.json, args.out / "results.json" if args.out else None):
         if path:
             content = {"rows": results, "trials": [to_json(r) for r in rows]}
             path.write_text(json.dumps(content, indent=1, allow_nan=False))
-    return 0 if len(rows) == len(tasks) else 1
+    return 0 if args.kept or len(rows) == planned_count else 1
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -69,6 +74,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--jobs", type=int, default=1, help="trials at a time, each a process")
     add("--threads", type=int, help="of a trial; default 1, all cores with --jobs 1")
     add("--out", type=Path, metavar="DIR", help="keeps finished trials: a killed run goes on, a longer one adds")
+    add("--begin", type=Path, metavar="FILE", help="take over seed and trials that an earlier run's --json wrote")
+    add("--kept", action="store_true", help="no new trials: figures of those that --out holds")
     add("--json", type=Path, metavar="FILE", help="figures {name, value, unit, baseline, goal, holds, seeds, ...}")
     return parser.parse_args(argv)
 
@@ -86,19 +93,30 @@ def master_seed(args: argparse.Namespace) -> int:
     return seed
 
 
+def taken_over(args: argparse.Namespace) -> None:
+    """Put the seed and the trials of an earlier run's figures into `--out`, to go on from there."""
+    if not args.out:
+        sys.exit("--begin FILE wants --out DIR: where its trials are to be kept")
+    content = json.loads(args.begin.read_text())
+    args.seed = content["rows"][0]["seeds"][0]
+    master_seed(args)
+    kept = plan.Kept(args.out)
+    for row in map(from_json, content["trials"]):
+        task = Task(row.robot, row.group, tuple(row.families), row.seed, baselines=bool({"sysid"} & set(row.errors)))
+        if kept.get(task) is None:
+            kept.put(task, row)
+
+
 def planned(args: argparse.Namespace, seed: int) -> list[Task]:
-    """Every trial, robots in turn: those of a run that is stopped early are then of all kinds."""
+    """Every trial; robots and kinds of trial are woven, so that a run that is stopped early has its share of each."""
     if args.quick:
         return plan.quick(args.robots or ("quadcopter", "jackal"), seed)
     lanes = []
     for robot in args.robots or ROBOTS:
-        tasks = list(plan.singles(robot, args.effects or (), args.trials, seed))
-        tasks += plan.pairs(robot, args.pairs, seed)
-        tasks += plan.others(robot, args.outside, args.nulls, seed)
-        lanes.append(tasks)
-    longest = max(map(len, lanes), default=0)
-    woven = [lane[i * len(lane) // longest] for i in range(longest) for lane in lanes if lane]
-    return plan.with_baselines(list({t.name: t for t in woven}.values()), args.baselines)
+        singles = list(plan.singles(robot, args.effects or (), args.trials, seed))
+        pairs = list(plan.pairs(robot, args.pairs, seed))
+        lanes.append(plan.woven([singles, pairs, *plan.others(robot, args.outside, args.nulls, seed)]))
+    return plan.with_baselines(plan.woven(lanes), args.baselines)
 
 
 def shown(rows: Iterable[tuple[Row, str]]) -> Iterable[Row]:

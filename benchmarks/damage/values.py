@@ -1,5 +1,6 @@
 """Values that nobody expects, and bytes that nobody wrote."""
 
+from copy import deepcopy
 from random import Random
 from typing import Any
 
@@ -18,8 +19,8 @@ ODD: tuple[Any, ...] = (
 
 
 def odd(rng: Random) -> Any:
-    """An odd value."""
-    return rng.choice(ODD)
+    """An odd value, its own: what is damaged next must not reach into `ODD`."""
+    return deepcopy(rng.choice(ODD))
 
 
 def flipped(content: bytes, rng: Random) -> bytes:

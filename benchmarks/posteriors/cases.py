@@ -8,6 +8,7 @@ import torch
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.inference.config import Sizes
 from nfc_gym.inference.data import TensorWindows
+from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.random import mixed
@@ -15,6 +16,7 @@ from nfc_gym.inference.sequential import SequentialConfig, sequential
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
 from nfc_gym.simulate import Simulator
+from nfc_gym.simulate.machine import Machine
 from posteriors import metrics
 from posteriors.fitted import Ours
 from posteriors.methods import METHODS, OURS, network_config
@@ -57,7 +59,7 @@ def rounds(
     seen = simulate(psi, rng)
     window = Window(seen["states"][0].numpy(), seen["actions"][0].numpy())
     config = network_config(METHODS[OURS], "summaries", small)
-    sizes = Sizes.of(seen)
+    sizes = Sizes.of(seen, place=place_of(Machine(env).state_names))
 
     def gain(given: NeuralPosterior) -> float:
         return float(given.log_prob(Fidelity(psi))[0] + prior.log_volume) / prior.size

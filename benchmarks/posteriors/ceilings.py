@@ -8,6 +8,8 @@ import numpy as np
 
 from nfc_gym.inference.windows import Windows
 from nfc_gym.simulate.ceiling import CLOUD, PAIRS, ceiling
+from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.starts import spread
 from posteriors.judge import groups
 from posteriors.keep import write
 from posteriors.metrics import mean
@@ -22,14 +24,15 @@ def ceiling_of(
     of psi are left out and counted.
     """
     name = env.removeprefix("nfc_gym/").removesuffix("-v0")
-    folder = out / "ceilings" / f"{name}_{cloud}_{pairs}"
+    folder = out / "ceilings" / f"{name}_{cloud}_{pairs}_start"
     folder.mkdir(parents=True, exist_ok=True)
     family = judges.take(np.arange(len(judges)), ("family",))["family"]
+    before = spread(Machine(env), judges.take(np.arange(len(judges)), ("start",)))
     joint, own = [], []
     for row in np.flatnonzero(family == 0)[:count]:
         file = folder / f"{row}.json"
         if not file.is_file():
-            found = ceiling(env, judges.take(np.array([row])), cloud=cloud, pairs=pairs, nthread=jobs)
+            found = ceiling(env, judges.take(np.array([row])), cloud=cloud, pairs=pairs, nthread=jobs, before=before)
             write(file, {"joint": float(found.joint[0]), "gain": found.gain[0].tolist()})
         kept = json.loads(file.read_text())
         joint.append(kept["joint"])

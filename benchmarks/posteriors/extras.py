@@ -12,21 +12,21 @@ from nfc_gym.inference.progress import Spoken
 from nfc_gym.inference.train import TrainConfig
 from posteriors import cases, plots, residuals
 from posteriors.methods import OURS
-from posteriors.sets import JUDGE, Held, environment, prior_of, stored
+from posteriors.sets import HALF, Sets, environment, prior_of
 
 if TYPE_CHECKING:
     from posterior_table import Run
 
 
-def _residuals(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> None:
+def _residuals(run: Run, robot: str, terrain: str, sets: Sets) -> None:
     name, env, args = f"{robot}{terrain}_residuals", environment(robot, terrain), run.args
-    judged = stored(args.data, env, args.judges, JUDGE, args.jobs, maps=True)
+    struck = Sets(args.data, env, args.residual_windows, args.judges, HALF, True, args.jobs, run.device)
     run.kept.once(name, lambda: residuals.heads(
-        env, windows, judged, judges, prior_of(env), run.plan, run.folder(name), run.device, args.samples, args.few,
-        Spoken())[1])  # fmt: skip
+        env, struck, prior_of(env), run.plan, run.folder(name), run.device, args.samples, args.few,
+        Spoken())[1], trained_on=args.residual_windows)  # fmt: skip
 
 
-def _axle(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> None:
+def _axle(run: Run, robot: str, terrain: str, sets: Sets) -> None:
     if (robot, terrain) != ("Jackal", "Flat"):
         return
     for inputs in run.args.inputs:
@@ -37,7 +37,7 @@ def _axle(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> No
                 n, environment(robot, terrain), run.args.axles, run.args.samples, run.args.jobs))  # fmt: skip
 
 
-def _rounds(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> None:
+def _rounds(run: Run, robot: str, terrain: str, sets: Sets) -> None:
     env, args, found = environment(robot, terrain), run.args, []
     training = TrainConfig(epochs=args.epochs, batch=args.batch, rate=args.rate)
     for truth in range(args.truths):
@@ -49,9 +49,10 @@ def _rounds(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> 
         run.kept.keep(f"{robot}{terrain}_rounds", cases.summed(found))
 
 
-def _plots(run: Run, robot: str, terrain: str, windows: Held, judges: Held) -> None:
-    prior = prior_of(environment(robot, terrain))
-    plots.draw(run.args.out, run.kept.out / "training", f"{robot}{terrain}", prior, judges, run.device)
+def _plots(run: Run, robot: str, terrain: str, sets: Sets) -> None:
+    args, env = run.args, environment(robot, terrain)
+    struck = Sets(args.data, env, args.residual_windows, args.judges, HALF, True, args.jobs, run.device)
+    plots.draw(args.out, run.kept.out / "training", f"{robot}{terrain}", prior_of(env), sets, struck, run.device)
 
 
 def _opened(file: Path, run: Run) -> Network:

@@ -11,7 +11,7 @@ from nfc_gym.inference.network import Network
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import EDGE
 
-_WINDOWS = 64  # whose draws or densities are computed at once
+_WINDOWS = {False: 64, True: 1024}  # whose draws or densities are computed at once, on a processor and on a GPU
 
 
 class Fitted(Protocol):
@@ -41,10 +41,9 @@ class Ours:
 
     def __init__(self, network: Network) -> None:
         self.network = network.eval()
-        self.free = torch.tensor(network.prior.free)
 
     def _parts(self, batch: Batch) -> list[Batch]:
-        cut = {k: t.split(_WINDOWS) for k, t in batch.items()}
+        cut = {k: t.split(_WINDOWS[t.is_cuda]) for k, t in batch.items()}
         return [{k: cut[k][i] for k in cut} for i in range(len(cut["psi"]))]
 
     @torch.no_grad()
@@ -64,6 +63,6 @@ class Ours:
         out = []
         for part in self._parts(batch):
             given = self.network.encode(part["states"], part["actions"], part.get("map"))
-            z = truth_of(part["psi"][:, self.free.to(part["psi"].device)])
+            z = truth_of(part["psi"][:, self.network.free])
             out.append(gain_of(z, self.network.log_prob(z[:, None], given, 1)[:, 0]).double())
         return torch.cat(out)

@@ -42,7 +42,9 @@ def judge(fitted: Fitted, judges: Held, prior: PriorBox, samples: int, most: int
     own = metrics.marginal_gain(draws, truth)
     d = len(names)
     rank, near = metrics.ranks(draws, truth), metrics.tarp(draws, truth, np.random.default_rng(0))
-    low, high = metrics.intervals(draws, 0.9)
+    halves = metrics.halved(draws)
+    ends = {level: metrics.shortest(*halves, level) for level in LEVELS}
+    low, high = ends[0.9]
     return {
         "windows": len(truth),
         "samples": samples,
@@ -52,7 +54,7 @@ def judge(fitted: Fitted, judges: Held, prior: PriorBox, samples: int, most: int
         "log_posterior": metrics.mean(gain - d * math.log(2)),
         "worst": float(gain.min() / d),
         "marginal": {name: metrics.mean(own[clean][:, at].mean(1)) for name, at in groups(names).items()},
-        "coverage": {str(level): metrics.mean(metrics.coverage(draws, truth, level)) for level in LEVELS},
+        "coverage": {str(level): metrics.mean(metrics.held(*ends[level], truth)) for level in LEVELS},
         "width": metrics.mean((high - low).mean(1)),
         "ranks": max(metrics.farthest(rank[:, i]) for i in range(d)),
         "tarp": metrics.farthest(near),

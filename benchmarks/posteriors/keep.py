@@ -1,6 +1,7 @@
 """Finished results under DIR: each is computed once, and belongs to the settings that it was computed with."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,14 +31,26 @@ class Kept:
                 raise InputError(f"{out} holds results of {', '.join(odd)}: give those, or another folder")
         write(file, settings)
 
-    def once(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """What `make` gives, or gave when it was called for this name before; what is `missing` is tried again."""
+    def once(self, name: str, make: Callable[[], dict[str, Any]], **of: Any) -> dict[str, Any]:
+        """What `make` gives, or gave when it was called for this name before; what is `missing` is tried again.
+
+        Args:
+          name: of the result.
+          make: see above.
+          of: kept with the result: settings that differ from one to the next.
+
+        Raises:
+          InputError: what is kept was made of something else.
+        """
         file = self.cells / f"{name}.json"
         if file.is_file():
             found = json.loads(file.read_text())
+            odd = [f"{k} {found.get(k)}, not {v}" for k, v in of.items() if found.get(k) != v]
+            if odd and "missing" not in found:
+                raise InputError(f"{file} is of {', '.join(odd)}: give that, or another folder")
             if "missing" not in found:
                 return found
-        write(file, make())
+        write(file, make() | of)
         return json.loads(file.read_text())
 
     def keep(self, name: str, found: dict[str, Any]) -> None:
@@ -54,7 +67,12 @@ class Kept:
 
 
 def write(file: Path, value: Any) -> None:
-    """Whole or not at all."""
-    part = file.with_suffix(".part")
-    part.write_text(json.dumps(value, indent=1))
+    """As JSON, see `write_text`."""
+    write_text(file, json.dumps(value, indent=1))
+
+
+def write_text(file: Path, text: str) -> None:
+    """Whole or not at all, also where several processes write it."""
+    part = file.with_name(f"{file.name}.{os.getpid()}.part")
+    part.write_text(text)
     part.replace(file)

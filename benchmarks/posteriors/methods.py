@@ -29,11 +29,13 @@ METHODS = {
     "sde-rff": Method("SDE + QMC-RFF", "qmc-rff", "score"),
     "sde-fks": Method("SDE + QMC-FKS", "qmc-fks", "score"),
     "sde-tcn": Method("SDE + TCN (ours)", "tcn", "score"),
+    "flow-tcn": Method("spline flow + TCN", "tcn", "flow"),
     "sbi-npe": Method("sbi NPE, spline flow, TCN", "tcn", "npe", peer=True),
     "sbi-npse": Method("sbi NPSE, TCN", "tcn", "npse", peer=True),
 }
 OURS = "sde-tcn"
 BASELINES = ("mdn-rff", "mdn-tcn", "sde-nn", "sde-rff", "sde-fks")  # the paper's five
+PEERS = ("flow-tcn", "sbi-npe", "sbi-npse")  # stronger ones, which the paper has not
 
 # What every method of a row is given: what is added to the window of states and actions.
 INPUTS: dict[str, dict[str, bool]] = {
@@ -44,11 +46,11 @@ INPUTS: dict[str, dict[str, bool]] = {
 }
 
 
-def network_config(method: Method, inputs: str, small: bool = False) -> NetworkConfig:
-    """Of one method; `small` is for trying things out."""
+def network_config(method: Method, inputs: str, small: bool = False, draws: int = 8) -> NetworkConfig:
+    """Of one method; `small` is for trying things out, `draws` are a score model's."""
     size = {"width": 64, "features": 64, "hidden": 64, "depth": 2} if small else {}
     density = "score" if method.peer else method.density
-    return NetworkConfig(encoder=method.encoder, density=density, **INPUTS[inputs], **size)
+    return NetworkConfig(encoder=method.encoder, density=density, draws=draws, **INPUTS[inputs], **size)
 
 
 def possible(method: Method, inputs: str) -> str:

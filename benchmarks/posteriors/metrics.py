@@ -49,9 +49,19 @@ def intervals(draws: Array, level: float) -> tuple[Array, Array]:
     quantiles are its ends, and the ends are those quantiles of the other half: its coverage is the level, to the
     rounding of 1 / (n / 2 + 1), if the posterior is right. Ends may be those of the box.
     """
+    return shortest(*halved(draws), level)
+
+
+def halved(draws: Array) -> tuple[Array, Array]:
+    """Two halves of the draws, each sorted between the box's edges, from which intervals of every level are taken."""
     half = draws.shape[1] // 2
-    inside = round(level * (half + 1))
     choose, take = (np.sort(_edged(draws[:, i * half : (i + 1) * half]), axis=1) for i in (0, 1))
+    return choose, take
+
+
+def shortest(choose: Array, take: Array, level: float) -> tuple[Array, Array]:
+    """`intervals` of a level, from the two halves of `halved`."""
+    inside = round(level * (choose.shape[1] - 1))
     at = (choose[:, inside:] - choose[:, :-inside]).argmin(1)[:, None]
     low, high = np.take_along_axis(take, at, 1), np.take_along_axis(take, at + inside, 1)
     return low[:, 0], high[:, 0]
@@ -64,7 +74,11 @@ def _edged(draws: Array) -> Array:
 
 def coverage(draws: Array, truth: Array, level: float) -> Array:
     """(windows,) share of the parameters whose highest-density interval holds the truth."""
-    low, high = intervals(draws, level)
+    return held(*intervals(draws, level), truth)
+
+
+def held(low: Array, high: Array, truth: Array) -> Array:
+    """(windows,) share of the parameters whose interval holds the truth."""
     return ((low <= truth) & (truth <= high)).mean(1)
 
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from nfc_gym.core.errors import MissingExtra
 from nfc_gym.inference.config import Sizes
 from nfc_gym.inference.data import Batch
+from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import PriorBox
@@ -32,7 +33,12 @@ class Embedding(nn.Module):
 
     def __init__(self, network: Network) -> None:
         super().__init__()
-        self.encoder, self.project, self.sizes = network.encoder, network.project, network.sizes
+        self.place, self.encoder, self.project, self.sizes = (
+            network.place,
+            network.encoder,
+            network.project,
+            network.sizes,
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, F)."""
@@ -40,7 +46,10 @@ class Embedding(nn.Module):
         states, actions = (size.horizon + 1) * size.states, size.horizon * size.actions
         rows = x.split([states, actions, x.shape[1] - states - actions], 1)
         elevation = rows[2].view(-1, 128, 128) if rows[2].shape[1] else None
-        motion = rows[0].view(-1, size.horizon + 1, size.states), rows[1].view(-1, size.horizon, size.actions)
+        motion = (
+            self.place(rows[0].view(-1, size.horizon + 1, size.states)),
+            rows[1].view(-1, size.horizon, size.actions),
+        )
         return self.project(self.encoder(*motion, elevation))
 
 
@@ -98,7 +107,8 @@ def fit_peer(
         raise MissingExtra(f"sbi is not installed ({e}): pip install 'nfc_gym[bench]'") from None
     batch = windows.noisy(seed + 1)
     free = torch.tensor(prior.free)
-    network = Network(network_config(method, inputs, plan.small), Sizes.of(batch), prior, seed)
+    sizes = Sizes.of(batch, place=place_of(windows.names))
+    network = Network(network_config(method, inputs, plan.small), sizes, prior, seed)
     network.fit_scales({k: t[:16384].cpu() for k, t in batch.items()})
     embedding = Embedding(network).to(device)
     d = prior.size

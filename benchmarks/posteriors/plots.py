@@ -16,7 +16,7 @@ from nfc_gym.inference.space import PriorBox
 from posteriors.fitted import Fitted
 from posteriors.methods import INPUTS, METHODS, OURS
 from posteriors.residuals import maps_of
-from posteriors.sets import Held
+from posteriors.sets import Held, Sets
 
 Array = NDArray[np.float64]
 _DRAWS, _MAPS = 2000, 24
@@ -24,22 +24,29 @@ DRAWS = "draws.npz"
 
 
 def draw(
-    out: Path, training: Path, place: str, prior: PriorBox, judges: Held, device: torch.device
+    out: Path, training: Path, place: str, prior: PriorBox, sets: Sets, struck: Sets, device: torch.device
 ) -> list[Path]:  # fmt: skip
-    """Every picture that the trained posteriors of one environment allow; gives the files."""
+    """Every picture that the trained posteriors of one environment allow; gives the files.
+
+    Args:
+      out, training: where pictures go, and where draws and networks lie.
+      place: robot and ground.
+      prior: psi's box.
+      sets, struck: windows of the table, and those of the residual heads.
+      device: of the networks.
+    """
     folder = out / "plots"
     folder.mkdir(exist_ok=True)
-    batch = judges.noisy()
     files: list[Path] = []
     for inputs in INPUTS:
         found = {k: sorted(training.glob(f"{place}_{k}_{inputs}_*/{DRAWS}")) for k in METHODS}
         drawn = {METHODS[k].name: np.load(files_[0])["u"] for k, files_ in found.items() if files_}
         if drawn:
-            files.append(joint(folder / f"{place}_{inputs}_joint.png", drawn, prior, batch))
+            files.append(joint(folder / f"{place}_{inputs}_joint.png", drawn, prior, sets.judges.noisy()))
     heads = training / f"{place}_residuals" / "posterior.safetensors"
     if heads.is_file():
         network = checkpoint.load(heads)[0].to(device)
-        files += ground(folder, place, network, batch)
+        files += ground(folder, place, network, struck.judges.noisy())
     return files
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posteriors import paper
-from posteriors.methods import BASELINES, INPUTS, METHODS, OURS
+from posteriors.methods import BASELINES, INPUTS, METHODS, OURS, PEERS
 from posteriors.metrics import mean
 
 Results = dict[str, dict[str, Any]]
@@ -57,7 +57,7 @@ def table(results: Results) -> str:
 
 def _place(place: str, found: dict[tuple[str, str, int], dict[str, Any]], ceiling: dict[str, Any] | None) -> str:
     head = ["method", "seed", "gain a parameter", "without effect", "efficiency", "coverage 50", "90", "95",
-            "90 % width", "ranks", "TARP", "epochs (best)", "s", "ms"]  # fmt: skip
+            "90 % width", "ranks", "TARP", "windows", "epochs (best)", "s", "ms"]  # fmt: skip
     out = [f"## {place}\n"]
     if ceiling:
         out.append(
@@ -79,7 +79,8 @@ def _place(place: str, found: dict[tuple[str, str, int], dict[str, Any]], ceilin
             rows.append([
                 name, str(seed), shown(one["gain"]), shown(one["gain_without_effect"]),
                 "-" if share is None else f"{share:.2f}", *(shown(one["coverage"][c]) for c in ("0.5", "0.9", "0.95")),
-                shown(one["width"]), f"{one['ranks']:.3f}", f"{one['tarp']:.3f}", f"{one['epochs']} ({one['best']})",
+                shown(one["width"]), f"{one['ranks']:.3f}", f"{one['tarp']:.3f}", str(one["trained_on"]),
+                f"{one['epochs']} ({one['best']})",
                 f"{one['seconds']:.0f}", f"{one['latency_ms']:.1f}",
             ])  # fmt: skip
             kinds.append([name, str(seed), *(_group(one, g, ceiling) for g in one["marginal"])])
@@ -116,7 +117,7 @@ def _compared(every: dict[tuple[str, str, str, int], dict[str, Any]], places: li
             if not len(ours):
                 continue
             row = [place, _NAMES[inputs], shown(mean(ours))]
-            for rivals in (BASELINES, ("sbi-npe", "sbi-npse")):
+            for rivals in (BASELINES, PEERS):
                 there = {m: best[m] for m in rivals if len(best[m])}
                 if not there:
                     row += ["-", "-"]
@@ -127,7 +128,7 @@ def _compared(every: dict[tuple[str, str, str, int], dict[str, Any]], places: li
             rows.append(row)
     if not rows:
         return ""
-    head = ["", "inputs", "SDE + TCN", "best of the paper's five", "ahead by", "best of sbi", "ahead by"]
+    head = ["", "inputs", "SDE + TCN", "best of the paper's five", "ahead by", "best of the stronger peers", "ahead by"]
     return "## Ours against the others\n\n" + lines(head, rows) + (
         "\nGain a parameter, nats; differences are taken window by window, on the windows that both were judged on, "
         "after a mean over seeds. Their errors are over windows: training again would give another difference.\n"

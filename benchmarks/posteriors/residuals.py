@@ -19,7 +19,7 @@ from nfc_gym.simulate.machine import MOTOR, Machine
 from posteriors import metrics
 from posteriors.fit import Plan, fit_network
 from posteriors.methods import METHODS, OURS, network_config
-from posteriors.sets import Held
+from posteriors.sets import Sets
 
 Array = NDArray[np.float64]
 SIZES = ((0, 2), (2, 5), (5, np.inf))  # of X / X_null
@@ -27,27 +27,26 @@ _REPLAYS = 16
 
 
 def heads(
-    env: str, windows: Held, judged: Windows, judges: Held, prior: PriorBox, plan: Plan, folder: Path,
-    device: torch.device, samples: int, few: int, report: Report,
+    env: str, sets: Sets, prior: PriorBox, plan: Plan, folder: Path, device: torch.device, samples: int, few: int,
+    report: Report,
 ) -> tuple[Network, dict[str, Any]]:  # fmt: skip
     """Train SDE + TCN with all heads, and what is measured of them.
 
     Args:
       env: its id.
-      windows, judges: to train on and to judge by, with maps; on flat ground too, where delta_e is the camera's error.
-      judged: the second as stored.
+      sets: windows with maps, part of them with effects; on flat ground too, where delta_e is the camera's error.
       prior, plan, folder, device, report: see `fit`.
       samples: draws a window.
       few: windows that are replayed, or whose maps are drawn.
     """
+    judged, batch = sets.judged, sets.judges.noisy()
     config = replace(
         network_config(METHODS[OURS], "map", plan.small),
         delta_s=True, delta_e=True, families=tuple(judged.manifest.families), draws=1 if plan.small else 4,
     )  # fmt: skip
-    done = fit_network(config, windows, prior, plan, 0, folder, device, report)
+    done = fit_network(config, sets.windows, prior, plan, 0, folder, device, report)
     network = done.fitted.network
     out: dict[str, Any] = {"seconds": done.outcome.seconds, "epochs": len(done.outcome.held_out)}
-    batch = judges.noisy()
     out |= dynamics(network, batch, samples)
     sizes = strengths(env, judged, batch, len(judged) if few >= len(judged) else 4 * few)
     out |= structure(network, batch, sizes)

@@ -1,6 +1,8 @@
 """Windows of a benchmark: simulated once into a folder, then held on the device with fresh sensor noise each pass."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.maps import keep_maps
 
 TRAIN, JUDGE = 0, 1  # seeds of the windows that are learned from, and of those that judge
+HALF = 0.5  # share of windows with an effect that the heads of residuals learn from
 _MAPS = ("map", "delta_e")
 
 
@@ -30,12 +33,19 @@ def prior_of(env: str) -> PriorBox:
     return PriorBox.of(machine.space, machine.kind.name)
 
 
-def stored(out: Path, env: str, windows: int, seed: int, jobs: int, maps: bool = False) -> Windows:
-    """Windows of an environment under DIR; simulated if they are not there, or not all."""
+def folder_of(out: Path, env: str, windows: int, seed: int, effects: float) -> Path:
+    """Where `stored` keeps windows."""
     name = env.removeprefix("nfc_gym/").removesuffix("-v0")
-    folder = out / "windows" / f"{name}_{windows}_{seed}"
+    return out / "windows" / f"{name}_{windows}_{seed}_{effects:g}"
+
+
+def stored(
+    out: Path, env: str, windows: int, seed: int, jobs: int, maps: bool = False, effects: float = 0.0
+) -> Windows:  # fmt: skip
+    """Windows of an environment under DIR, a share of them with an effect; what is not there yet is simulated."""
+    folder = folder_of(out, env, windows, seed, effects)
     console = Console(stderr=True)
-    found = simulate(env, windows, folder, seed=seed, jobs=jobs, console=console)
+    found = simulate(env, windows, folder, seed=seed, jobs=jobs, effects=effects, console=console)
     if maps:
         keep_maps(folder, jobs, console)
         found = Windows(folder)
@@ -48,10 +58,11 @@ class Held:
     Args:
       tensors: a batch of all windows, states free of noise.
       noise: (s,) standard deviation of each entry of the states.
+      names: of the entries of the states.
     """
 
-    def __init__(self, tensors: Batch, noise: Tensor) -> None:
-        self.tensors, self.noise, self.manifest = tensors, noise, {}
+    def __init__(self, tensors: Batch, noise: Tensor, names: tuple[str, ...] = ()) -> None:
+        self.tensors, self.noise, self.names, self.manifest = tensors, noise, names, {}
 
     @classmethod
     def of(cls, windows: Windows, device: torch.device, maps: bool = False) -> "Held":
@@ -62,7 +73,7 @@ class Held:
         require_batch(tensors)
         noise = torch.tensor(windows.manifest.state_noise, dtype=torch.float32)
         small = {k: t.half() if k in _MAPS else t for k, t in tensors.items()}
-        return cls({k: t.to(device) for k, t in small.items()}, noise.to(device))
+        return cls({k: t.to(device) for k, t in small.items()}, noise.to(device), tuple(windows.manifest.state_names))
 
     def __len__(self) -> int:
         return len(self.tensors["psi"])
@@ -87,9 +98,53 @@ class Held:
         """All of them, once, with one draw of noise."""
         return next(self.batches(len(self), None if seed == 0 else seed))
 
+    def first(self, count: int) -> "Held":
+        """The first windows, at most all."""
+        return Held({k: t[:count] for k, t in self.tensors.items()}, self.noise, self.names)
+
     def split(self, share: float) -> tuple["Held", "Held"]:
         """The first windows, and the last `share` of them."""
         cut = len(self) - max(1, round(share * len(self)))
         parts = ({k: t[part] for k, t in self.tensors.items()} for part in (slice(cut), slice(cut, None)))
-        first, last = (Held(p, self.noise) for p in parts)
+        first, last = (Held(p, self.noise, self.names) for p in parts)
         return first, last
+
+
+@dataclass(frozen=True)
+class Sets:
+    """Windows of one environment to train on and to judge by; nothing is simulated or read before it is asked for.
+
+    Attributes:
+      out: DIR.
+      env: id.
+      train_on, judge_by: how many windows.
+      effects: share of them with an effect.
+      maps: whether they have maps.
+      jobs: processes of the simulation.
+      device: where they are held.
+    """
+
+    out: Path
+    env: str
+    train_on: int
+    judge_by: int
+    effects: float
+    maps: bool
+    jobs: int
+    device: torch.device
+
+    @cached_property
+    def judged(self) -> Windows:
+        """To judge by, as stored."""
+        return stored(self.out, self.env, self.judge_by, JUDGE, self.jobs, self.maps, self.effects)
+
+    @cached_property
+    def judges(self) -> Held:
+        """The same, held."""
+        return Held.of(self.judged, self.device, self.maps)
+
+    @cached_property
+    def windows(self) -> Held:
+        """To train on."""
+        whole = stored(self.out, self.env, self.train_on, TRAIN, self.jobs, self.maps, self.effects)
+        return Held.of(whole, self.device, self.maps)

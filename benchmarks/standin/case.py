@@ -71,13 +71,27 @@ def sized(
     for _ in range(tries):
         hidden = kind.make(np.random.default_rng(place), size)
         ratio = ratio_of(hidden) / floor
-        found.append((abs(np.log(max(ratio, 1.0) / wanted)), hidden, ratio))
-        if found[-1][0] < 0.1:
+        found.append((size, ratio, hidden))
+        if abs(np.log(max(ratio, 1.0) / wanted)) < 0.1:
             break
-        # The excess grows about as the square of the size; where not, a step goes at most to a tenth or tenfold.
-        step = np.sqrt((wanted - 1) / max(ratio - 1, 1e-2))
-        size = float(np.clip(size * np.clip(step, 0.1, 10.0), kind.low, kind.high))
-    return min(found, key=lambda f: f[0])[1:]
+        size = _next_size([(s, r) for s, r, _ in found], wanted, kind)
+    _, ratio, hidden = min(found, key=lambda f: abs(np.log(max(f[1], 1.0) / wanted)))
+    return hidden, ratio
+
+
+def _next_size(tried: Sequence[tuple[float, float]], wanted: float, kind: Kind) -> float:
+    """The size to try after (size, X / X_null) pairs.
+
+    The excess grows about as the square of the size: a step goes by that, at most to a tenth or tenfold. It ends midway
+    where it would leave what earlier tries have enclosed: a limit on a force does nothing at all down to some value.
+    """
+    size, ratio = tried[-1]
+    step = float(np.clip(np.sqrt((wanted - 1) / max(ratio - 1, 1e-2)), 0.1, 10.0))
+    below = max((s for s, r in tried if r < wanted), default=None)
+    above = min((s for s, r in tried if r >= wanted), default=None)
+    if below is not None and above is not None and below < above and not below < size * step < above:
+        return float(np.sqrt(below * above))
+    return float(np.clip(size * step, kind.low, kind.high))
 
 
 def true_effects(bench: Bench, logs: Sequence[Log], hidden: Hidden) -> list[tuple[Effect, Array]] | None:

@@ -58,13 +58,20 @@ def pairs(robot: str, count: int, master: int) -> Iterator[Task]:
         yield Task(robot, "pair", able[order[i % len(able)]], seed_of(master, robot, "pair", i))
 
 
-def others(robot: str, trials: int, nulls: int, master: int) -> Iterator[Task]:
-    """`trials` of every effect outside the library, and trials without any."""
-    for i in range(trials):
-        for family in ROBOTS[robot].outside:
-            yield Task(robot, "outside", (family,), seed_of(master, robot, "outside", family, i))
-    for i in range(nulls):
-        yield Task(robot, "null", (), seed_of(master, robot, "null", i))
+def others(robot: str, trials: int, nulls: int, master: int) -> tuple[list[Task], list[Task]]:
+    """`trials` of every effect outside the library; and trials without any."""
+    outside = [
+        Task(robot, "outside", (family,), seed_of(master, robot, "outside", family, i))
+        for i in range(trials)
+        for family in ROBOTS[robot].outside
+    ]
+    return outside, [Task(robot, "null", (), seed_of(master, robot, "null", i)) for i in range(nulls)]
+
+
+def woven(lanes: Sequence[Sequence[Task]]) -> list[Task]:
+    """All tasks of all lanes, each lane spread evenly over the whole: any beginning has its share of each."""
+    spread = [((i + 0.5) / len(lane), task) for lane in lanes for i, task in enumerate(lane)]
+    return [task for _, task in sorted(spread, key=lambda pair: pair[0])]
 
 
 def quick(robots: Sequence[str], master: int) -> list[Task]:

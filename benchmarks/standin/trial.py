@@ -23,6 +23,8 @@ from .row import Row, Task
 from .score import estimates, foretold, psi_estimates, score
 
 LEAST, MOST = 1.3, 30.0  # X / X_null of what is hidden, log-uniform
+_PLACES = 3  # that are drawn until an effect acts: friction at a joint that these motions never turn is no effect
+_NEAR = 0.9  # of the least X / X_null that counts as acting
 Model = tuple[Plant, Array]
 
 
@@ -55,8 +57,11 @@ def _hide(
     table = kit.outside if task.group == "outside" else kit.kinds
     found, ratios = [], []
     for family in task.families:
-        place, wanted = int(rng.integers(2**31)), float(np.exp(rng.uniform(np.log(LEAST), np.log(MOST))))
-        hidden, ratio = sized(kit, psi, table[family], place, wanted, folder, task.size.tries)
+        for _ in range(_PLACES):
+            place, wanted = int(rng.integers(2**31)), float(np.exp(rng.uniform(np.log(LEAST), np.log(MOST))))
+            hidden, ratio = sized(kit, psi, table[family], place, wanted, folder, task.size.tries)
+            if ratio >= LEAST * _NEAR:
+                break
         found.append(hidden)
         ratios.append(ratio)
     row.ratio = min(ratios, default=float("nan"))

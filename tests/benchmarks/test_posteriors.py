@@ -149,6 +149,9 @@ def test_what_is_finished_is_kept_and_what_is_missing_tried_again(tmp_path: Path
     kept.once("b", lambda: {"missing": "sbi"})
     assert kept.once("b", lambda: {"gain": [2.0, 0.1]}) == {"gain": [2.0, 0.1]}
     assert json.loads((tmp_path / "cells" / "b.json").read_text())["gain"][0] == 2
+    kept.once("c", lambda: {"gain": [3.0, 0.1]}, trained_on=100)
+    with pytest.raises(InputError, match="of trained_on 100, not 200"):
+        kept.once("c", lambda: pytest.fail("made anew"), trained_on=200)
     with pytest.raises(InputError, match="windows 10, not 20"):
         Kept(tmp_path, {"windows": 20})
 
@@ -160,7 +163,7 @@ def test_the_tables_print_what_there_is() -> None:
            [0.2, 0.3, 0.4], "marginal":
            {"mass": [0.1, 0.01]}, "coverage": {k: [float(k), 0.01] for k in ("0.5", "0.9", "0.95")}, "width":
            [0.5, 0.1], "ranks": 0.02, "tarp": 0.03, "distance_95": 0.04, "epochs": 5, "best": 4, "seconds": 9.0,
-           "latency_ms": 12.0}  # fmt: skip
+           "latency_ms": 12.0, "trained_on": 100}  # fmt: skip
     less = one | {"gain": [0.1, 0.01], "gains": [0.0, 0.1, 0.2]}
     ceiling = {"windows": 3, "apart": 0, "cloud": 8, "pairs": 2, "joint": [0.8, 0.1], "groups": {"mass": [0.2, 0.1]}}
     text = report.table({

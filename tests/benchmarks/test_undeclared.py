@@ -80,6 +80,25 @@ def test_excluded_families_are_those_that_a_mapping_knows() -> None:
         assert all(set(k.exclude) | set(k.near) <= known for k in robot.outside.values())
 
 
+def test_any_beginning_has_its_share_of_every_kind_and_robot() -> None:
+    first = tasks("--trials", "5", "--pairs", "10", "--outside", "5", "--nulls", "31")
+    tenth = first[: len(first) // 10]
+    for robot in ("jackal", "ant"):
+        for group in ("single", "pair", "outside", "null"):
+            share = sum(t.robot == robot and t.group == group for t in first) / 10
+            assert abs(sum(t.robot == robot and t.group == group for t in tenth) - share) <= 1
+
+
+def test_a_limit_that_does_nothing_down_to_some_value_is_enclosed() -> None:
+    modules()
+    case, kind = import_module("standin.case"), SimpleNamespace(low=0.05, high=0.6)
+    tried = [(0.17, 40.0)]  # X / X_null 1 below 0.1, then steep
+    for _ in range(7):
+        size = case._next_size(tried, 3.0, kind)
+        tried.append((size, 1 + max(size - 0.1, 0) * 600))
+    assert min(abs(math.log(r / 3.0)) for _, r in tried) < 0.1
+
+
 # ---- resuming -------------------------------------------------------------------------------------------------------
 
 
@@ -111,6 +130,18 @@ def test_a_trial_without_baselines_is_not_finished_for_one_with(tmp_path: Path) 
     kept.put(bare, m.row.Row("ant", "single", ["lag"], 1))
     assert kept.get(bare) is not None
     assert kept.get(full) is None
+
+
+def test_a_run_begins_with_the_trials_of_another(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    m = modules()
+    task = m.main.planned(m.main.parse(["--robots", "ant", "--nulls", "1", "--trials", "0"]), 7)[0]
+    row = m.row.Row("ant", "null", [], task.seed, outcome="right", seconds=2.0, cpu=3.0)
+    m.plan.Kept(tmp_path / "a").put(task, row)
+    words = ["--robots", "ant", "--nulls", "1", "--trials", "0", "--kept"]
+    first = [*words, "--seed", "7", "--out", str(tmp_path / "a"), "--json", str(tmp_path / "a.json")]
+    assert m.main.main(first) == 0
+    assert m.main.main([*words, "--begin", str(tmp_path / "a.json"), "--out", str(tmp_path / "b")]) == 0
+    assert "1 of 1 trials" in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_a_folder_keeps_its_seed(tmp_path: Path) -> None:

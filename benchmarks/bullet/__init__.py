@@ -1,0 +1,1 @@
+"""The second engine: PyBullet, which shares no code with MuJoCo. Needs the extra `bench`."""

@@ -1,0 +1,133 @@
+"""Worlds that hide their truth: what a policy loses in each, and which of them count.
+
+    python benchmarks/hidden_worlds.py --policy falco --places JackalFlat JackalRough --task figure8 --episodes 100
+    python benchmarks/hidden_worlds.py --policy ant.safetensors --places AntFlat --find 3 --draws 20
+    python benchmarks/hidden_worlds.py --quick
+
+A world counts where the policy loses at least 30 % of the return that it earns at home beyond a random policy's.
+Sizes are drawn from `--seed`, by default drawn itself and printed. `--find K` draws worlds of a scenario one after
+another until K count, and prints those that do not as well. `--out DIR` keeps every world's row and goes on there.
+The paper's scenarios of the Jackal's axle are what is measured where none is named.
+"""
+
+import argparse
+import json
+import os
+import secrets
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+from posteriors.keep import Kept
+from worlds.counting import DROP, Drop, measure
+from worlds.scenarios import TABLE_III
+from worlds.world import ENGINES, World
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = parse(argv)
+    kept = Kept(args.out, {"seed": args.seed, "policy": args.policy, "task": args.task, "episodes": args.episodes}) \
+        if args.out else None  # fmt: skip
+    print(f"seed {args.seed}, policy {args.policy}, {args.episodes} episodes a world", flush=True)
+    print("world | return at home | there | random | drop | counts | success | ended early | ratio | hidden")
+    rows = []
+    for place in args.places:
+        for scenario in args.scenarios or default(place):
+            rows += [shown(r) for r in worlds(args, kept, place, scenario)]
+    print(f"{sum(r['counts'] for r in rows)} of {len(rows)} worlds count")
+    if args.json:
+        args.json.write_text(json.dumps({"rows": [figure(r, args) for r in rows], "worlds": rows}, indent=1))
+    return 0
+
+
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add(
+        "--policy", default="falco", help="falco, random, a policy's file, or an id whose policy comes with the package"
+    )
+    add("--places", nargs="+", default=["JackalFlat", "JackalRough"], metavar="PLACE", help="such as AntRough")
+    add("--scenarios", nargs="+", metavar="PARTS", help="such as axle+snow; default the paper's, or psi+effect")
+    add("--engine", choices=ENGINES, default="mujoco", help="bullet: PyBullet, for Jackal, Quadcopter, Quadruped")
+    add("--task", choices=("goal", "figure8"), help="of Jackal and Quadcopter; default goal")
+    add("--episodes", type=int, default=100)
+    add("--worlds", type=int, default=1, help="drawn of each scenario")
+    add("--threads", type=int, default=1, help="of the physics; 0 is all cores")
+    add("--find", type=int, metavar="K", help="go on until K of a scenario count")
+    add("--draws", type=int, default=20, help="worlds drawn at most by --find")
+    add("--seed", type=int, help="of what is hidden and of the episodes; default drawn")
+    add("--out", type=Path, metavar="DIR", help="keeps finished worlds")
+    add("--json", type=Path, metavar="FILE")
+    add("--quick", action="store_true", help="two worlds, a few episodes: a toy")
+    args = parser.parse_args(argv)
+    if args.quick:
+        args.scenarios, args.episodes = args.scenarios or ["axle"], 4
+    known = args.out / "seed.json" if args.out else None
+    if args.seed is None:
+        args.seed = json.loads(known.read_text()) if known and known.is_file() else secrets.randbits(31)
+    if known:
+        args.out.mkdir(parents=True, exist_ok=True)
+        known.write_text(json.dumps(args.seed))
+    return args
+
+
+def default(place: str) -> tuple[str, ...]:
+    if not place.startswith("Jackal"):
+        return ("psi+effect",)
+    return TABLE_III["Rough" if place.endswith("Rough") else "Flat"]
+
+
+def worlds(args: argparse.Namespace, kept: Kept | None, place: str, scenario: str) -> Iterator[dict[str, Any]]:
+    """Rows of the worlds of one scenario, as they are measured."""
+    found = 0
+    for k in range(args.draws if args.find else args.worlds):
+        world = World(place, scenario, args.seed + k, engine=args.engine)
+
+        def row(world: World = world) -> dict[str, Any]:
+            began = time.monotonic()
+            settings = {"nthread": args.threads} | ({"task": args.task} if args.task else {})
+            return plain(measure(args.policy, world, args.episodes, args.seed, **settings), time.monotonic() - began)
+
+        result = kept.once(world.name, row) if kept else row()
+        yield result
+        found += result["counts"]
+        if args.find and found >= args.find:
+            return
+
+
+def plain(drop: Drop, seconds: float) -> dict[str, Any]:
+    """A row that JSON holds."""
+    e = drop.episodes
+    ratios = [r for r in e.ratio if r == r]
+    return {
+        **{k: getattr(drop.world, k) for k in ("place", "scenario", "seed", "engine")},
+        "world": drop.world.name, "hidden": drop.world.truth.text, "home": drop.nominal, "there": drop.there,
+        "random": drop.random, "drop": drop.drop, "counts": bool(drop.counts), "success": float(np.mean(e.success)),
+        "early": float(np.mean(e.ended)), "ratio": float(np.mean(ratios)) if ratios else None,
+        "orientation_jerk": float(np.nanmean(e.orientation_jerk)),
+        "position_jerk": float(np.nanmean(e.position_jerk)), "seconds": seconds,
+    }  # fmt: skip
+
+
+def shown(row: dict[str, Any]) -> dict[str, Any]:
+    """Print it."""
+    home, there, random = ("{:.0f} [{:.0f}, {:.0f}]".format(*row[k]) for k in ("home", "there", "random"))
+    ratio = "-" if row["ratio"] is None else f"{row['ratio']:.2f}"
+    print(f"{row['world']} | {home} | {there} | {random} | {row['drop']:.0%} | {'yes' if row['counts'] else 'no'} | "
+          f"{row['success']:.2f} | {row['early']:.2f} | {ratio} | {row['hidden']}", flush=True)  # fmt: skip
+    return row
+
+
+def figure(row: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """A figure with what it is compared to."""
+    return {"name": f"drop of {args.policy} in {row['world']}", "value": row["drop"], "unit": "1", "baseline": None,
+            "goal": f">= {DROP:g}", "holds": row["counts"], "seeds": [args.seed]}  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())

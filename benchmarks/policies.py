@@ -1,0 +1,211 @@
+"""The paper's Tables II and III: what policies are worth in worlds that hide their truth, after adapting and before.
+
+    python benchmarks/policies.py --tables II III --policies DIR --posteriors DIR --world-models DIR --out results/
+    python benchmarks/policies.py --tables III --methods random falco --out results/
+    python benchmarks/policies.py --quick
+
+Table II: return in a hidden world of each environment, between a random policy (0) and an oracle that was trained there
+(1), the paper's min-max normalisation beside. Table III: the Jackal's broken axle on a figure of eight, in the paper's
+scenarios. With `--counting` Table II takes the worlds that `hidden_worlds.py --find K --json FILE` has found to count.
+Every cell (table, world, method, seed) is kept in --out, so the same command goes on where it was stopped; `--stop
+SECONDS` begins no new cell after that time. What is hidden is drawn from `--seed`, itself drawn once and kept.
+Pretrained policies are those that `pretrain.py --out DIR` made, else the package's; posteriors (also .npz) and
+detectors are `<place>.safetensors` in their folders; so are TD-MPC2's world models, which `tdmpc2_pretrain.py` makes.
+The control rate is that of one robot's decisions on this machine.
+--quick pretrains a toy Jackal first and ends within three minutes; its figures mean nothing.
+"""
+
+import argparse
+import json
+import os
+import secrets
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from posteriors.keep import Kept
+from worlds import paper, tables
+from worlds.learning import Budget
+from worlds.machines import ROBOTS, nominal_space
+from worlds.methods import METHODS, Job, run
+from worlds.scenarios import TABLE_III
+from worlds.world import ENGINES, World
+
+PLACES = tuple(f"{robot}{ground}" for robot in paper.ROBOTS for ground in paper.GROUNDS)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = parse(argv)
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        out = args.out or Path(folder)
+        out.mkdir(parents=True, exist_ok=True)
+        args.seed = master_seed(args.seed, out)
+        if args.quick:
+            toy(args, out)
+        kept = Kept(out, {"seed": args.seed, "episodes": args.episodes, "steps": args.steps, "envs": args.envs,
+                          "executed": args.executed, "task": args.task, "engine": args.engine})  # fmt: skip
+        cells = filled(args, kept, out, began)
+        rng = np.random.default_rng(0)
+        parts = [table(cells, args.methods, rng) for table in (tables.table_two, tables.table_three)]
+        text = "\n".join(t for t, _ in parts if t) + f"\n{paper.CAVEAT}\n"
+        (out / "tables.md").write_text(text)
+        print(text)
+        if args.json:
+            rows = [row for _, rows in parts for row in rows]
+            args.json.write_text(json.dumps({"rows": rows, "seed": args.seed}, indent=1, allow_nan=False))
+    return 0
+
+
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--tables", nargs="+", choices=("II", "III"), default=["II", "III"])
+    add("--places", nargs="+", choices=PLACES, default=list(PLACES), metavar="PLACE", help="of Table II")
+    add("--grounds", nargs="+", choices=paper.GROUNDS, default=list(paper.GROUNDS), help="of Table III")
+    add("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    add("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of learning")
+    add("--worlds", type=int, default=1, help="hidden worlds a scenario")
+    add("--counting", type=Path, metavar="FILE", help="of `hidden_worlds.py --json`: Table II takes what counts there")
+    add("--scenario", default="psi+effect", help="of Table II")
+    add("--scenarios", nargs="+", metavar="PARTS", help="of Table III; default the paper's")
+    add("--engine", choices=ENGINES, default="mujoco", help="of the true worlds; bullet: PyBullet")
+    add("--task", choices=("goal", "figure8"), default="figure8", help="of Table III")
+    add("--episodes", type=int, default=100, help="that judge a policy")
+    add("--policies", type=Path, metavar="DIR")
+    add("--posteriors", type=Path, metavar="DIR")
+    add("--detectors", type=Path, metavar="DIR")
+    add("--world-models", type=Path, metavar="DIR", help="of TD-MPC2")
+    add("--envs", type=int, default=1024)
+    add("--steps", type=int, default=20_000_000, help="control steps of learning in simulation")
+    add("--budget", type=float, default=1800.0, metavar="SECONDS", help="of learning in simulation")
+    add("--executed", type=int, default=10, help="episodes in the true world that adapting may use")
+    add("--ratio", type=float, default=1.0, help="updates of TD-MPC2 a control step in the true world; published: 1")
+    add("--threads", type=int, default=0, help="of the physics; 0 is all")
+    add("--device", default="cpu")
+    add("--seed", type=int, help="of what is hidden; default drawn once, and kept in --out")
+    add("--stop", type=float, metavar="SECONDS")
+    add("--out", type=Path, metavar="DIR")
+    add("--json", type=Path, metavar="FILE")
+    add("--quick", action="store_true")
+    return parser.parse_args(argv)
+
+
+def master_seed(given: int | None, out: Path) -> int:
+    """The given seed, else the one that the folder was begun with, else a new one; the folder keeps it."""
+    file = out / "seed.json"
+    seed = given if given is not None else json.loads(file.read_text()) if file.is_file() else secrets.randbits(31)
+    file.write_text(json.dumps(seed))
+    return seed
+
+
+def toy(args: argparse.Namespace, out: Path) -> None:
+    """Settings of a minute, and a policy and a world model that were hardly trained."""
+    from tdmpc2 import pretraining as tdmpc2
+
+    from nfc_gym.adaptation.pretraining import pretrain
+
+    args.places, args.grounds, args.seeds = ["JackalFlat"], ["Flat"], [0]
+    args.methods = [
+        m for m in args.methods if m in ("random", "unadapted", "nfc", "no_nfc", "oracle", "falco", "tdmpc2")
+    ]
+    args.episodes, args.envs, args.steps, args.budget, args.executed, args.scenarios = 4, 16, 4_000, 2.0, 1, ["axle"]
+    args.policies = args.posteriors = out / "toys"
+    args.world_models = out / "toy_models"
+    args.policies.mkdir(exist_ok=True)
+    pretrain("JackalFlat", args.policies / "JackalFlat.safetensors", steps=4_000, envs=16, threads=1)
+    tiny = tdmpc2.Pretraining(envs=16, first=400, net="tiny", episodes=1)
+    tdmpc2.pretrain("JackalFlat", args.world_models / "JackalFlat.safetensors", tiny, steps=800, threads=1)
+    space = nominal_space(ROBOTS["jackal"])
+    psi = np.random.default_rng(0).uniform(space.low, space.high, (64, len(space)))  # it knows no more than the prior
+    np.savez(args.posteriors / "JackalFlat.npz", psi=psi)
+
+
+def worlds_of(args: argparse.Namespace) -> list[World]:
+    """Of Table II: the first that were found to count, or drawn ones."""
+    if not args.counting:
+        return [World(p, args.scenario, args.seed + k, engine=args.engine) for p in args.places
+                for k in range(args.worlds)]  # fmt: skip
+    rows = [r for r in json.loads(args.counting.read_text())["worlds"] if r["counts"]]
+    worlds = []
+    for place in args.places:
+        own = [World(place, r["scenario"], r["seed"], engine=r["engine"]) for r in rows if r["place"] == place]
+        if not own:
+            print(f"{place}: no world of {args.counting} counts: left out", flush=True)
+        worlds += own[: args.worlds]
+    return worlds
+
+
+def asked(args: argparse.Namespace) -> Iterator[tuple[str, World, str | None, int]]:
+    """Table, world, task and seed of every cell."""
+    for seed in args.seeds:
+        if "II" in args.tables:
+            for world in worlds_of(args):
+                yield "II", world, None, seed
+        if "III" in args.tables:
+            for ground in args.grounds:
+                for scenario in args.scenarios or TABLE_III[ground]:
+                    for k in range(args.worlds):
+                        yield (
+                            "III",
+                            World(f"Jackal{ground}", scenario, args.seed + k, engine=args.engine),
+                            args.task,
+                            seed,
+                        )
+
+
+def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tables.Cells:
+    """All cells that there are or are asked for."""
+    cells = tables.Cells()
+    points, judged = (2, 4) if args.quick else (10, 32)
+    budget = Budget(args.envs, args.steps, args.budget, args.executed, judged, points, args.threads, args.device,
+                    args.ratio)  # fmt: skip
+    for table, world, task, seed in asked(args):
+        for method in args.methods:
+            if args.stop and time.monotonic() - began > args.stop:
+                print("time is up: the same command goes on")
+                return cells
+            name = f"{table}_{world.name}_{method}_{seed}"
+            *given, model = files(args, world.place)
+            job = Job(world, seed, *given, budget, task, out / "states" / name, model)
+            start = time.monotonic()
+            of = {"ratio": args.ratio} if method == "tdmpc2" else {}
+            cell = kept.once(name, lambda m=method, j=job: run(m, j, args.episodes), **of)
+            cells.add((table, world.place, world.scenario, world.seed, seed), method, cell)
+            print(f"{name}: {told(cell)}, {time.monotonic() - start:.0f} s", flush=True)
+    return cells
+
+
+def files(args: argparse.Namespace, place: str) -> tuple[str, str | None, str | None, str | None]:
+    """Policy, posterior, detector and world model of a place: files, or for the policy an id."""
+    posterior = file_of(args.posteriors, place, (".npz", ".safetensors"))
+    return (
+        file_of(args.policies, place, ("-v0.safetensors", ".safetensors")) or place,
+        posterior,
+        file_of(args.detectors, place),
+        file_of(args.world_models, place),
+    )
+
+
+def told(cell: dict) -> str:
+    """A cell in a few words."""
+    if "missing" in cell:
+        return f"missing: {cell['missing']}"
+    e = cell["episodes"]
+    return f"return {np.mean(e['returns']):.0f}, success {np.mean(e['success']):.2f}"
+
+
+def file_of(folder: Path | None, place: str, suffixes: Sequence[str] = (".safetensors",)) -> str | None:
+    """A place's file in a folder, where both are there."""
+    found = [] if folder is None else [folder / f"{place}{s}" for s in suffixes if (folder / f"{place}{s}").is_file()]
+    return str(found[0]) if found else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

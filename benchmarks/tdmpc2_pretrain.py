@@ -1,0 +1,89 @@
+"""World models of TD-MPC2 for the tables of `policies.py`, pretrained under random psi and terrain, one after another.
+
+    python benchmarks/tdmpc2_pretrain.py --out DIR --only JackalFlat AntFlat --steps 1000000 --device cuda
+    python benchmarks/tdmpc2_pretrain.py --quick
+
+DIR gets `<Place>.safetensors` for each, its state and its curves; the same command goes on with what was stopped.
+Planning for one robot takes about 37 GFLOP a control step with the published network (`--net 5M`): use a GPU. Prints
+how each does in the nominal world, beside a policy of random actions. `--quick` is a tiny network that learns nothing.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import torch
+from pretrain import IDS, random_return
+from rich.console import Console
+from tdmpc2.pretraining import Pretraining, pretrain
+from tdmpc2.settings import NETS
+from timing import Table
+
+from nfc_gym.adaptation.ppo import Diverged
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = parse(argv)
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    first = 500 if args.quick else 0
+    arguments = Pretraining(seed=args.seed, envs=args.envs, first=first, ratio=args.ratio, net=args.net,
+                            episodes=args.episodes)  # fmt: skip
+    table, code = Table(), 0
+    with tempfile.TemporaryDirectory() as folder:
+        out = args.out or Path(folder)
+        for place in args.only:
+            try:
+                agent = pretrain(
+                    place, out / f"{place}.safetensors", arguments, steps=args.steps, seconds=args.seconds,
+                    device=args.device, threads=args.threads, console=Console(),
+                )  # fmt: skip
+            except Diverged as error:
+                print(error, flush=True)
+                code = 1
+                continue
+            found = agent.about["nominal"]
+            table.add(f"{place}: TD-MPC2, return in the nominal world", found["return"], "1",
+                      baseline=random_return(place), seeds=(args.seed,))  # fmt: skip
+            if "success" in found:
+                table.add(f"{place}: TD-MPC2, success", found["success"], "share", seeds=(args.seed,))
+    if args.json:
+        args.json.write_text(json.dumps([asdict(row) for row in table.rows], indent=1))
+    return code
+
+
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--out", type=Path, metavar="DIR")
+    add("--only", nargs="+", choices=IDS, default=["JackalFlat", "JackalRough", "AntFlat", "AntRough"], metavar="PLACE")
+    add("--steps", type=int, default=1_000_000, help="control steps of all simulations of a place together")
+    add("--seconds", type=float, help="of each place, whichever is used up first")
+    add("--envs", type=int, default=64)
+    add("--ratio", type=float, default=0.25, help="updates a control step; the published one is 1")
+    add("--net", choices=list(NETS), default="5M")
+    add("--episodes", type=int, default=16, help="that judge each")
+    add("--device", default="auto")
+    add("--threads", type=int, default=0, help="of the physics; 0 is all")
+    add("--seed", type=int, default=0)
+    add("--json", type=Path, metavar="FILE")
+    add("--quick", action="store_true")
+    args = parser.parse_args(argv)
+    if args.quick:
+        args.only, args.net, args.steps = ["JackalFlat"], "tiny", 1_000
+        args.envs, args.episodes, args.threads = 16, 1, 1
+    elif args.out is None:
+        parser.error("name a folder: --out DIR")
+    return args
+
+
+if __name__ == "__main__":
+    sys.exit(main())

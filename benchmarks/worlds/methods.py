@@ -1,0 +1,220 @@
+"""Ways to a policy for a world, by name: those of the paper, its ablations, and references."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nfc_gym.core.errors import NfcError
+
+from .falco import Falco
+from .judge import Episodes, Uniform
+from .players import control_rate, play
+from .world import World
+
+if TYPE_CHECKING:
+    from .learning import Budget, Learned
+
+
+REACH = 0.3  # of the prior's width, by which psi may lie beyond its bounds: as far as `psi_off` leads
+
+
+class NotThere(NfcError):
+    """A method lacks something; the message says what."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One method in one world with one seed.
+
+    Attributes:
+      world: the true world.
+      seed: of learning and of the episodes that judge it.
+      nominal: the pretrained policy: a file, or an id whose policy comes with the package.
+      posterior: checkpoint of a posterior of the same environment; None infers by `Assimilation`, on Flat.
+      detector: an anomaly detector or its file; None where there is none.
+      budget: what it may use.
+      task: of Jackal and Quadcopter; None is the first.
+      folder: where states and logs go.
+      world_model: file of a pretrained world model of TD-MPC2; None where there is none.
+    """
+
+    world: World
+    seed: int
+    nominal: str
+    posterior: str | None
+    detector: Any
+    budget: "Budget"
+    task: str | None
+    folder: Path
+    world_model: str | None = None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Of the environment."""
+        return {"task": self.task} if self.task else {}
+
+    def mean_return(self, policy: Any) -> float:
+        """Over a few episodes in the true world, for curves."""
+        return float(np.mean(self.played(policy, self.budget.judged, self.seed + 10_000).returns))
+
+    def played(self, policy: Any, episodes: int, seed: int) -> Episodes:
+        """Episodes in the true world."""
+        return play(policy, self.world, episodes, seed, nthread=self.budget.threads, **self.settings)
+
+
+Make = Callable[[Job], "Learned"]
+
+
+def _fixed(policy: Any, job: Job) -> "Learned":
+    from .learning import Learned
+
+    return Learned(policy, [], {})
+
+
+def random_policy(job: Job) -> "Learned":
+    """Actions uniform in their box."""
+    return _fixed(Uniform(job.world.kind.action_size, job.seed), job)
+
+
+def falco(job: Job) -> "Learned":
+    """Motion primitives with PID."""
+    if job.world.robot != "jackal":
+        raise NotThere("drives a Jackal alone")
+    return _fixed(Falco(), job)
+
+
+def unadapted(job: Job) -> "Learned":
+    """The pretrained policy as it is."""
+    from .learning import opened
+
+    return _fixed(opened(job.nominal, job.budget.device), job)
+
+
+def no_nfc(job: Job) -> "Learned":
+    """PPO on what was executed in the true world, and on nothing else."""
+    from .learning import EPISODE, improve, opened, true_world
+
+    budget, policy = job.budget, opened(job.nominal, job.budget.device)
+    envs = true_world(job.world, 1, budget, job.seed, **job.settings)
+    return improve(policy, envs, job.mean_return, budget, job.seed, EPISODE * budget.executed)
+
+
+def oracle(job: Job) -> "Learned":
+    """PPO in as many simulations of the true world as there is time for: what could be reached at all."""
+    from .learning import improve, levelled, opened, true_world
+
+    budget, policy = job.budget, opened(job.nominal, job.budget.device)
+    envs = true_world(job.world, budget.envs, budget, job.seed, **job.settings)
+    found = improve(policy, envs, job.mean_return, budget, job.seed, budget.steps)
+    found.notes["levelled"] = levelled(found.curve)
+    return found
+
+
+def randomised(job: Job) -> "Learned":
+    """PPO for as many steps in the package's simulator, psi uniform over the whole prior: no posterior is asked."""
+    from nfc_gym.adaptation.worlds import training_env
+
+    from .learning import EPISODE, improve, opened
+
+    budget, policy = job.budget, opened(job.nominal, job.budget.device)
+    envs = training_env(f"nfc_gym/{job.world.place}-v0", budget.envs, threads=budget.threads, seed=job.seed, spread=1.0,
+                        episode=EPISODE, settings=job.settings)  # fmt: skip
+    return improve(policy, envs, job.mean_return, budget, job.seed, budget.steps)
+
+
+def inference(job: Job) -> Any:
+    """The posterior of the job; without one, replays of what was executed, which need to know the ground."""
+    from nfc_gym.adaptation.assimilation import Assimilation
+    from nfc_gym.core.posterior import load_source
+
+    if job.posterior is not None:
+        return load_source(job.posterior)
+    if job.world.ground == "Rough":
+        raise NotThere(f"needs a posterior on rough ground: --posteriors DIR with {job.world.place}.safetensors")
+    environment, threads = f"nfc_gym/{job.world.place}-v0", job.budget.threads
+    return Assimilation(environment, reach=REACH, seed=job.seed, nthread=threads)
+
+
+def nfc(**config: Any) -> Make:
+    """The paper's Algorithm 1; `config` of `AdaptConfig`, by which it is ablated."""
+
+    def make(job: Job) -> "Learned":
+        from nfc_gym.adaptation.agent import ppo_agent
+        from nfc_gym.adaptation.algorithm import AdaptConfig, adapt
+
+        from .learning import EPISODE, Learned, opened
+        from .watching import watcher
+
+        posterior = inference(job)
+        policy, budget = opened(job.nominal, job.budget.device), job.budget
+        detector = job.detector or watcher(policy, job.world, job.seed, nthread=job.budget.threads, **job.settings)
+        context = ["psi", "elevation"] if job.world.ground == "Rough" else ["psi"]
+        given = AdaptConfig(missions=budget.executed, worlds=budget.envs, steps=budget.steps // budget.executed,
+                            episode=EPISODE, seed=job.seed, **config)  # fmt: skip
+        found = adapt(
+            ppo_agent(policy), job.world.single(context=context, **job.settings), posterior, detector,
+            config=given, environment=f"nfc_gym/{job.world.place}-v0", folder=job.folder, threads=budget.threads,
+            settings=job.settings,
+        )  # fmt: skip
+        curve = [(EPISODE * k, row["return"]) for k, row in enumerate(found.history)]
+        return Learned(policy, curve, {"anomalies": found.anomalies, "history": found.history})
+
+    return make
+
+
+def tdmpc2(job: Job) -> "Learned":
+    """A world model that was pretrained as PPO was, and learns from what was executed in the true world alone."""
+    if job.world_model is None:
+        raise NotThere(f"needs a world model: --world-models DIR with {job.world.place}.safetensors, which "
+                       "`benchmarks/tdmpc2_pretrain.py` makes")  # fmt: skip
+    from . import planned
+    from .learning import EPISODE, true_world
+
+    budget = job.budget
+    envs = true_world(job.world, 1, budget, job.seed, **job.settings)
+    agent = planned.opened(job.world_model, envs, budget.device)
+    return planned.improve(agent, envs, job.mean_return, budget, job.seed, EPISODE * budget.executed)
+
+
+@dataclass(frozen=True)
+class Method:
+    """One of them.
+
+    Attributes:
+      title: in tables.
+      make: how it comes by a policy.
+      learns: whether it makes use of a budget, so that several seeds differ in more than their episodes.
+    """
+
+    title: str
+    make: Make
+    learns: bool = True
+
+
+METHODS: dict[str, Method] = {
+    "random": Method("random", random_policy, learns=False),
+    "unadapted": Method("PPO, unadapted", unadapted, learns=False),
+    "nfc": Method("PPO w/ NFC", nfc()),
+    "no_fidelity": Method("PPO w/o delta-fidelity", nfc(parts=("psi",))),
+    "no_hallucination": Method("PPO w/o hallucination", nfc(hallucinate=False)),
+    "no_nfc": Method("PPO w/o NFC", no_nfc),
+    "randomised": Method("domain randomisation alone", randomised),
+    "oracle": Method("oracle", oracle),
+    "falco": Method("Falco", falco, learns=False),
+    "tdmpc2": Method("TD-MPC2", tdmpc2),
+}
+
+
+def run(name: str, job: Job, episodes: int) -> dict[str, Any]:
+    """A method's episodes in its world, with its curve and control rate; or what is `missing`, in words."""
+    try:
+        learned = METHODS[name].make(job)
+    except (NotThere, ImportError) as error:
+        return {"missing": str(error)}
+    found = job.played(learned.policy, episodes, job.seed)
+    hertz = control_rate(learned.policy, job.world, **job.settings)
+    return {"episodes": found.to_json(), "curve": learned.curve, "notes": learned.notes,
+            "hidden": job.world.truth.text, "hertz": hertz}  # fmt: skip

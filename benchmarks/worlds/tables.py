@@ -1,0 +1,209 @@
+"""Tables II and III out of finished cells: figures with intervals, the paper's beside them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from posteriors.report import lines
+
+from nfc_gym.measured.hidden import Array
+
+from . import paper
+from .figures import Interval, bootstrap, normalised, running_min_max
+from .judge import Episodes
+from .methods import METHODS
+
+LEAST = (
+    0.05  # of normalised return that an oracle must be above the unadapted policy, for shares of it to mean anything
+)
+RATE = "control rate, Hz: ours / the paper's"
+Key = tuple[str, str, str, int, int]  # table, place, scenario, seed of what is hidden, seed of learning
+
+
+@dataclass
+class Cells:
+    """Finished cells by what they are of, then by method.
+
+    Attributes:
+      found: (table, place, scenario, hidden seed, learning seed) -> method -> what `methods.run` gave.
+    """
+
+    found: dict[Key, dict[str, dict[str, Any]]] = field(default_factory=dict)
+
+    def add(self, key: Key, method: str, cell: dict[str, Any]) -> None:
+        """One more."""
+        self.found.setdefault(key, {})[method] = cell
+
+    def places(self, table: str) -> list[str]:
+        """Of a table, in the order in which they came."""
+        return list(dict.fromkeys(k[1] for k in self.found if k[0] == table))
+
+    def of(self, table: str, place: str, method: str) -> dict[Key, Episodes]:
+        """Episodes of a method at a place."""
+        return {k: Episodes.of_json(v[method]["episodes"]) for k, v in self.found.items()
+                if k[:2] == (table, place) and "episodes" in v.get(method, {})}  # fmt: skip
+
+    def missing(self, table: str, place: str, method: str) -> str | None:
+        """Why there are none."""
+        said = [v[method]["missing"] for k, v in self.found.items() if k[:2] == (table, place)
+                and "missing" in v.get(method, {})]  # fmt: skip
+        return said[0] if said else None
+
+    def hertz(self, table: str, place: str, method: str) -> float:
+        """Its mean control rate there; NaN where none was measured."""
+        rates = [v[method]["hertz"] for k, v in self.found.items() if k[:2] == (table, place)
+                 and "hertz" in v.get(method, {})]  # fmt: skip
+        return float(np.mean(rates)) if rates else float("nan")
+
+
+def references(cells: Cells, place: str) -> dict[tuple[str, str, int], tuple[float, float]]:
+    """Mean return of the random policy and of the oracle, by (place, scenario, hidden seed), over all their seeds."""
+    out = {}
+    worlds = {k[1:4] for k in cells.found if k[:2] == ("II", place)}
+    for world in worlds:
+        means = []
+        for method in ("random", "oracle"):
+            all_of = [e.returns for k, e in cells.of("II", place, method).items() if k[1:4] == world]
+            means.append(float(np.mean(np.concatenate(all_of))) if all_of else float("nan"))
+        out[world] = (means[0], means[1])
+    return out
+
+
+def groups(cells: Cells, place: str, method: str) -> dict[Key, Array]:
+    """Normalised returns (episodes,) by cell."""
+    known = references(cells, place)
+    return {k: normalised(np.array(e.returns), *known[k[1:4]]) for k, e in cells.of("II", place, method).items()}
+
+
+def min_max(cells: Cells, place: str, method: str) -> float:
+    """The paper's normalisation: mean over cells, each between the smallest and largest mean return in its world.
+
+    Every point of every method's curve there counts as a return so far, and the method's own last comes last.
+    """
+    values = []
+    for key, episodes in cells.of("II", place, method).items():
+        past = [r for k, v in cells.found.items() if k[:4] == key[:4] for cell in v.values()
+                for r in _returns(cell)]  # fmt: skip
+        values.append(running_min_max([*past, float(np.mean(episodes.returns))])[-1])
+    return float(np.mean(values)) if values else float("nan")
+
+
+def _returns(cell: dict[str, Any]) -> list[float]:
+    own = [float(np.mean(cell["episodes"]["returns"]))] if "episodes" in cell else []
+    return [r for _, r in cell.get("curve", [])] + own
+
+
+def paired(cells: Cells, place: str, one: str, other: str, rng: np.random.Generator) -> Interval:
+    """Mean difference of normalised return between two methods, episode by episode, as their seeds are the same."""
+    first, second = groups(cells, place, one), groups(cells, place, other)
+    return bootstrap([first[k] - second[k] for k in first if k in second], rng)
+
+
+def recovered(cells: Cells, place: str, method: str) -> float:
+    """Share of (oracle - unadapted) that a method brought back.
+
+    NaN where one of them is missing, or where the oracle is hardly better than the unadapted policy: it was trained
+    for too short a time then, or nothing was lost.
+    """
+    after, before = (
+        np.mean([g.mean() for g in groups(cells, place, m).values()] or [np.nan]) for m in (method, "unadapted")
+    )
+    return float((after - before) / (1 - before)) if before < 1 - LEAST else float("nan")
+
+
+def shown(interval: Interval, digits: int = 2) -> str:
+    """As text; a dash where there is nothing."""
+    if interval.value != interval.value:
+        return "-"
+    return f"{interval.value:.{digits}f} [{interval.low:.{digits}f}, {interval.high:.{digits}f}]"
+
+
+def shown_rate(hertz: float, method: str) -> str:
+    """A control rate beside the paper's, as text."""
+    theirs = paper.RATES.get(method)
+    return f"{'-' if hertz != hertz else f'{hertz:.0f}'} / {'-' if theirs is None else f'{theirs:.0f}'}"
+
+
+def table_two(cells: Cells, methods: Iterable[str], rng: np.random.Generator) -> tuple[str, list[dict[str, Any]]]:
+    """Text and figures of Table II."""
+    text, figures = [], []
+    for place in cells.places("II"):
+        rows = []
+        for name in methods:
+            why, own = cells.missing("II", place, name), groups(cells, place, name)
+            value = bootstrap(list(own.values()), rng)
+            returns = bootstrap([np.array(e.returns) for e in cells.of("II", place, name).values()], rng)
+            theirs, ours = paper.return_of(name, place), min_max(cells, place, name)
+            rows.append([METHODS[name].title, why or shown(value), shown(returns, 0), "-" if ours != ours else
+                         f"{ours:.2f}", "-" if theirs is None else f"{theirs:.2f}",
+                         shown_rate(cells.hertz("II", place, name), name), str(len(own))])  # fmt: skip
+            if why is None:
+                figures.append(_figure(f"{place}: {METHODS[name].title}, normalised return", value, "1", theirs, own))
+        head = ["", "normalised return, 95 %", "return, 95 %", "min-max", "the paper's", RATE, "cells"]
+        text.append(f"### {place}\n\n{lines(head, rows)}\n{_contributions(cells, place, rng)}")
+    shares = [s for s in (recovered(cells, place, "nfc") for place in cells.places("II")) if s == s]
+    if shares:
+        middle = Interval(float(np.median(shares)), min(shares), max(shares))
+        figures.append(_figure("share of (oracle - unadapted) recovered, median over places (lowest, highest)", middle,
+                               "1", None, {}, paper.RECOVERED))  # fmt: skip
+    if not text:
+        return "", []
+    return "## Table II: return in the hidden world (random 0, oracle 1)\n\n" + "\n".join(text), figures
+
+
+def _contributions(cells: Cells, place: str, rng: np.random.Generator) -> str:
+    out = []
+    for other in ("no_fidelity", "no_hallucination", "no_nfc", "randomised"):
+        value = paired(cells, place, "nfc", other, rng)
+        if value.value == value.value:
+            out.append(f"- w/ NFC minus {METHODS[other].title}: {shown(value)}")
+    rose = [v["oracle"]["notes"].get("levelled") for k, v in cells.found.items()
+            if k[:2] == ("II", place) and "notes" in v.get("oracle", {})]  # fmt: skip
+    if rose:
+        out.append(f"- the oracle's curve has levelled in {sum(map(bool, rose))} of {len(rose)} cells")
+    share = recovered(cells, place, "nfc")
+    if share == share:
+        out.append(f"- share of (oracle - unadapted) recovered: {share:.2f}")
+    return "\n".join(out) + ("\n" if out else "")
+
+
+def table_three(cells: Cells, methods: Iterable[str], rng: np.random.Generator) -> tuple[str, list[dict[str, Any]]]:
+    """Text and figures of Table III; a ground's scenarios are taken together, as the paper does."""
+    rows, figures = [], []
+    for name in methods:
+        for place in cells.places("III"):
+            ground, own = place.removeprefix("Jackal"), cells.of("III", place, name)
+            why = cells.missing("III", place, name)
+            row = [METHODS[name].title, ground, str(sum(len(e.returns) for e in own.values()))]
+            for key, words in paper.FIGURES.items():
+                value = bootstrap([np.array(getattr(e, key), float) for e in own.values()], rng)
+                theirs = paper.drive_of(name, ground, key)
+                row.append(why or f"{shown(value)} / {'-' if theirs is None else f'{theirs:g}'}")
+                if own:
+                    goal = paper.GOALS.get((key, ground)) if name == "nfc" else None
+                    figures.append(_figure(f"{place}: {METHODS[name].title}, {words}", value, words, theirs, own, goal,
+                                           at_least=key == "success"))  # fmt: skip
+            hertz = cells.hertz("III", place, name)
+            row.append(shown_rate(hertz, name))
+            if own and hertz == hertz:
+                measured = Interval(hertz, float("nan"), float("nan"))
+                figures.append(_figure(f"{place}: {METHODS[name].title}, control rate", measured, "Hz",
+                                       paper.RATES.get(name), own))  # fmt: skip
+            rows.append(row)
+    if not rows:
+        return "", []
+    head = ["", "ground", "episodes", *(f"{words}: ours / the paper's" for words in paper.FIGURES.values()), RATE]
+    return f"## Table III: the Jackal's broken axle, figure of eight\n\n{lines(head, rows)}\n", figures
+
+
+def _figure(
+    name: str, value: Interval, unit: str, baseline: float | None, own: dict[Key, Any], goal: float | None = None,
+    at_least: bool = True,
+) -> dict[str, Any]:  # fmt: skip
+    seeds = sorted({k[4] for k in own})
+    plain = [None if v != v else v for v in value]
+    holds = None if goal is None else bool(value.value >= goal if at_least else value.value <= goal)
+    said = None if goal is None else f"{'>=' if at_least else '<='} {goal:g}"
+    return {"name": name, "value": plain[0], "unit": unit, "baseline": baseline, "goal": said, "holds": holds,
+            "seeds": seeds, "low": plain[1], "high": plain[2]}  # fmt: skip

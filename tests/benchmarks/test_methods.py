@@ -1,0 +1,122 @@
+"""Methods of Tables II and III: what each may use, and that what is missing is said."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="methods learn with torch")
+pytest.importorskip("torchrl", reason="methods learn by TorchRL")
+
+
+def untrained(tmp_path: Path, place: str = "JackalFlat") -> str:
+    """A policy's file with weights as they are drawn."""
+    from worlds.world import World
+
+    from nfc_gym.adaptation.network import ActorCritic, Sizes
+    from nfc_gym.adaptation.policy import Policy
+    from nfc_gym.adaptation.sight import Sight
+
+    env = World(place, "nominal", 0).make(1, context=["psi"])
+    torch.manual_seed(0)
+    sight = Sight.of(env)
+    sizes = Sizes(sight.size, len(env.unwrapped.psi_space), env.unwrapped.robot.action_size, (16,))
+    path = tmp_path / f"{place}.safetensors"
+    Policy(sight, ActorCritic(sizes)).save(path)
+    return str(path)
+
+
+def job(tmp_path: Path, **change: Any) -> Any:
+    from worlds.learning import Budget
+    from worlds.methods import Job
+    from worlds.world import World
+
+    budget = Budget(envs=4, steps=800, seconds=5.0, executed=1, judged=1, points=1, threads=1)
+    given = {"world": World("JackalFlat", "axle", 0), "seed": 0, "nominal": untrained(tmp_path), "posterior": None,
+             "detector": None, "budget": budget, "task": None, "folder": tmp_path / "states"}  # fmt: skip
+    return Job(**{**given, **change})
+
+
+def test_a_curve_has_levelled_where_its_last_quarter_hardly_rises() -> None:
+    from worlds.learning import levelled
+
+    steps = np.arange(0, 101, 5)
+    assert levelled([(int(s), float(1 - np.exp(-s / 10))) for s in steps])
+    assert not levelled([(int(s), float(s)) for s in steps])
+    assert not levelled([(0, 0.0), (100, 1.0)])
+
+
+def test_what_is_missing_is_said_and_not_counted(tmp_path: Path) -> None:
+    from worlds.methods import run
+    from worlds.world import World
+
+    plain = job(tmp_path)
+    assert "--world-models DIR with JackalFlat" in run("tdmpc2", plain, 2)["missing"]
+    rough = job(tmp_path, world=World("JackalRough", "axle", 0))
+    assert "--posteriors DIR with JackalRough" in run("nfc", rough, 2)["missing"]
+    assert "Jackal" in run("falco", job(tmp_path, world=World("AntFlat", "psi", 0)), 2)["missing"]
+
+
+def test_without_nfc_no_more_is_learned_from_than_was_executed(tmp_path: Path) -> None:
+    from worlds.methods import METHODS
+
+    found = METHODS["no_nfc"].make(job(tmp_path))
+    assert found.notes["steps"] == 1000  # one episode's
+    assert [s for s, _ in found.curve] == [0, 1000]
+
+
+def test_an_oracle_learns_in_the_true_world_and_the_nominal_policy_is_left_alone(tmp_path: Path) -> None:
+    from worlds.methods import METHODS, run
+
+    plain = job(tmp_path)
+    before = Path(plain.nominal).read_bytes()
+    found = METHODS["oracle"].make(plain)
+    assert found.notes["steps"] >= 800
+    assert len(found.curve) == 2
+    assert "levelled" in found.notes
+    assert Path(plain.nominal).read_bytes() == before
+    cell = run("unadapted", plain, 2)
+    assert len(cell["episodes"]["returns"]) == 2
+    assert cell["hidden"] == "front_left_wheel_damping 0"
+    assert cell["hertz"] > 50  # a small network decides faster than the robot is controlled
+
+
+def test_a_watcher_of_the_motion_at_home_sees_another_motion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from worlds import watching
+    from worlds.learning import opened
+    from worlds.players import seen_by
+    from worlds.watching import HORIZON, RATE, watcher, windows
+    from worlds.world import World
+
+    monkeypatch.setattr(watching, "ROBOTS", 48)
+    policy = opened(untrained(tmp_path), "cpu")
+    home = World("JackalFlat", "nominal", 0)
+    detector = watcher(policy, home, 0)
+    states, actions = windows(policy, seen_by(policy, home, 16, max_episode_steps=300), 15, 99, 300)
+    assert states.shape[1:] == (HORIZON + 1, 15)
+    assert np.mean(detector.scorer.score(states, actions) >= detector.threshold) < 10 * RATE
+    loud = states + np.where(np.arange(15) == 9, 0.5, 0.0) * np.random.default_rng(0).standard_normal(states.shape)
+    assert np.mean(detector.scorer.score(loud, actions) >= detector.threshold) > 0.9
+
+
+def test_algorithm_one_runs_in_a_hidden_world(tmp_path: Path) -> None:
+    from worlds.machines import ROBOTS, nominal_space
+    from worlds.methods import run
+
+    class Alarm:
+        threshold = 1.0
+
+        def reset(self, rows: Any = None) -> None:
+            """Nothing is kept."""
+
+        def update(self, obs: Any, action: Any, next_obs: Any) -> float:
+            return 2.0
+
+    space = nominal_space(ROBOTS["jackal"])
+    prior = tmp_path / "JackalFlat.npz"
+    np.savez(prior, psi=np.random.default_rng(0).uniform(space.low, space.high, (64, len(space))))
+    cell = run("nfc", job(tmp_path, posterior=str(prior), detector=Alarm()), 2)
+    assert len(cell["curve"]) == 1  # of the one mission
+    assert cell["notes"]["anomalies"] == 1
+    assert (tmp_path / "states").is_dir()
