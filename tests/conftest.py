@@ -1,8 +1,13 @@
-"""Shared by all tests: the recordings' folder, and a clear skip where it is absent."""
+"""Shared by all tests: the recordings' folder, a clear skip where it is absent, and no test that times itself."""
 
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# How long an example takes depends on what else the machine does: the time of a test is no property of the code.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data"
 

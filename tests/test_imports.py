@@ -22,7 +22,7 @@ ALLOWED: dict[str, set[str]] = {
     "measured": {"", "core", "physics", "terrain", "assets"},
     # of inference only `windows`, the format on disk
     "simulate": {"core", "physics", "terrain", "assets", "envs", "wrappers", "inference"},
-    "adaptation": {"", "core", "physics", "terrain", "assets", "inference", "envs", "wrappers", "measured"},
+    "adaptation": {"", "core", "physics", "terrain", "assets", "inference", "envs", "wrappers", "measured", "simulate"},
     "cli": {
         "",
         "core",
