@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from nfc_gym import __version__
-from nfc_gym.cli import measured, policies, posteriors
+from nfc_gym.cli import measured, mission, policies, posteriors
 
 app = typer.Typer(
     help="Find what a MuJoCo model lacks, from logs of the real machine, and put it there.",
@@ -32,6 +32,7 @@ COMMANDS = {
     "pretrain": policies.pretrain,
     "play": policies.play,
     "adapt": policies.adapt,
+    "learn": mission.learn,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
