@@ -42,6 +42,7 @@ def hollows(
     found: Fit,
     seed: int,
     others: tuple[Array, ...] = (),
+    starts: int = STARTS,
     tick: Callable[[int], None] = lambda start: None,
 ) -> Hollows:
     """Fit again from starts about a fit, and keep the likeliest, each by the noise that it expects itself.
@@ -53,12 +54,13 @@ def hollows(
       found: the fit at hand.
       seed: of the starts.
       others: (size,) each, starts besides.
+      starts: how many are drawn.
       tick: called with the number of each start, from 1.
     """
     if not problem.rough:
         return Hollows(found.x, np.zeros(len(found.x)))
     plant, limits = found.plant, box(found.plant)
-    around = np.random.default_rng(seed).normal(size=(STARTS, len(limits.scale)))
+    around = np.random.default_rng(seed).normal(size=(starts, len(limits.scale)))
     z = np.clip(limits.at(found.x) + _AWAY * around, limits.floor, limits.roof)
     ends = [found.x]
     for number, start in enumerate([*limits.x(z, found.x), *others], 1):

@@ -24,7 +24,7 @@ from nfc_gym.measured.calibrate import calibrate, compared
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
-from nfc_gym.measured.elsewhere import hollows
+from nfc_gym.measured.elsewhere import STARTS, hollows
 from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.halved import step_error
@@ -271,8 +271,10 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit, Array]:
     """Calibrated and extended model refitted on every fit segment; what step and search leave open of the latter."""
     assert found.rest is not None
     last = found.rest.fitted
-    calibrated = extended = _settled(run, "calibrated", found.calibrated, whole)
-    if last.plant.effects:
+    effects = bool(last.plant.effects)
+    # Psi alone began its way here from several places; its intervals are asked for only where there is nothing beside.
+    calibrated = extended = _settled(run, "calibrated", found.calibrated, whole, starts=1 if effects else STARTS)
+    if effects:
         # What psi alone went to is another place for the same psi to begin.
         psi = calibrated.fitted.x[: len(last.plant.space)]
         extended = _settled(run, "extended", last, whole, (np.concatenate([psi, last.x[len(psi) :]]),))
@@ -289,14 +291,16 @@ class _Settled:
     open: Array
 
 
-def _settled(run: _Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = ()) -> _Settled:
+def _settled(
+    run: _Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = (), starts: int = STARTS
+) -> _Settled:
     """Fit a model from where it stands and, where bodies touch, from other places (size,) too."""
     plant, stage = start.plant, f"final {name}"
     if run.stages.get(stage) is None:
         run.say(f"fitting the {name} model on all {len(whole)} segments")
         fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
         tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
-        ended = hollows(whole, under, extra, fitted, run.seed, others, tick)
+        ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
         run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "open": ended.open.tolist()})
     x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "open"))
     under = metric(whole, whole.covariance(plant, x if whole.rough else start.x), extra)
