@@ -25,6 +25,7 @@ from nfc_gym.core import InputError, NfcError
 if TYPE_CHECKING:
     from nfc_gym.inference.posterior import Window
     from nfc_gym.measured.checks import Finding
+    from nfc_gym.simulate.witness import Witness
 
 FAULT, BAD_INPUT, INTERRUPTED = 1, 2, 3
 
@@ -111,7 +112,11 @@ def close_loop(
     ] = None,
     posterior: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Start from a posterior of this machine, which `nfc-gym infer --out` wrote."),
+        typer.Option(
+            metavar="FILE",
+            help="Start from a posterior of this machine, which `nfc-gym infer --out` wrote; one that was trained with "
+            "--structure says which effects to look at first, given a window or not.",
+        ),
     ] = None,
     time_saved: Annotated[
         bool, typer.Option("--time-saved", help="Calibrate without the posterior too, to say what it saved.")
@@ -121,10 +126,24 @@ def close_loop(
     with _outcome(ctx, resumes=True):
         from nfc_gym.measured.loop import close_loop as run
 
+        belief, witness = _consulted(posterior)
         run(
-            mapping, out, seed=seed, jobs=jobs, overwrite=overwrite, resume=resume, fold=fold, posterior=posterior,
-            compare=time_saved, console=Console(),
+            mapping, out, seed=seed, jobs=jobs, overwrite=overwrite, resume=resume, fold=fold, posterior=belief,
+            compare=time_saved, witness=witness, console=Console(),
         )  # fmt: skip
+
+
+def _consulted(posterior: Path | None) -> "tuple[Path | None, tuple[Witness, Path] | None]":
+    """What of a posterior's file the loop starts from, and its structure head: a file may hold either, or both."""
+    if posterior is None or posterior.suffix.lower() != ".safetensors" or not posterior.is_file():
+        return posterior, None
+    try:
+        from nfc_gym.simulate.witness import Witness, heads
+    except ImportError:
+        return posterior, None  # who opens it says what is missing
+    structure, window = heads(posterior)
+    witness = (Witness(posterior), posterior) if structure else None
+    return posterior if window or not structure else None, witness
 
 
 @app.command()
@@ -276,6 +295,12 @@ def train(
     maps: Annotated[
         bool, typer.Option("--maps", help="See the elevation map; needs windows simulated with --maps.")
     ] = False,
+    structure: Annotated[
+        bool, typer.Option("--structure", help="Say too which family of effects the model lacks; for close-loop.")
+    ] = False,
+    noise: Annotated[
+        float, typer.Option(metavar="FACTOR", min=0, help="Times the sensor noise that the windows' manifest assumes.")
+    ] = 1.0,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the windows, at most.")] = 100,
     batch: Annotated[int, typer.Option(min=1, help="Windows a step.")] = 256,
     seed: Annotated[int, typer.Option(min=0, help="Of the first weights, the order and the noise.")] = 0,
@@ -309,10 +334,11 @@ def train(
         machine = Machine(Manifest.read(windows).environment)
         prior = PriorBox.of(machine.space, machine.kind.name)
         config = NetworkConfig(
-            encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
-        )
+            encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s,
+            families=("none", "any") if structure else (),
+        )  # fmt: skip
         training = TrainConfig(epochs=epochs, batch=batch, seed=seed)
-        done = jobs.train_posterior(windows, prior, out, config, training, device=device, report=Spoken())
+        done = jobs.train_posterior(windows, prior, out, config, training, device=device, report=Spoken(), noise=noise)
         if done.best:
             said = f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
         else:

@@ -18,6 +18,7 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.segments import Layout, servos
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, estimate_states
+from nfc_gym.measured.suspects import Witness
 from nfc_gym.physics.effects import complete_inertia, propose
 from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrides
 from nfc_gym.physics.effects.conditions import conditioned
@@ -38,6 +39,7 @@ class Bench:
       states: of every log, by name.
       belief: of a posterior that calibration starts from.
       compare: calibrate from nominal values too, to say what that saved.
+      witness: a structure head that is asked about the fit logs, and the name of its file.
     """
 
     dataset: Dataset
@@ -46,6 +48,7 @@ class Bench:
     states: dict[str, States]
     belief: Belief | None = None
     compare: bool = False
+    witness: tuple[Witness, str] | None = None
 
     @property
     def mode(self) -> str:
