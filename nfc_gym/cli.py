@@ -296,7 +296,8 @@ def train(
         bool, typer.Option("--maps", help="See the elevation map; needs windows simulated with --maps.")
     ] = False,
     structure: Annotated[
-        bool, typer.Option("--structure", help="Say too which family of effects the model lacks; for close-loop.")
+        bool,
+        typer.Option("--structure", help="In place of a posterior: a head for close-loop, which family it lacks."),
     ] = False,
     noise: Annotated[
         float, typer.Option(metavar="FACTOR", min=0, help="Times the sensor noise that the windows' manifest assumes.")
@@ -314,6 +315,9 @@ def train(
 
     What the motion does not show comes back as wide as the prior, however long one trains: simulate motion like the one
     that you will log.
+
+    With --structure the file holds a structure head instead: shown motion and what a calibrated model without effects
+    misses of it, it says which family of effects is at work; `nfc-gym close-loop --posterior` then looks there first.
 
     Example: nfc-gym train windows/jackal --out jackal.safetensors
     """
@@ -334,11 +338,15 @@ def train(
         machine = Machine(Manifest.read(windows).environment)
         prior = PriorBox.of(machine.space, machine.kind.name)
         config = NetworkConfig(
-            encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s,
-            families=("none", "any") if structure else (),
-        )  # fmt: skip
-        training = TrainConfig(epochs=epochs, batch=batch, seed=seed)
-        done = jobs.train_posterior(windows, prior, out, config, training, device=device, report=Spoken(), noise=noise)
+            encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
+        )
+        training, how = TrainConfig(epochs=epochs, batch=batch, seed=seed), {"report": Spoken(), "noise": noise}
+        if structure:
+            from nfc_gym.simulate.teach import train_structure
+
+            done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
+        else:
+            done = jobs.train_posterior(windows, prior, out, config, training, device=device, **how)
         if done.best:
             said = f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
         else:

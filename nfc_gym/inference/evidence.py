@@ -23,6 +23,7 @@ from nfc_gym.inference.network import Network
 Array = NDArray[np.float64]
 EFFECTIVE = 8.0  # windows that any number of them counts for at most
 STRAY = 0.05
+_ROWS = 1024  # windows at once
 
 
 def combined(told: Array, shares: Array) -> Array:
@@ -47,18 +48,12 @@ def combined(told: Array, shares: Array) -> Array:
 
 
 @torch.no_grad()
-def told_by(
-    network: Network, states: Array, actions: Array, lacking: Array, rng: np.random.Generator, draws: int = 4
-) -> Array:
-    """(W, f) probabilities of the families given each of W windows, averaged over draws of sensor noise.
+def told_by(network: Network, states: Array, actions: Array) -> Array:
+    """(W, f) probabilities of the families given each of W windows.
 
     Args:
       network: with a structure head.
-      states, actions: (W, H+1, s) and (W, H, a), as logged.
-      lacking: (s,) standard deviation of the noise that the training set had and the log has not: it is added, since
-        windows quieter than all that a network was trained on are new inputs to it.
-      rng: of that noise.
-      draws: of it.
+      states, actions: (W, H+1, s) and (W, H, a), as it was trained on.
 
     Raises:
       InputError: a network without a structure head, or windows of another shape than it was trained on.
@@ -71,16 +66,14 @@ def told_by(
         ("actions", actions, (size.horizon, size.actions)),
     ):
         if x.ndim != 3 or x.shape[1:] != shape or not np.isfinite(x).all():
-            raise InputError(f"windows: {name} must be finite and of shape (windows, {shape}), got {x.shape}")
-    if network.config.elevation:
-        raise InputError("this network sees elevation maps, which logs do not hold: train one without --maps")
-    known = torch.as_tensor(actions, dtype=torch.float32)
-    total = np.zeros((len(states), len(network.config.families)))
-    for _ in range(draws):
-        noisy = states + lacking * rng.standard_normal(states.shape)
-        given = network.encode(torch.as_tensor(noisy, dtype=torch.float32), known)
-        total += network.structure(given.features).double().cpu().numpy()
-    return total / draws
+            raise InputError(
+                f"windows: {name} must be finite, of shape (windows, {shape[0]}, {shape[1]}), got {x.shape}"
+            )
+    out = []
+    for at in range(0, len(states), _ROWS):
+        pair = (torch.as_tensor(x[at : at + _ROWS], dtype=torch.float32) for x in (states, actions))
+        out.append(network.structure(network.encode(*pair).features).double().cpu().numpy())
+    return np.concatenate(out) if out else np.zeros((0, len(network.config.families)))
 
 
 def shares_of(families: Sequence[str], notes: dict) -> Array:

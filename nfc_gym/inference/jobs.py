@@ -82,9 +82,6 @@ def train_posterior(
         "seconds": outcome.seconds, "held_out": outcome.held_out, "start": outcome.start,
         "noise": [noise * sd for sd in about.state_noise],
     }  # fmt: skip
-    if config.families:
-        family = stored.take(np.arange(len(stored)), ["family"])["family"]
-        notes["shares"] = (np.bincount(family, minlength=len(config.families)) / len(family)).tolist()
     checkpoint.save(out, network.cpu(), notes=notes)
     return outcome
 

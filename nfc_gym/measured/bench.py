@@ -64,9 +64,17 @@ class Bench:
             return kind(model, logs, states, segments.length, max(1, -(-sum(map(len, self.dataset.logs)) // _SAMPLES)))
         return self.rollouts(logs, states, most)
 
-    def rollouts(self, logs: Sequence[Log], states: Sequence[States], most: int | None = None) -> RolloutProblem:
-        """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs."""
+    def rollouts(
+        self, logs: Sequence[Log], states: Sequence[States], most: int | None = None, length: float | None = None
+    ) -> RolloutProblem:
+        """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs.
+
+        Args:
+          length: s, of each segment, compared at its end; default as the mapping says.
+        """
         segments, model = self.dataset.mapping.segments, self.plant.model
+        if length is not None:
+            segments = replace(segments, length=length, horizons=(length,))
         controls = self.dataset.mapping.controls
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")

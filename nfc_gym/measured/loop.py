@@ -209,7 +209,7 @@ def _fold(
     calibrated, extended, step = _final(run, found, whole)
     final = calibrated, extended
     pool = candidates(bench, [*fitting, *selecting])
-    suspects = _suspects(run, fitting)
+    suspects = restored(stages.get("suspects"))
     if suspects is not None:
         pool = looked_at(pool, suspects, [*found.rounds, *found.rest.rounds] if found.rest else found.rounds)
     known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
@@ -247,7 +247,7 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     calibrated = stand(work, metric(work, sigma), plant, x)
     pool = candidates(bench, fitting)
     data = Data(work, sigma), Data(select, select.covariance(plant, x))
-    search = Search(*data, pool, Options(seed=run.seed), run.say, _suspects(run, fitting))
+    search = Search(*data, pool, Options(seed=run.seed), run.say, _suspects(run, fitting, x))
     if run.stages.get("found") is None:
         _keep_found(run.stages, _hunt(run, search, calibrated, pool))
     kept = run.stages.get("found")
@@ -261,15 +261,15 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     return found
 
 
-def _suspects(run: _Run, fitting: Sequence[Log]) -> Suspects | None:
-    """What the structure head says of the fit logs, asked once a run; None without a head."""
+def _suspects(run: _Run, fitting: Sequence[Log], x: Array) -> Suspects | None:
+    """What the structure head says of the fit logs and the calibrated model, asked once a run; None without a head."""
     if run.bench.witness is None:
         return None
     if run.stages.get("suspects") is None:
         witness, file = run.bench.witness
-        found = ask(witness, file, run.bench.plant.model, fitting, run.seed)
-        told = ", ".join(f"{f} {found.probabilities[f]:.2f}" for f in found.likely)
-        run.say(f"{file}, asked about {found.windows} windows: {told}; nothing missing {found.probabilities[NONE]:.2f}")
+        found = ask(witness, file, run.bench, fitting, x, run.seed)
+        told = ", ".join(f"{f} {found.probabilities[f]:.2f}" for f in (NONE, *found.likely) if f in found.probabilities)
+        run.say(f"{file}, asked about {found.windows} windows: {told}")
         run.stages.put("suspects", kept(found))
     return restored(run.stages.get("suspects"))
 

@@ -1,38 +1,32 @@
 """What a trained structure head says of logs: which family of effects their motion betrays."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.core.log import Log
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.evidence import combined, shares_of, told_by
 from nfc_gym.simulate.machine import Machine
-from nfc_gym.simulate.observed import commands, observed
+from nfc_gym.simulate.misfit import shown
+from nfc_gym.simulate.observed import actions_of, commands, proprio, require_unfeeling
 
 Array = NDArray[np.float64]
+MISFIT = "misfit"  # in a checkpoint's notes: its structure head is shown the misfit beside the motion
 _HALF = 0.5  # a rotation by a small angle moves a quaternion's entries by half of it
-
-
-class States(Protocol):
-    """Measured states along a log: positions (T, nq) and velocities (T, nv) in the order of the robot's model."""
-
-    qpos: Array
-    qvel: Array
+_DRAWS = 4  # of the noise that quiet logs are given
 
 
 def heads(path: Path) -> tuple[bool, bool]:
-    """Whether a posterior's checkpoint has a structure head, and whether it was given a window."""
-    network, given, _ = checkpoint.load(path)
-    return network.structure is not None, given is not None
+    """Whether a posterior's checkpoint has a structure head for logs, and whether it was given a window."""
+    network, given, notes = checkpoint.load(path)
+    return network.structure is not None and bool(notes.get(MISFIT)), given is not None
 
 
 class Witness:
-    """Cuts logs into windows like those of the training set and asks the head about each.
+    """Asks a structure head about stretches of a log and what a calibrated model predicts for them.
 
     Args:
       path: a checkpoint of `nfc-gym train --structure`.
@@ -40,6 +34,7 @@ class Witness:
     Attributes:
       families: that the head knows, "none" first.
       machine: the robot of its training set.
+      horizon, dt: H control steps of `dt` s make a window.
 
     Raises:
       InputError: no checkpoint, one without a structure head, or one that does not say what it was trained on.
@@ -48,55 +43,56 @@ class Witness:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.network, _, self.notes = checkpoint.load(path)
-        if self.network.structure is None:
-            raise InputError(f"{path}: trained without a structure head; `nfc-gym train --structure` trains one")
-        missing = [k for k in ("environment", "noise") if k not in self.notes]
-        if missing:
-            raise InputError(f"{path}: does not say the {missing[0]} of its training set; `nfc-gym train` writes it")
+        missing = [k for k in (MISFIT, "environment", "noise") if k not in self.notes]
+        if self.network.structure is None or missing:
+            raise InputError(f"{path}: holds no structure head for logs; `nfc-gym train --structure` trains one")
         self.machine = Machine(self.notes["environment"])
+        require_unfeeling(self.machine)
         self.families = tuple(self.network.config.families)
+        self.horizon, self.dt = self.network.sizes.horizon, self.machine.dt
 
-    def __call__(self, logs: Sequence[Log], states: Sequence[States], seed: int = 0) -> tuple[dict[str, float], int]:
-        """Probability of each family, and from how many windows.
+    def __call__(
+        self,
+        motion: tuple[Array, Array],
+        expected: tuple[Array, Array],
+        sent: Mapping[str, Array],
+        noise: Mapping[str, float],
+        seed: int = 0,
+    ) -> dict[str, float]:
+        """Probability of each family given W windows together (see `inference.evidence`).
 
         Args:
-          logs: of one machine.
-          states: as measured along each, unsmoothed: the head saw observations with their noise.
-          seed: of the noise that quiet logs are given.
+          motion: positions (W, H+1, nq) and velocities (W, H+1, nv) as measured at control steps, unsmoothed.
+          expected: the same of the calibrated model, from the same starts.
+          sent: `ctrl:<actuator>` -> (W, H) what was commanded.
+          noise: channel name -> standard deviation of its sensor.
+          seed: of the noise that quiet logs are given: windows quieter than all that a network was trained on are new
+            inputs to it.
 
         Raises:
-          InputError: logs of another robot or rate, or shorter than a window.
+          InputError: another robot's motion, or commands that none of its actions makes.
         """
-        parts = [self._windows(log, s) for log, s in zip(logs, states, strict=True)]
-        seen, done = (np.concatenate(p) for p in zip(*parts, strict=True))
-        if not len(seen):
-            need = self.network.sizes.horizon * self.machine.dt
-            raise InputError(f"{self.path}: its windows last {need:g} s, and no log to fit is as long")
-        told = told_by(self.network, seen, done, self._lacking(logs[0]), np.random.default_rng(seed))
-        found = combined(told, shares_of(self.families, self.notes))
-        return dict(zip(self.families, found.tolist(), strict=True)), len(seen)
-
-    def _windows(self, log: Log, states: States) -> tuple[Array, Array]:
-        """(W, H+1, s) and (W, H, a) of a log, one after the other; what is left at its end is dropped."""
-        model = self.machine.model
-        if states.qpos.shape[1] != model.nq or states.qvel.shape[1] != model.nv:
+        model, machine = self.machine.model, self.machine
+        if motion[0].shape[2] != model.nq or motion[1].shape[2] != model.nv:
             raise InputError(
-                f"{self.path}: the head is of {self.machine.environment} with {model.nq} positions and {model.nv} "
-                f"velocities; the mapping's model has {states.qpos.shape[1]} and {states.qvel.shape[1]}"
+                f"{self.path}: the head is of {machine.environment} with {model.nq} positions and {model.nv} "
+                f"velocities; the mapping's model has {motion[0].shape[2]} and {motion[1].shape[2]}"
             )
-        sent = commands(self.machine, log.controls)
-        seen, done = observed(self.machine, log.time - log.time[0], states.qpos, states.qvel, sent)
-        h = self.network.sizes.horizon
-        starts = range(0, len(done) - h + 1, h)
-        return (
-            np.array([seen[i : i + h + 1] for i in starts]).reshape(-1, h + 1, seen.shape[1]),
-            np.array([done[i : i + h] for i in starts]).reshape(-1, h, done.shape[1]),
-        )
+        count, h = motion[0].shape[0], self.horizon
+        ctrl = commands(machine, {k: v.reshape(-1) for k, v in sent.items()})
+        actions = actions_of(machine, ctrl).reshape(count, h, -1)
+        seen, predicted = (proprio(machine, *pair, actions) for pair in (motion, expected))
+        rng, sd, told = np.random.default_rng(seed), np.array(self.notes["noise"]), []
+        for _ in range(_DRAWS):
+            noisy = seen + self._lacking(noise) * rng.standard_normal(seen.shape)
+            told.append(told_by(self.network, shown(machine, noisy, predicted, sd), actions))
+        found = combined(np.mean(told, 0), shares_of(self.families, self.notes))
+        return dict(zip(self.families, found.tolist(), strict=True))
 
-    def _lacking(self, log: Log) -> Array:
-        """(s,) noise that the training set's states had and the log's have not; of what no channel says, none."""
+    def _lacking(self, noise: Mapping[str, float]) -> Array:
+        """(s,) noise that the training set's states had and the log's have not."""
         names = self.machine.state_names
-        known = {k.removesuffix("@body"): c.noise for k, c in log.channels.items() if c.noise is not None}
+        known = {k.removesuffix("@body"): sd for k, sd in noise.items()}
         own = np.zeros(len(names))
         for i, name in enumerate(names):
             channel = name.rsplit(".", 1)[0].removesuffix("@body")
