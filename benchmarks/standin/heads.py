@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
+from posteriors.metrics import area
 
 from nfc_gym.core import Fidelity
 from nfc_gym.inference.evidence import told_by
@@ -24,12 +25,11 @@ from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.misfit import of_windows
 from nfc_gym.simulate.teach import SMALL, train_structure
 from nfc_gym.simulate.witness import Witness
-from posteriors.metrics import area
 
 from .robots import ROBOTS
 
 ENVIRONMENTS = {"quadcopter": "nfc_gym/QuadcopterFlat-v0", "jackal": "nfc_gym/JackalFlat-v0"}
-NOISE = {"quadcopter": 0.5, "jackal": 0.35}  # times the environment's sensor noise: no less than the stand-in's
+NOISE = {"quadcopter": 0.35, "jackal": 0.35}  # times the environment's sensor noise: about the stand-ins' own gyroscope
 MOTOR = 0.002  # of the motors' range; a stand-in's motors make what they are told
 EFFECTS = 0.75  # share of windows with one
 STRONG = 2.0  # X / X_null from which a head must see an effect
@@ -91,8 +91,8 @@ class Declared:
 def taught(robot: str, course: Course, folder: Path, seed: int) -> Path:
     """The head's file; what is there already is not made again."""
     declared, head = Declared(robot), folder / f"{robot}.safetensors"
-    windows = _windows(robot, declared, course.windows, folder / f"{robot}_windows", seed)
     if not head.exists():
+        windows = _windows(robot, declared, course.windows, folder / f"{robot}_windows", seed)
         config = replace(SMALL, width=64, features=64, hidden=64) if course.small else SMALL
         train_structure(
             windows.folders[0], head, TrainConfig(epochs=course.epochs, rate=1e-3, patience=6, seed=seed),
@@ -108,7 +108,8 @@ def judged(robot: str, head: Path, course: Course, folder: Path, seed: int) -> d
     in training; X_null its median without an effect. Areas are of 1 - P(none), effects against none, and the mean over
     families of P(family), windows with it against all others.
     """
-    witness, windows = Witness(head), _windows(robot, Declared(robot), course.judged, folder / f"{robot}_judged", seed + 1)
+    witness = Witness(head)
+    windows = _windows(robot, Declared(robot), course.judged, folder / f"{robot}_judged", seed + 1)
     rows, machine = np.arange(len(windows)), witness.machine
     states, fine = of_windows(machine, windows, rows, NOISE[robot], np.random.default_rng(seed + 1))
     batch = windows.take(rows[fine], ["actions", "family"])

@@ -41,7 +41,7 @@ from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
-from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
+from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, count_named, kept, looked_at, restored
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
@@ -210,13 +210,14 @@ def _fold(
     final = calibrated, extended
     pool = candidates(bench, [*fitting, *selecting])
     suspects = restored(stages.get("suspects"))
-    if suspects is not None:
-        pool = looked_at(pool, suspects, [*found.rounds, *found.rest.rounds] if found.rest else found.rounds)
+    close = pool if suspects is None else looked_at(pool, suspects, found.rounds)
     known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
     outcome = report(bench, fold, found, final, step, bench.problem(verifying), whole, seed, tell)
     outcome["posterior"] = compared(bench, stages.get("calibrated"), extended, whole, outcome["parameters"])
-    outcome["structure"] = None if suspects is None else suspects.told()
-    outcome["identifiability"] = table(known.lens, pool, known.stakes)
+    began_table = time.monotonic()
+    outcome["identifiability"] = table(known.lens, close, known.stakes)
+    tabled = time.monotonic() - began_table
+    outcome["structure"] = None if suspects is None else suspects.told(*map(count_named, (close, pool)), tabled)
     advice = advise(bench, [*fitting, *selecting], outcome, known, tell, seed)
     outcome["identifiability"] = advice.rows
     outcome["findings"] += advice.findings

@@ -78,12 +78,13 @@ class Suspects:
             sum_ += self.probabilities[family]
         return tuple(out)
 
-    def told(self) -> dict[str, Any]:
-        """For `report.json`."""
+    def told(self, rows: int, of: int, seconds: float) -> dict[str, Any]:
+        """For `report.json`; the identifiability table has so many rows of the pool's, which took so many seconds."""
         ranked = sorted(self.probabilities.items(), key=lambda pair: -pair[1])
         return {
             "file": self.file, "windows": self.windows, "seconds": self.seconds,
             "families": {f: max(p, _FAINT) for f, p in ranked}, "looked_at_first": list(self.likely),
+            "left_out": of - rows, "seconds_spared": round(seconds / max(rows, 1) * (of - rows), 2),
         }  # fmt: skip
 
 
@@ -152,6 +153,11 @@ def looked_at(pool: Sequence[Effect], suspects: Suspects, rounds: Sequence[Any])
     named = {i for r in rounds for i in (*r.accepted, *r.equivalents)}
     families = {i.partition(":")[0] for i in ranked | named} | set(suspects.likely)
     return [e for e in pool if e.family in families]
+
+
+def count_named(pool: Sequence[Effect]) -> int:
+    """How many of a pool may be named as a cause."""
+    return sum(not e.generic for e in pool)
 
 
 def kept(suspects: Suspects) -> dict[str, Any]:

@@ -24,7 +24,7 @@ _ROWS = 2048  # windows replayed at once
 
 
 def entries(machine: Machine) -> tuple[list[int], list[list[int]], list[int]]:
-    """Indices in `proprio`: of the base's quaternion (4), of horizontal pairs that turn with it, of its place (2 or 3)."""
+    """Indices in `proprio`: the base's quaternion (4), horizontal pairs that turn with it, its place (2 or 3)."""
     found = place_of(machine.state_names) or {"quat": [], "pos": [], "turned": []}
     # The Quadcopter's first entries are its goal seen from it: its place, but for the sign.
     pos = [0, 1, 2] if issubclass(machine.kind, Quadcopter) else list(found["pos"])
@@ -132,7 +132,7 @@ def of_windows(
 
 
 def _start_noise(machine: Machine, sd: Array) -> Array:
-    """(nq + nv + na) standard deviations of a start: the sensors', of a joint's speed `_JOINT_SPEED`, of actuators 0."""
+    """(nq + nv + na) standard deviations of a start: as sensors tell it; actuators are known."""
     model, names = machine.model, machine.state_names
     of = {name.replace("@body", ""): s for name, s in zip(names, sd, strict=True)}
     out = np.zeros(model.nq + model.nv + model.na)
