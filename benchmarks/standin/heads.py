@@ -16,7 +16,6 @@ from posteriors.metrics import area
 from nfc_gym.core import Fidelity
 from nfc_gym.inference.evidence import told_by
 from nfc_gym.inference.progress import Spoken
-from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig
 from nfc_gym.inference.windows import Windows
 from nfc_gym.measured.hidden import Array
@@ -82,21 +81,16 @@ class Declared:
             psi[:, at] = rng.uniform(low, high, n)[:, None]
         return Fidelity(np.clip(psi, self.space.low, self.space.high))
 
-    def prior(self, robot: str) -> PriorBox:
-        """The environment's, free in one parameter of each group: the others of one make follow from it."""
-        box, first = PriorBox.of(self.space, robot), {at[0] for at, _, _ in self.groups}
-        return replace(box, free=tuple(i in first for i in range(len(box))))
-
 
 def taught(robot: str, course: Course, folder: Path, seed: int) -> Path:
     """The head's file; what is there already is not made again."""
-    declared, head = Declared(robot), folder / f"{robot}.safetensors"
+    head = folder / f"{robot}.safetensors"
     if not head.exists():
-        windows = _windows(robot, declared, course.windows, folder / f"{robot}_windows", seed)
+        windows = _windows(robot, Declared(robot), course.windows, folder / f"{robot}_windows", seed)
         config = replace(SMALL, width=64, features=64, hidden=64) if course.small else SMALL
         train_structure(
-            windows.folders[0], head, TrainConfig(epochs=course.epochs, rate=1e-3, patience=6, seed=seed),
-            config=config, prior=declared.prior(robot), noise=NOISE[robot], report=Spoken(),
+            windows.folders[0], head, TrainConfig(epochs=course.epochs, rate=1e-3, decay=0.02, patience=6, seed=seed),
+            config=config, noise=NOISE[robot], report=Spoken(),
         )  # fmt: skip
     return head
 

@@ -73,12 +73,11 @@ class Bench:
           length: s, of each segment, compared at its end; default as the mapping says.
         """
         segments, model = self.dataset.mapping.segments, self.plant.model
-        if length is not None:
-            segments = replace(segments, length=length, horizons=(length,))
+        length, horizons = (segments.length, segments.horizons) if length is None else (length, (length,))
         controls = self.dataset.mapping.controls
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")
-        layout = Layout(segments.length, segments.history, segments.horizons, segments.length, model.opt.timestep)
+        layout = Layout(length, segments.history, horizons, length, model.opt.timestep)
         whole = RolloutProblem(
             model, logs, states, layout, servos(model, laws), linear, settle=segments.start == "settled"
         )

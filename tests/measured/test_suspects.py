@@ -1,4 +1,4 @@
-"""A head that names suspects: the answer is the same with a right head, a wrong one and none, and the report says so."""
+"""A head that names suspects: the answer is the same with a right head, a wrong one and none; what it held is told."""
 
 import json
 from collections.abc import Mapping
