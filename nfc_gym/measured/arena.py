@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 from nfc_gym.measured.box import box
 from nfc_gym.measured.contest import (
     Judged,
+    Side,
     clusters,
     dispersion,
+    fitted_residual,
     fold_of,
     judge,
-    left_out_losses,
+    left_out,
     losses,
     not_worse,
     price,
@@ -36,10 +38,14 @@ _ALIKE = 0.1  # of a parameter's effect on the motion: what must remain when all
 
 @dataclass
 class Data:
-    """A problem with its noise covariance at the calibrated model."""
+    """A problem with the noise covariance (S, m, m) that a model expects."""
 
     problem: Problem
     sigma: Array
+
+    def expected(self, by: Fit) -> "Data":
+        """The same with what another model expects."""
+        return Data(self.problem, self.problem.covariance(by.plant, by.x))
 
 
 class Arena:
@@ -52,6 +58,8 @@ class Arena:
       extra: (m,) its slack, which the selection logs' metric shares.
       rng: of the bootstrap.
       say: progress.
+      own: judge each model by the noise that it expects itself, at the price of expecting it. Where bodies touch, noise
+        grows with the model's own impacts, and what one model expects would excuse its errors and not a rival's.
     """
 
     def __init__(
@@ -63,31 +71,47 @@ class Arena:
         extra: Array,
         rng: np.random.Generator,
         say: Callable[[str], None],
+        own: bool = False,
     ) -> None:
         self.fit_data, self.select, self.current, self.under, self.rng, self.say = (
             fit_data, select, current, under, rng, say,
         )  # fmt: skip
-        self.on, self.extra = metric(select.problem, select.sigma, extra), extra
+        self.on, self.extra, self.own = metric(select.problem, select.sigma, extra), extra, own
         self.blocks = clusters(fit_data.problem), clusters(select.problem)
         self.folds = fold_of(fit_data.problem)
-        self.base = losses(select.problem, self.on, current)
-        self.left_out = left_out_losses(fit_data.problem, under, current, self.folds)
+        self._face(current)
+
+    def _face(self, current: Fit) -> None:
+        self.current, by = current, self._metrics(current)
+        self.base = losses(self.select.problem, self.on, current)
+        self._sides = (
+            Side(self.fit_data.problem, self.blocks[0], left_out(self.fit_data.problem, by[0], current, self.folds)),
+            Side(self.select.problem, self.blocks[1], by[1].surprise(fitted_residual(self.select.problem, current))[0]),
+        )
+
+    def _metrics(self, fitted: Fit) -> tuple[Metric, Metric]:
+        """By which a model's errors count on the fit and on the selection logs."""
+        if not self.own:
+            return self.under, self.on
+        one, other = (metric(d.problem, d.expected(fitted).sigma, self.extra) for d in (self.fit_data, self.select))
+        return one, other
 
     def facing(self, current: Fit) -> "Arena":
         """The same arena with another model to beat."""
         out = object.__new__(Arena)
         out.__dict__.update(self.__dict__)
-        out.current, out.base = current, losses(self.select.problem, self.on, current)
-        out.left_out = left_out_losses(self.fit_data.problem, self.under, current, self.folds)
+        out._face(current)
         return out
 
     def sharper(self, than: Fit) -> "Arena":
-        """The arena under what another, better model leaves unexplained."""
-        data = self.fit_data
+        """The arena under what another, better model leaves unexplained; where bodies touch, each by its own noise."""
+        data, select = self.fit_data, self.select
+        if rough := data.problem.rough:
+            data, select = data.expected(than), select.expected(than)
         extra = slack(data.problem, data.sigma, than.plant, than.x)
         under = metric(data.problem, data.sigma, extra)
         current = fit(data.problem, under, self.current.plant, self.current.x, 6)
-        return Arena(data, self.select, current, under, extra, self.rng, self.say)
+        return Arena(data, select, current, under, extra, self.rng, self.say, own=rough)
 
     # ---- entering ---------------------------------------------------------------------------------------------------
 
@@ -112,6 +136,18 @@ class Arena:
         """
         chord = known if quick or known.shape[-1] > _CHORD else None
         return self.judge(fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord))
+
+    def enter_beside(self, leader: Judged, pick: Screened) -> Judged:
+        """Fit a screened candidate in a leading one's place, also from where the leader's fit took all the rest."""
+        self.say(f"refitting {pick.effect.id}, which does much the same")
+        current = self.current
+        plant = current.plant.with_effects([*current.plant.effects, pick.effect])
+        limits, width = box(current.plant), len(current.x)
+        moved = limits.x(limits.at(current.x) + pick.shift, current.x)
+        starts = np.stack([np.concatenate([x, pick.theta]) for x in (leader.fitted.x[:width], moved, current.x)])
+        values = loss(self.under.whiten(self.fit_data.problem.residual(plant, starts))).sum(-1)
+        known = leader.fitted.jacobian[..., : current.jacobian.shape[-1]]
+        return self._refit(plant, starts[int(values.argmin())], 10, known, quick=self.fit_data.problem.rough)
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
         """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""
@@ -160,10 +196,7 @@ class Arena:
 
     def judge(self, fitted: Fit) -> Judged:
         """Compare a fitted model with the one to beat."""
-        return judge(
-            fitted, self.current, self.fit_data.problem, self.under, self.left_out, self.folds, self.blocks[0],
-            self.select.problem, self.on, self.base, self.rng,
-        )  # fmt: skip
+        return judge(fitted, self.current, self._metrics(fitted), self._sides, self.folds, self.rng)
 
     @property
     def leftover(self) -> float:
@@ -271,7 +304,7 @@ class Arena:
         return {
             "id": self.label(j),
             "gain_fit": float(j.fit_gains.sum()),
-            "share": float(j.fit_gains.sum() / max(self.left_out.sum(), 1e-9)),
+            "share": float(j.fit_gains.sum() / max(self.current.losses.sum(), 1e-9)),
             "gain_select": j.gain,
             "gain_select_low": j.lower,
             "generic": new[0].generic,

@@ -36,7 +36,7 @@ class Judged:
 
     Attributes:
       fitted: on the fit logs.
-      gains: (S,) drop of the loss per block of the selection logs against the model without it.
+      gains: (S,) drop of the surprise (`Metric`) per block of the selection logs against the model without it.
       fit_gains: the same on the fit logs, each group of blocks predicted by a fit that left it out.
       total: drop over both, less a price for each parameter (the Bayesian information criterion, Schwarz 1978).
       lower: 0.5 % bootstrap quantile of the gain over both.
@@ -50,7 +50,7 @@ class Judged:
 
     @property
     def gain(self) -> float:
-        """Drop of the loss over the selection logs."""
+        """Drop of the surprise over the selection logs."""
         return float(self.gains.sum())
 
 
@@ -64,27 +64,46 @@ def fitted_residual(problem: Problem, fitted: Fit) -> Array:
     return problem.residual(fitted.plant, fitted.x[None])
 
 
+@dataclass(frozen=True)
+class Side:
+    """The logs that candidates are fitted to, or those that they are judged on besides.
+
+    Attributes:
+      problem: of these logs.
+      blocks: (S,) clusters of its blocks.
+      base: (S,) surprise of each block under the model to beat; of fit logs, when the block is left out of the fit.
+    """
+
+    problem: Problem
+    blocks: NDArray[np.intp]
+    base: Array
+
+
 def judge(
     fitted: Fit,
     base: Fit,
-    problem: Problem,
-    under: Metric,
-    base_left_out: Array,
+    metrics: tuple[Metric, Metric],
+    sides: tuple[Side, Side],
     folds: NDArray[np.intp],
-    fit_blocks: NDArray[np.intp],
-    select: Problem,
-    metric: Metric,
-    base_losses: Array,
     rng: np.random.Generator,
 ) -> Judged:
-    """Compare a fitted candidate with the model without it, on the selection logs and on left-out fit blocks."""
-    gains = base_losses - losses(select, metric, fitted)
-    fit_gains = base_left_out - left_out_losses(problem, under, fitted, folds)
+    """Compare a fitted candidate with the model without it.
+
+    Args:
+      fitted, base: the candidate and the model to beat.
+      metrics: by which the candidate's errors count on the fit and on the selection logs.
+      sides: these logs.
+      folds: (S,) fold of each block of the fit logs.
+      rng: of the bootstrap.
+    """
+    fit_side, select = sides
+    gains = select.base - metrics[1].surprise(fitted_residual(select.problem, fitted))[0]
+    fit_gains = fit_side.base - left_out(fit_side.problem, metrics[0], fitted, folds)
     extra = len(fitted.x) - len(base.x)
-    blocks = clusters(select)
     both = np.concatenate([gains, fit_gains])
-    draws = bootstrap(both, np.concatenate([blocks, fit_blocks + int(blocks.max()) + 1]), rng)
-    count = int(problem.mask.sum()) + int(select.mask.sum())
+    blocks = np.concatenate([select.blocks, fit_side.blocks + int(select.blocks.max()) + 1])
+    draws = bootstrap(both, blocks, rng)
+    count = int(fit_side.problem.mask.sum()) + int(select.problem.mask.sum())
     total = float(both.sum()) - price(count, extra, dispersion(base))
     return Judged(fitted, gains, fit_gains, total, float(np.quantile(draws, 0.005)))
 
@@ -100,15 +119,15 @@ def price(count: int, extra: int, dispersion: float) -> float:
     return float(np.log(max(count, 2)) * extra * dispersion)
 
 
-def left_out_losses(problem: Problem, under: Metric, fitted: Fit, folds: NDArray[np.intp]) -> Array:
-    """(S,) loss of each block when its fold takes no part in the fit: one Gauss-Newton step from the whole fit.
+def left_out(problem: Problem, by: Metric, fitted: Fit, folds: NDArray[np.intp]) -> Array:
+    """(S,) surprise of each block when its fold takes no part in the fit: one Gauss-Newton step from the whole fit.
 
     At the optimum the blocks' gradients add up to zero; without fold k they add up to minus its own, and the parameters
-    move by H_-k^{-1} g_k. The residuals there are rolled out, all folds in one batch.
+    move by H_-k^{-1} g_k. The residuals there are rolled out, all folds in one batch, and count as `by` has it.
     """
     jac, white = fitted.jacobian, fitted.white
     if jac.shape[-1] == 0:
-        return fitted.losses
+        return by.surprise(fitted_residual(problem, fitted))[0]
     weight = loss_weight(white) ** 2
     limits = box(fitted.plant)
     hessians = np.einsum("smi,sm,smj->sij", jac, weight, jac)
@@ -121,8 +140,8 @@ def left_out_losses(problem: Problem, under: Metric, fitted: Fit, folds: NDArray
     for row, k in zip(z, names, strict=True):
         of = folds == k
         row += np.linalg.solve(whole - hessians[of].sum(0) + ridge, gradients[of].sum(0))
-    losses = loss(under.whiten(problem.residual(fitted.plant, limits.x(z, fitted.x))))
-    return losses[np.searchsorted(names, folds), np.arange(len(folds))]
+    found = by.surprise(problem.residual(fitted.plant, limits.x(z, fitted.x)))
+    return found[np.searchsorted(names, folds), np.arange(len(folds))]
 
 
 def fold_of(problem: Problem, most: int = 8) -> NDArray[np.intp]:

@@ -19,6 +19,7 @@ _WORST = 6  # blocks with the largest errors that join them there
 _FAINT = 0.05  # of the best gain: what the best of a family must reach there to be among the field whatever its rank
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
 _SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
+_SURE = 2  # of them, whose gain by straight lines counts where the look around finds less
 _PURSUED = 40  # candidates that a smooth problem takes a few steps further before it shortlists
 _FIRST = 10  # of the suspected families' candidates that are screened in full, besides the best of each family
 _BESIDE, _MOST_BESIDE = 2, 4  # families that lead plain screening and join the suspected ones: always, and at most
@@ -92,7 +93,9 @@ class Lookout:
             leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
             thin = self._thinned(screen)
             whole = float(screen.current.losses.sum() / thin.current.losses.sum())
-            look = lambda f: _times(whole, thin.scout(f, self.rng))  # noqa: E731
+            # A scout sees few blocks: who leads on all of them by straight lines is not lost for what it saw.
+            sure = {id(f) for f in leading[:_SURE]}
+            look = lambda f: _times(whole, thin.scout(f, self.rng), f.gain * (id(f) in sure))  # noqa: E731
         else:
             leading, look = [f for f in found[:_PURSUED] if f.gain > 0], screen.pursue
         self.say(f"looking closer at {len(leading)} of them")
@@ -138,9 +141,9 @@ class Lookout:
         return found
 
 
-def _times(factor: float, found: Screened) -> Screened:
-    """What was found on some of the blocks, with the gain that all of them would bring."""
-    return replace(found, gain=factor * found.gain)
+def _times(factor: float, found: Screened, least: float) -> Screened:
+    """What was found on some of the blocks, with the gain that all of them would bring, or at least so much."""
+    return replace(found, gain=max(factor * found.gain, least))
 
 
 def _plain(effect: Effect) -> str:

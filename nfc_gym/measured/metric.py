@@ -30,6 +30,14 @@ class Metric:
         bad = ~np.isfinite(residual).all(-1, keepdims=True)
         return np.where(self.mask, np.where(bad, _UNSTABLE, white), 0.0)
 
+    def surprise(self, residual: Array) -> Array:
+        """(P, S) twice the negative log-likelihood of residuals (P, S, m), but for a constant: loss and log-volume.
+
+        By this, models can be compared that expect noise of different size: who expects more must pay for it.
+        """
+        log_det = -2 * np.log(np.einsum("sii->si", self.inverse_root)).sum(1)
+        return loss(self.whiten(residual)) + log_det
+
     def take(self, index: NDArray[np.intp]) -> "Metric":
         """The metric of some of the blocks."""
         return Metric(self.inverse_root[index], self.mask[index])

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from nfc_gym.measured.arena import Arena, contains
 from nfc_gym.measured.contest import Judged, mechanism, shortlist
 from nfc_gym.measured.fit import Fit, fit
-from nfc_gym.measured.screen import Screen, Screened
+from nfc_gym.measured.screen import Screen, Screened, likeness
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each, split
 
@@ -19,6 +19,8 @@ _LEFT = 0.1  # nats a number beyond the noise, below which a second law beside o
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
 _FAINT = 0.02  # nats a number beyond the noise, below which two laws have nothing to mend together
 _HOPE = 0.25  # of the gain that a law must reach: what screening must promise for a refit to be worth its time
+_MIMIC, _MIMICS = 0.95, 2  # cosine from which a law does much the same as the best one; how many such are refitted
+_BY_PSI = 0.1  # of a candidate's gain, beyond which its psi alone becomes the model to beat
 _ALIKE = 3  # families that may explain the data alike for one of them to be claimed
 
 
@@ -98,6 +100,10 @@ class Contest:
             outcome.reason = f"the best candidate, {arena.label(judged[0])}, gains no more on unseen logs than chance"
             return outcome, None
         best = self._simplest(believed)
+        if mimics := self._mimics(best, judged):
+            judged = sorted([*judged, *mimics], key=lambda j: -j.total)
+            outcome.ranking = [arena.row(j) for j in mimics] + outcome.ranking
+            best = self._simplest(believed := [j for j in judged if self._believed(j)])
         alike = [*(e.id for e in arena.new(best)), *self._equivalents([*judged, *beaten], best, believed[0])]
         if len({i.partition(":")[0] for i in alike}) > _ALIKE:
             # So many causes that do alike are no finding: each would be named for want of the others.
@@ -127,6 +133,22 @@ class Contest:
             self.arena = arena = arena.facing(better)
             judged = sorted((arena.judge(j.fitted) for j in judged), key=lambda j: -j.total)
         return judged
+
+    def _mimics(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
+        """Fits of what does nearly the same as the law about to be accepted, and was not asked in full.
+
+        A first look may lose the right one of two laws that straight lines cannot tell apart.
+        """
+        arena, new = self.arena, self.arena.new(best)
+        by_id = {s.effect.id: s for s in self.screened}
+        asked = {arena.label(j) for j in judged} | {e.id for e in new}
+        added = len(best.fitted.plant.effects) > len(arena.current.plant.effects)
+        if len(new) != 1 or new[0].id not in by_id or not added:
+            return []
+        one = by_id[new[0].id]
+        near = [(likeness(one, s, self.screen.projected), s) for s in self.screened if s.effect.id not in asked]
+        near = sorted((pair for pair in near if pair[0] > _MIMIC), key=lambda pair: -pair[0])
+        return [arena.enter_beside(best, s) for _, s in near[:_MIMICS]]
 
     def _equivalents(self, judged: Sequence[Judged], best: Judged, leading: Judged) -> list[str]:
         """Ids of what explains the data as well as the law that is accepted."""
@@ -203,8 +225,9 @@ class Contest:
         if not self.rough or plant.effects[: len(current.plant.effects)] != current.plant.effects:
             return None
         other = fit(arena.fit_data.problem, arena.under, current.plant, best.fitted.x[: len(current.x)], 10)
-        gained = float(current.losses.sum() - other.losses.sum())
-        return other if gained > 0.1 * float(best.fit_gains.sum()) > 0 else None
+        gained = arena.judge(other)
+        share = _BY_PSI * max(float(best.fit_gains.sum() + best.gains.sum()), 0.0)
+        return other if gained.gain + float(gained.fit_gains.sum()) > share > 0 else None
 
     def _simplest(self, believed: list[Judged]) -> Judged:
         """Of the candidates that explain the data as well as the best: fewest parameters, then widest place.

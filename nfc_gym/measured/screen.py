@@ -235,6 +235,15 @@ class Screen:
         return {s.effect.id: luckiest * float(m) for s, m in zip(kept, mean, strict=True)}
 
 
+def likeness(one: Screened, other: Screened, projected: Array) -> float:
+    """Cosine between what one candidate does about a projected residual (n,) and the nearest that another could do."""
+    if not (one.columns.shape[1] and other.columns.shape[1]):
+        return 0.0
+    basis = _span(one.columns)
+    does = basis @ (basis.T @ projected)
+    return float(np.linalg.norm(_span(other.columns).T @ does) / max(float(np.linalg.norm(does)), 1e-12))
+
+
 def _bounded(columns: Array, target: Array, free: Array, low: Array, high: Array) -> Array:
     """Multiples (k,) of columns (n, k) that come nearest to a target within bounds; `free` is the answer without them.
 

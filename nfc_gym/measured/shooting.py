@@ -185,10 +185,11 @@ class RolloutProblem(Problem):
         mask: NDArray[np.bool_],
     ) -> Array:
         values, traj = self.predict(plant, x, segments, self._observers)
-        parts = [
-            self._flat(o.difference(interpolate(v, step, o.quaternion), m), o)
-            for o, v, m in zip(self._observers, values, measured, strict=True)
-        ]
+        with np.errstate(invalid="ignore", over="ignore"):  # of a roll-out that came apart nothing counts
+            parts = [
+                self._flat(o.difference(interpolate(v, step, o.quaternion), m), o)
+                for o, v, m in zip(self._observers, values, measured, strict=True)
+            ]
         residual = np.where(mask, np.concatenate(parts, -1), 0.0)
         return np.where(traj.stable[..., None], residual, np.nan)
 

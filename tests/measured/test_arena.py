@@ -104,3 +104,27 @@ def test_a_law_that_ends_at_the_edge_of_the_plausible_stands_in_for_another(
     plant: Any = SimpleNamespace(effects=(effect,), split=lambda x: (x[:0], [x]))
     fitted = Fit(plant, np.array([value]), np.zeros((1, 1)), np.zeros((1, 1, 1)))
     assert contest.plausible(judged(fitted)) == plausible
+
+
+class Touching(Curve):
+    """A machine whose models expect the more noise the further their first parameter is from zero."""
+
+    rough = True
+
+    def covariance(self, plant: Any, x: np.ndarray) -> np.ndarray:
+        return (1 + 100 * abs(x[0])) ** 2 * super().covariance(plant, x)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_where_bodies_touch_who_expects_noise_pays_for_it(own: bool) -> None:
+    """Two models with the same errors but for a hair: which is better depends on what they expect alone."""
+    one, other = Touching(0.0, 0), Touching(0.0, 1)
+    calm, loud = model(one, [0.0]), model(one, [0.05])
+    data = [Data(p, p.covariance(None, loud.x)) for p in (one, other)]
+    rng = np.random.default_rng(0)
+    contest = Arena(data[0], data[1], loud, metric(one, data[0].sigma), np.zeros(8), rng, lambda text: None, own=own)
+    found = contest.judge(calm)
+    numbers = 8 * len(one)  # on either side; six times the deviation costs 2 ln 6 each and spares them nearly all loss
+    expected = numbers * (2 * np.log(6) - 1) if own else 0.0
+    assert found.gain == pytest.approx(expected, abs=0.2 * numbers)
+    assert float(found.fit_gains.sum()) == pytest.approx(expected, abs=0.2 * numbers)

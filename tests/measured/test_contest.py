@@ -12,14 +12,15 @@ from nfc_gym.measured.contest import (
     clusters,
     dispersion,
     fold_of,
-    left_out_losses,
+    left_out,
     not_worse,
     shortlist,
 )
 from nfc_gym.measured.fit import Fit
-from nfc_gym.measured.metric import loss, metric
+from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.rounds import Contest
+from nfc_gym.measured.screen import Screened, likeness
 from nfc_gym.physics.effects import FAMILIES
 
 
@@ -134,6 +135,12 @@ def test_left_out_losses_are_those_of_a_refit() -> None:
     np.testing.assert_allclose(found, exact, atol=0.2 * inside.mean())
 
 
+def left_out_losses(problem: Problem, under: Metric, fitted: Fit, folds: np.ndarray) -> np.ndarray:
+    """Surprises without what every model pays for the noise that it expects."""
+    inside = under.surprise(problem.residual(fitted.plant, fitted.x[None]))[0]
+    return left_out(problem, under, fitted, folds) - inside + fitted.losses
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_superfluous_parameter_pays_on_what_it_did_not_see(seed: int) -> None:
     """y has no slope and no curvature: in-sample they always gain, left out they lose."""
@@ -227,3 +234,40 @@ def test_plainer_laws_are_tried_though_screening_left_them_out() -> None:
     contest = Contest(arena, screen, [], 8, 0.02, [law, coulomb, force])  # pyright: ignore[reportArgumentType]
     sets = [[p.effect for p in parts] for parts in contest._plainer(law)]
     assert sets == [[coulomb], [coulomb, force]]
+
+
+def candidate(name: str, columns: list[list[float]]) -> Screened:
+    effect: Any = SimpleNamespace(id=name)
+    return Screened(effect, 1.0, np.zeros(1), np.zeros(1), np.array(columns, float).reshape(-1, 4).T, np.ones(1))
+
+
+def test_likeness_asks_what_the_other_could_do_of_what_the_one_does() -> None:
+    residual = np.array([3.0, 4.0, 0.0, 1.0])
+    first, both = candidate("a", [[2, 0, 0, 0]]), candidate("b", [[1, 0, 0, 0], [0, 1, 0, 0]])
+    tilted, apart = candidate("c", [[1, 1, 0, 0]]), candidate("d", [[0, 0, 1, 0]])
+    assert likeness(first, both, residual) == pytest.approx(1.0)
+    assert likeness(both, first, residual) == pytest.approx(0.6)
+    assert likeness(first, tilted, residual) == pytest.approx(np.sqrt(0.5))
+    assert likeness(first, apart, residual) == pytest.approx(0.0)
+    assert likeness(first, candidate("e", []), residual) == 0.0
+
+
+def test_what_does_the_same_as_the_best_is_asked_before_the_best_is_believed() -> None:
+    """Whoever was refitted in full already is not asked again, and of many that do the same the two nearest are."""
+    lag, named = candidate("lag", [[1, 0.1, 0, 0]]), [candidate("far", [[0, 1, 0, 0]])]
+    near = [candidate(f"near_{k}", [[1, 0.1 + 0.01 * k, 0, 0]]) for k in range(4)]
+    current = SimpleNamespace(plant=SimpleNamespace(effects=[]))
+    arena: Any = SimpleNamespace(
+        fit_data=SimpleNamespace(problem=SimpleNamespace(rough=True)),
+        current=current,
+        new=lambda j: j.fitted.plant.effects,
+        label=lambda j: j.fitted.plant.effects[0].id,
+        enter_beside=lambda best, pick: pick.effect.id,
+    )
+    screen: Any = SimpleNamespace(projected=np.array([1.0, 0.0, 0.0, 0.0]))
+    contest = Contest(arena, screen, [*named, *near[::-1], lag], 8, 0.02)
+    best, asked = (
+        Judged(SimpleNamespace(plant=SimpleNamespace(effects=[s.effect])), np.zeros(1), np.zeros(1), 1.0, 1.0)  # type: ignore[arg-type]
+        for s in (lag, near[1])
+    )
+    assert contest._mimics(best, [best, asked]) == ["near_0", "near_2"]
