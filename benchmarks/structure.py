@@ -94,7 +94,7 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
 def tasks(robot: str, args: argparse.Namespace, seed: int) -> list[Task]:
     """Single effects, families in an order drawn from the seed; then machines that lack nothing."""
     if args.quick:
-        families, size = ("wind",), Size(4, 1.7, ("wind", "drag_linear"), 2)
+        families, size = ("wind",), Size(3, 0.9, ("wind", "slope"), 1)
         return [Task(robot, "single", families, plan.seed_of(seed, robot, "quick"), size)]
     families = np.random.default_rng(plan.seed_of(seed, robot, "order")).permutation(sorted(ROBOTS[robot].kinds))
     chosen = [str(families[i % len(families)]) for i in range(args.trials)]
