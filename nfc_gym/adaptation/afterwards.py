@@ -122,7 +122,10 @@ def learn_from_mission(
     old = load(posterior) if isinstance(posterior, str | Path) else posterior
     watch = detector_file.load(detector) if isinstance(detector, str | Path) else detector
     _check(old, watch)
-    of = _described(trajectories, old, watch, config)
+    of = _described(trajectories, old, watch, config) | {
+        "environment": environment, "normal": getattr(normal, "__qualname__", type(normal).__name__),
+        "beside": None if beside is None else len(beside),
+    }  # fmt: skip
     done = None if folder is None else _finished(folder, of, old, watch)
     if done is not None:
         return done

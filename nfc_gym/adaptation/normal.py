@@ -164,6 +164,10 @@ def with_beside(windows: TensorWindows, beside: WindowSet | None, seed: int) -> 
         lacking = [name for name in windows.tensors if name not in others]
         if lacking:
             raise InputError(f"beside: the windows have no {lacking[0]!r}; they have: {', '.join(others)}")
+        for name, t in windows.tensors.items():
+            if others[name].shape[1:] != t.shape[1:]:
+                theirs, ours = tuple(others[name].shape[1:]), tuple(t.shape[1:])
+                raise InputError(f"beside: {name!r} of a window has shape {theirs}, where the mission's have {ours}")
         windows = windows.append(TensorWindows({name: others[name] for name in windows.tensors}))
     order = torch.randperm(len(windows), generator=torch.Generator().manual_seed(mixed(seed, 2)))
     return TensorWindows({name: t[order] for name, t in windows.tensors.items()})

@@ -3,11 +3,12 @@
 Measured signals are interpolated linearly, orientations by slerp, commands held from the last one unless their `hold`
 says linear. A gap longer than `GAP` of a stream's own sampling intervals is not bridged: rows inside it are NaN. Of a
 sensor that is slower than the base only the row nearest to each of its samples is kept, so that one sample counts once.
-Rows that some stream does not reach are cut off at both ends. All of it is told by `Alignment`, nothing is guessed.
+Rows that some stream does not reach are cut off at both ends. A channel's `shift` is taken from its stamps before all
+that. All of it is told by `Alignment`, nothing is guessed.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,10 +18,10 @@ from nfc_gym.core import InputError
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.readers import Stream, Streams, Table
-from nfc_gym.measured.resampling import Clock, held, interpolated, lateness, nearest_rows
+from nfc_gym.measured.resampling import Clock, flagged, held, interpolated, lateness, nearest_rows
 
 Array = NDArray[np.float64]
-How = Literal["linear", "hold", "slerp"]
+How = Literal["linear", "hold", "slerp", "both"]
 
 GAP = 4.0  # sampling intervals of a stream; over a longer pause nothing is interpolated
 SLOWER = 1.5  # a sensor whose interval is so many times the base's is kept at its own samples only
@@ -28,11 +29,23 @@ SLOWER = 1.5  # a sensor whose interval is so many times the base's is kept at i
 
 @dataclass(frozen=True)
 class Use:
-    """Columns of the mapping that are resampled together: how, and whether they are measured (or commanded)."""
+    """Columns of the mapping that are resampled together.
+
+    Attributes:
+      columns: their names.
+      how: interpolated, held, or of a shifted mask, which is true only between `both` true samples.
+      measured: or commanded.
+      shift: s by which their stamps are late.
+      rate: Hz at which they are renewed where they are held between rows, if that was declared.
+      beside: the channel's columns that a shifted mask is of; it moves with them if it has their clock.
+    """
 
     columns: tuple[str, ...]
     how: How
     measured: bool = False
+    shift: float = 0.0
+    rate: float | None = None
+    beside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -50,6 +63,7 @@ class Resampled:
       late: s, by which a held command comes after its stamp, on average: it waits for the base's next row.
       longest: s, the longest pause in it.
       repeated, disordered: samples with a stamp that another has, and those that came before an earlier one.
+      shift: s that were taken from its stamps.
     """
 
     stream: str
@@ -64,6 +78,7 @@ class Resampled:
     longest: float
     repeated: int
     disordered: int
+    shift: float
 
 
 @dataclass(frozen=True)
@@ -71,12 +86,14 @@ class Alignment:
     """A log's columns at the base's times.
 
     Attributes:
-      table: every column that the mapping uses has the base's rows; the others are as they were.
+      table: every column that the mapping uses has the base's rows; the others are as they were. Columns whose stamps
+        were shifted are there under the name `shifted`.
       base: the topic whose times they are.
       clock: what those times are.
       resampled: what was done to the other streams.
       rates: measured columns that are NaN in some rows, in gaps or between a slow sensor's samples -> Hz of those.
-      ahead: s by which the stamps of a stream lie after its receipt, if they do, which two right clocks cannot show.
+      ahead: s by which the stamps of a stream, its shift taken out, lie after its receipt, if they do, which two right
+        clocks cannot show.
       cut: s that were cut off at the start and at the end, as some stream does not reach there.
       cutters: the streams that decided where.
     """
@@ -91,12 +108,20 @@ class Alignment:
     cutters: tuple[str, str]
 
 
+def shifted(name: str, shift: float) -> str:
+    """The name of a column whose stamps were shifted by so many seconds; others keep theirs."""
+    return f"{name} (shift {shift!r} s)" if shift else name
+
+
 def uses(mapping: Mapping) -> list[Use]:
     """How each column of a mapping is brought to other times: commands and masks held, measurements interpolated."""
     found = [Use(c.columns, "hold" if c.hold == "zero" else "linear") for c in mapping.controls.values()]
-    for name, channel in mapping.channels.items():
-        found.append(Use(channel.columns, "slerp" if parse_channel(name).quantity == "quat" else "linear", True))
-        found += [Use((channel.mask,), "hold")] if channel.mask else []
+    for name, c in mapping.channels.items():
+        how = "slerp" if parse_channel(name).quantity == "quat" else "linear"
+        found.append(Use(c.columns, how, True, c.shift, c.rate))
+        if c.mask:
+            mask = Use((c.mask,), "hold")
+            found.append(replace(mask, how="both", shift=c.shift, beside=c.columns) if c.shift else mask)
     found += [Use(e.columns, "linear") for e in mapping.exogenous.values()]
     found += [Use((name,), "linear") for k in mapping.known for name in k.columns]
     servos = [c.servo for c in mapping.controls.values() if c.servo]
@@ -115,34 +140,32 @@ def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
         return _single(streams, time, uses)
     base, kind = found
     grid = streams.seconds(base, kind)
-    others = {s.name: s for use in uses if (s := _owner(streams, use)) is not None and s is not base}
-    clocks = {name: Clock(streams.seconds(s, kind)) for name, s in others.items() if len(s.stamps) > 1}
-    holds = {s.name for use in uses if use.how == "hold" and (s := _owner(streams, use)) is not None}
+    uses = [_own_clock(streams, use) for use in uses]
+    owners = [(use, owner) for use in uses if (owner := _owner(streams, use)) is not None]
+    others = {_label(s, use): (s, use.shift) for use, s in owners if s is not base or use.shift}
+    clocks = {n: Clock(streams.seconds(s, kind) - shift) for n, (s, shift) in others.items() if len(s.stamps) > 1}
+    holds = {_label(s, use) for use, s in owners if use.how == "hold"}
     rows, cut, cutters = _overlap(base.name, grid, clocks, holds)
     table: Table = dict(streams)
     table[time] = grid[rows]
-    done: dict[tuple[str, How], Resampled] = {}
+    done: dict[tuple[str, str], Resampled] = {}
     rates: dict[str, float] = {}
-    for use in uses:
-        owner = _owner(streams, use)
-        if owner is None:
-            continue
-        parts = [_values(streams, name) for name in use.columns]
-        if owner is base:
-            table |= {name: p[rows] for name, p in zip(use.columns, parts, strict=True)}
-        elif owner.name not in clocks:  # a single message, such as a latched one, stands for the whole log
-            table |= {name: p[0] for name, p in zip(use.columns, parts, strict=True)}
+    for use, owner in owners:
+        parts, label = [_values(streams, name) for name in use.columns], _label(owner, use)
+        names = [shifted(name, use.shift) for name in use.columns]
+        if owner is base and not use.shift:
+            table |= {name: p[rows] for name, p in zip(names, parts, strict=True)}
+        elif label not in clocks:  # a single message, such as a latched one, stands for the whole log
+            table |= {name: p[0] for name, p in zip(names, parts, strict=True)}
         elif all(p.dtype.kind in "biuf" for p in parts):
-            values, report = _bring(clocks[owner.name], parts, grid[rows], use)
-            table |= dict(zip(use.columns, values, strict=True))
+            values, report = _bring(clocks[label], parts, grid[rows], use)
+            table |= dict(zip(names, values, strict=True))
             if use.measured and any(not np.isfinite(v).all() for v in values):
-                rates.update((name, float(report["rate"])) for name in use.columns)
+                rates.update((name, float(report["rate"])) for name in names)
             told = Resampled(owner.name, owner.clock if kind == "stamps" else "receive time", use.how, **report)
-            done[owner.name, use.how] = max(done.get((owner.name, use.how), told), told, key=lambda r: r.missing)
+            done[label, use.how] = max(done.get((label, use.how), told), told, key=lambda r: r.missing)
     clock = base.clock if kind == "stamps" else "receive time"
-    used = [base, *others.values()] if kind == "stamps" else []
-    lead = {s.name: float(np.median(s.stamps - s.received)) * 1e-9 for s in used}
-    ahead = {name: seconds for name, seconds in lead.items() if seconds > 0}
+    ahead = _ahead([(base, 0.0), *others.values()]) if kind == "stamps" else {}
     return Alignment(table, base.name, clock, tuple(done.values()), rates, ahead, cut, cutters)
 
 
@@ -163,18 +186,44 @@ def _owner(streams: Streams, use: Use) -> Stream | None:
     return next(iter(owners.values()), None)
 
 
+def _ahead(used: Sequence[tuple[Stream, float]]) -> dict[str, float]:
+    """Of streams and the shifts that their columns are used with, those whose stamps come after their receipt."""
+    found: dict[str, float] = {}
+    for stream, shift in used:
+        lead = float(np.median(stream.stamps - stream.received)) * 1e-9 - shift
+        if lead > 0:
+            found[stream.name] = max(lead, found.get(stream.name, 0.0))
+    return found
+
+
+def _own_clock(streams: Streams, use: Use) -> Use:
+    """A mask that is not of the stream of the channel that it is of stays where it is."""
+    if use.how != "both" or _owner(streams, use) is _owner(streams, Use(use.beside, "linear")):
+        return use
+    return Use(use.columns, "hold")
+
+
+def _label(stream: Stream, use: Use) -> str:
+    return shifted(stream.name, use.shift)
+
+
 def _single(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
     """A time column of another kind, such as a raw stamp: it serves the columns of its own stream."""
     base = streams.owner(time)
+    if any(use.shift for use in uses):
+        raise InputError(f"`shift` is taken from a topic's own times, and {time!r} is none; {_clocks(streams)}")
     stray = next((c for u in uses for c in u.columns if (s := streams.owner(c)) is not None and s is not base), None)
     if stray is not None:
-        clocks = sorted({f"{s.name}.time" for s in streams.streams})
         raise InputError(
             f"column {stray!r} has times of its own, and {time!r} is not a time that it can be brought to; "
-            f"name one of {', '.join(clocks[:8])}"
+            f"{_clocks(streams)}"
         )
     name = "" if base is None else base.name
     return Alignment(dict(streams), name, time, (), {}, {}, (0.0, 0.0), ("", ""))
+
+
+def _clocks(streams: Streams) -> str:
+    return f"name one of {', '.join(sorted({f'{s.name}.time' for s in streams.streams})[:8])}"
 
 
 def _overlap(
@@ -223,6 +272,8 @@ def _bring(
     fresh = np.ones(len(grid), bool)
     if use.how == "hold":
         values, gap, late = held(time, columns, grid), np.inf, lateness(time, grid)
+    elif use.how == "both":
+        values, gap = flagged(time, columns, grid), np.inf
     else:
         values = interpolated(time, columns, grid, gap, use.how == "slerp")
         if use.measured and interval > SLOWER * step:
@@ -240,5 +291,6 @@ def _bring(
         "longest": clock.longest,
         "repeated": clock.repeated,
         "disordered": clock.disordered,
+        "shift": use.shift,
     }
     return out, report

@@ -79,6 +79,7 @@ class Arena:
         self.on, self.extra, self.own = metric(select.problem, select.sigma, extra), extra, own
         self.blocks = clusters(fit_data.problem), clusters(select.problem)
         self.folds = fold_of(fit_data.problem)
+        self._expected: dict[int, tuple[Fit, tuple[Metric, Metric]]] = {}
         self._face(current)
 
     def _face(self, current: Fit) -> None:
@@ -93,8 +94,10 @@ class Arena:
         """By which a model's errors count on the fit and on the selection logs."""
         if not self.own:
             return self.under, self.on
-        one, other = (metric(d.problem, d.expected(fitted).sigma, self.extra) for d in (self.fit_data, self.select))
-        return one, other
+        if id(fitted) not in self._expected:  # the fit is kept beside, so that its id stays its own
+            one, other = (metric(d.problem, d.expected(fitted).sigma, self.extra) for d in (self.fit_data, self.select))
+            self._expected[id(fitted)] = fitted, (one, other)
+        return self._expected[id(fitted)][1]
 
     def facing(self, current: Fit) -> "Arena":
         """The same arena with another model to beat."""

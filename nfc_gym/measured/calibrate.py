@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nfc_gym.measured.belief import Belief
 from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.box import box
+from nfc_gym.measured.elsewhere import STARTS, hollows
 from nfc_gym.measured.fit import Fit, objective
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.problem import Problem
@@ -31,14 +32,14 @@ def calibrate(
     """Fit psi, without effects.
 
     A belief decides where the fit begins; what is minimised, the weak pull towards nominal values included, and when it
-    has converged are the same. Its draws stand in for the polish that a rough problem gets from nominal values: both
-    look around for a start from which least squares go down far. The fit begins at nominal values where these are
-    better than all that the posterior offers, so that a wrong posterior costs one batch of roll-outs.
+    has converged are the same. Its draws stand in for the fits from elsewhere (`elsewhere`) that a rough problem gets
+    from nominal values: both look around for a start from which least squares go down far. The fit begins at nominal
+    values where these are better than all that the posterior offers: a wrong posterior costs one batch of roll-outs.
 
     Args:
       problem: measured blocks.
       plant: the model without effects.
-      seed: of the polish that rough problems get.
+      seed: of the starts elsewhere that rough problems get.
       say: progress.
       belief: of a posterior.
       compare: fit once more from nominal values, to say how much time the belief saved.
@@ -49,9 +50,11 @@ def calibrate(
     """
     sigma = problem.covariance(plant, plant.null)
 
-    def fitted(x: Array, polished: bool) -> Array:
+    def fitted(x: Array, alone: bool) -> Array:
         tick = lambda turn: say(f"calibrating psi, pass {turn} of at most {TURNS}")  # noqa: E731
-        return settle(problem, sigma, plant, x, seed if polished else None, tick=tick)[0].x
+        found, under, extra = settle(problem, sigma, plant, x, tick=tick)
+        again = lambda start: say(f"calibrating psi from elsewhere, start {start} of {STARTS}")  # noqa: E731
+        return hollows(problem, under, extra, found, seed, tick=again).x if alone else found.x
 
     began = time.monotonic()
     at, about = (plant.null, {}) if belief is None else _nearest(problem, sigma, plant, belief)

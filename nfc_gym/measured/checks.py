@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 
 from nfc_gym.core import InputError, Log
-from nfc_gym.measured.clock_checks import clock_offsets
+from nfc_gym.measured.clock_checks import clock_offsets, shift_notes
 from nfc_gym.measured.dataset import Dataset, assemble, read_log
 from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order
 from nfc_gym.measured.mapping import SPLITS, Mapping, load_mapping
@@ -75,7 +75,9 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
         if log is not None:
             found += [(source.name, s) for s in suspicions(mapping, model, log)]
             logs.append(log)
-    findings = gather(_weighed(found, len(sources)), len(sources)) + list(clock_offsets(model, logs))
+    shifts = {name: c.shift for name, c in mapping.channels.items()}
+    findings = gather(_weighed(found, len(sources)), len(sources))
+    findings += [*clock_offsets(model, logs, shifts), *shift_notes(shifts)]
     if len(logs) < len(sources):
         return None, findings
     try:

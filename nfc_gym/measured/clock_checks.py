@@ -1,6 +1,6 @@
-"""Clocks that disagree: two sensors of one motion, one of which shows it later. Reported, never repaired."""
+"""Clocks that disagree: two sensors of one motion, one of which shows it later. Reported, never repaired unasked."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -23,8 +23,23 @@ FEWEST = 16  # samples of a channel from which motion can be told
 LONGEST = 10_000  # samples of a channel that are compared
 
 
-def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log]) -> Iterator[Finding]:
-    """Pairs of channels that measure one motion at different times, over all logs, each told where the later one is."""
+def shift_notes(shifts: Mapping[str, float]) -> Iterator[Finding]:
+    """What the mapping's `shift` of each channel (s, name -> value) does to it."""
+    for name, shift in shifts.items():
+        if shift:
+            way = "late" if shift > 0 else "early"
+            message = f"its stamps are taken to be {1e3 * abs(shift):.4g} ms {way}, as its `shift` says"
+            yield Finding("note", f"channels.{name}", message, "it is interpolated to the rows of the log")
+
+
+def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log], shifts: Mapping[str, float]) -> Iterator[Finding]:
+    """Pairs of channels that measure one motion at different times, over all logs, each told where the later one is.
+
+    Args:
+      model: to find the sites of gyroscopes; None leaves those out.
+      logs: with the mapping's shifts taken out.
+      shifts: these, s, channel -> value; what is advised comes on top.
+    """
     found: dict[tuple[str, str], list[tuple[str, Offset, float]]] = {}
     for log in logs:
         for position, speed, time, travel in _pairs(model, log):
@@ -37,10 +52,12 @@ def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log]) -> Iterator
                 coarsest = max(float(np.median(np.diff(t))) for t in (time, other))
                 found.setdefault((position, speed), []).append((log.name, offset, coarsest))
     for (position, speed), offsets in found.items():
-        yield from _told(position, speed, offsets)
+        yield from _told(position, speed, offsets, shifts)
 
 
-def _told(position: str, speed: str, offsets: list[tuple[str, Offset, float]]) -> Iterator[Finding]:
+def _told(
+    position: str, speed: str, offsets: list[tuple[str, Offset, float]], shifts: Mapping[str, float]
+) -> Iterator[Finding]:
     """The weighted mean over logs, its deviation widened where they scatter by more than their own."""
     each, sd = (np.array([getattr(o, key) for _, o, _ in offsets]) for key in ("seconds", "sd"))
     mean = float((each / sd**2).sum() / (1 / sd**2).sum())
@@ -54,8 +71,13 @@ def _told(position: str, speed: str, offsets: list[tuple[str, Offset, float]]) -
     if len(each) > 1:
         low, high = sorted(1e3 * np.sign(mean) * np.quantile(each, (0, 1)))
         message += f" in {len(each)} logs (single ones {low:.3g} to {high:.3g} ms)"
+    before = shifts.get(late, 0.0)
     message += ": two clocks, or a filter; nothing was shifted"
-    advice = f"subtract {size / 1e3:.3g} s from its stamps, or let the loop weigh sensor_delay:{late}"
+    message += f" beyond its `shift` of {before:g} s" if before else ""
+    advice = (
+        f"to take it out, write `shift: {before + abs(mean):.4g}` under channels.{late}, "
+        f"or let the loop weigh sensor_delay:{late}"
+    )
     yield Finding("warning", f"channels.{late}", message, advice)
 
 

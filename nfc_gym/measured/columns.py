@@ -1,6 +1,7 @@
 """From a file's table to the columns that a mapping names: addressing, broadcasting, and what may not be used."""
 
 import re
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from nfc_gym.measured.yaml_marks import suggest
 
 Array = NDArray[np.float64]
 _INDEXED = re.compile(r"^(.+)\[(\d+)\]$")
+_LARGEST = 1e20  # in any unit; nanoseconds since 1970 are 1.8e18
 
 
 class LogColumns:
@@ -20,11 +22,15 @@ class LogColumns:
 
     Args:
       table: what the reader gave.
+      rows: of the log, where they are known.
     """
 
-    def __init__(self, table: Table) -> None:
+    def __init__(self, table: Table, rows: int = 0) -> None:
         self._table = table
-        self.rows = 0
+        self.rows = rows
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._table
 
     def time(self, name: str) -> Array:
         """The time column (T,), in the file's unit; from then on every column must have T rows."""
@@ -33,6 +39,27 @@ class LogColumns:
             raise InputError(f"time column {name!r} must be a vector of two or more samples")
         self.rows = len(values)
         return values
+
+    def untimed(self, names: Iterable[str]) -> int:
+        """The rows of a log without a time column, by the columns of these names that are there and no constants."""
+        lengths: dict[str, int] = {}
+        for name in names:
+            try:
+                values = self._find(name)
+            except InputError:  # told where it is used
+                continue
+            if values.size > 1:
+                lengths[name] = len(values)
+        if max(lengths.values(), default=0) < 2:
+            raise InputError("no column has two or more samples")
+        first, rows = next(iter(lengths.items()))
+        other = next((name for name, n in lengths.items() if n != rows), None)
+        if other is not None:
+            raise InputError(
+                f"column {first!r} has {rows} rows and {other!r} {lengths[other]}; `interval` wants as many of each"
+            )
+        self.rows = rows
+        return rows
 
     def one(self, name: str) -> Array:
         """One column (T,) of numbers; a scalar stands for every row."""
@@ -95,3 +122,29 @@ class LogColumns:
         if values.ndim not in (1, 2) or len(values) != self.rows or values.size == 0:
             raise InputError(f"column {name!r} has shape {values.shape} where time has {self.rows} rows")
         return values
+
+
+def finite(values: Array, what: str, needed: NDArray[np.bool_] | None = None) -> Array:
+    """The values, if every one of the rows (or of the `needed` ones) is a number that something can have measured."""
+    bad: NDArray[np.bool_] = np.asarray(~np.isfinite(values.reshape(len(values), -1)).all(1))
+    if needed is not None:
+        bad &= needed
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise InputError(
+            f"{what}: {int(bad.sum())} of {len(bad)} rows are NaN or infinite, the first row {row}; cut the log there, "
+            "or, for a measured channel, name a `mask` column that is false in those rows"
+        )
+    return plausible(values, what)
+
+
+def plausible(values: Array, what: str) -> Array:
+    """The values, if none is larger than anything that is measured."""
+    wild = np.argwhere(np.abs(np.where(np.isfinite(values), values, 0.0)) > _LARGEST)
+    if len(wild):
+        row = wild[0]
+        raise InputError(
+            f"{what}: {values[tuple(row)]:.3g} at row {row[0]} ({len(wild)} such values), which nothing measures; "
+            "correct the column or its unit, or leave out those rows"
+        )
+    return values

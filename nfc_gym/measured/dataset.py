@@ -3,27 +3,27 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.measured import units
-from nfc_gym.measured.align import Alignment, align, uses
+from nfc_gym.measured.align import Alignment, Use, align, shifted, uses
 from nfc_gym.measured.channels import parse_channel
-from nfc_gym.measured.columns import LogColumns
+from nfc_gym.measured.columns import LogColumns, finite
 from nfc_gym.measured.entries import Measured, Servo
+from nfc_gym.measured.log_time import require_no_streams, time_of
 from nfc_gym.measured.mapping import Mapping, Split, load_mapping
-from nfc_gym.measured.readers import Streams, read_table
+from nfc_gym.measured.readers import Streams, Table, read_table
+from nfc_gym.measured.shifting import shift_table, too_long
 from nfc_gym.measured.splits import Fold, Source, divide, find_logs
 from nfc_gym.physics.effects.base import TIME
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-LARGEST_GAP = 10.0  # sampling intervals; a longer pause makes two logs of one
-LARGEST = 1e20  # in any unit; nanoseconds since 1970 are 1.8e18
 UNIT_NORM = 0.05  # a quaternion's norm may differ so much from 1 (rounding, interpolation) and is then normalised
 ROUNDING = 1e-14  # a norm that differs so little from 1 is 1
 
@@ -123,141 +123,131 @@ def _files(log: Path) -> list[Path]:
     return sorted(f for f in log.rglob("*") if f.is_file()) if log.is_dir() else [log]
 
 
-def read_log(mapping: Mapping, source: Source) -> Reading:
-    """One log file as the mapping describes it, or everything that is wrong with it."""
-    defects: list[Defect] = []
+class _Defects(list[Defect]):
+    """Collects what goes wrong, so that all of it is told at once."""
 
-    def attempt(where: str, work: Callable[[], T]) -> T | None:
+    def attempt(self, where: str, work: Callable[[], T]) -> T | None:
+        """What `work` returns, or None where it raises `InputError`."""
         try:
             return work()
         except InputError as e:
-            defects.append(Defect(where, str(e)))
+            self.append(Defect(where, str(e)))
             return None
 
-    time_column, used = mapping.time.columns[0], uses(mapping)
+
+def read_log(mapping: Mapping, source: Source) -> Reading:
+    """One log file as the mapping describes it, or everything that is wrong with it."""
+    defects, used = _Defects(), uses(mapping)
+    wanted = {*mapping.time.columns, *(name for use in used for name in use.columns)}
     try:
-        table = read_table(source.path, source.part, {time_column, *(name for use in used for name in use.columns)})
+        table = read_table(source.path, source.part, wanted)
     except InputError as e:
         return Reading(None, [Defect("file", str(e).removeprefix(f"{source.path}: "))])
     alignment = None
     if isinstance(table, Streams):
         streams = table
-        alignment = attempt("streams", lambda: align(streams, time_column, used))
-        if alignment is None:
+        alignment = defects.attempt("streams", lambda: _aligned(streams, mapping, used, defects))
+        if alignment is None or defects:
             return Reading(None, defects)
-    columns = LogColumns(table if alignment is None else alignment.table)
-    time = attempt("time", lambda: _time(mapping, columns))
+        table = alignment.table
+    columns = LogColumns(table)
+    names = [name for use in used for name in use.columns]
+    time = defects.attempt("time", lambda: time_of(mapping.time, columns, names))
     if time is None:
         return Reading(None, defects, alignment)
-    m = mapping
-    controls = {
-        k: attempt(f"controls.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.controls.items()
-    }
-    exogenous = {
-        k: attempt(f"exogenous.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.exogenous.items()
-    }
-    channels = {
-        k: attempt(f"channels.{k}", lambda k=k, c=c: _channel(k, c, columns, alignment)) for k, c in m.channels.items()
-    }
-    exogenous.setdefault(TIME, time)  # that of the whole file, where a split by time cuts it
-    known = {
-        f"{k.field}:{'+'.join(k.of)}": attempt(
-            f"known.{k.field}",
-            lambda k=k: units.to_si(_finite(columns.product(k.columns, k.scale) + k.offset, "its columns"), k.unit),
-        )
-        for k in m.known
-    }
-    servo = {
-        k: attempt(f"controls.{k}.servo", lambda s=c.servo: _servo(columns, s))
-        for k, c in m.controls.items()
-        if c.servo
-    }
+    if alignment is None:
+        moved = _shifted(mapping, table, time, used, defects)
+        if moved is None:
+            return Reading(None, defects)
+        columns, time = moved
+    parts = _parts(mapping, columns, alignment, defects)
+    parts["exogenous"].setdefault(TIME, time)  # that of the whole file, where a split by time cuts it
     if defects:
         return Reading(None, defects, alignment)
-    parts = {"controls": controls, "channels": channels, "exogenous": exogenous, "known": known, "servo": servo}
-    log = attempt(
-        "log", lambda: Log(name=source.name, time=time, group=source.group, condition=source.condition, **parts)
-    )
+    name, group, condition = source.name, source.group, source.condition
+    log = defects.attempt("log", lambda: Log(name=name, time=time, group=group, condition=condition, **parts))
     return Reading(log, defects, alignment)
 
 
-def _time(mapping: Mapping, columns: LogColumns) -> Array:
-    name = mapping.time.columns[0]
-    raw = columns.time(name)
-    bad = np.flatnonzero(~np.isfinite(raw))
-    if bad.size:
-        raise InputError(f"column {name!r} is not a number at row {bad[0]}; remove such rows")
-    _plausible(raw, f"column {name!r}")
-    time = units.to_si(raw - raw[0], mapping.time.unit)
-    step = np.diff(time)
-    back = np.flatnonzero(step <= 0)
-    if len(back) == len(step):
-        raise InputError(f"column {name!r} never increases; name the column that holds the time")
-    if back.size:
-        k = int(back[0])
-        how = "stands still" if step[k] == 0 else "goes back"
-        raise InputError(
-            f"column {name!r} {how} at row {k + 1} ({time[k]:.6g} to {time[k + 1]:.6g} s; {back.size} such rows); "
-            "remove repeated rows, or cut the file there into two logs"
-        )
-    longest = int(step.argmax())
-    if step[longest] > LARGEST_GAP * np.median(step):
-        count = int((step > LARGEST_GAP * np.median(step)).sum())
-        raise InputError(
-            f"a gap of {step[longest]:.3g} s after row {longest}, at {time[longest]:.6g} s, where samples are "
-            f"{np.median(step):.3g} s apart ({count} such gap{'s' * (count > 1)}); cut the file there into logs"
-        )
-    return time
+def _aligned(streams: Streams, mapping: Mapping, used: list[Use], defects: _Defects) -> Alignment | None:
+    """A log of several clocks at the times of one of them."""
+    require_no_streams(streams, mapping.time)
+    column = mapping.time.columns[0]
+    base = streams.clock(column)
+    if base is not None and len(base[0].stamps):
+        defects += _too_long(mapping, float(np.ptp(streams.seconds(*base))))
+    return None if defects else align(streams, column, used)
 
 
-def _finite(values: Array, what: str, needed: NDArray[np.bool_] | None = None) -> Array:
-    bad: NDArray[np.bool_] = np.asarray(~np.isfinite(values.reshape(len(values), -1)).all(1))
-    if needed is not None:
-        bad &= needed
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise InputError(
-            f"{what}: {int(bad.sum())} of {len(bad)} rows are NaN or infinite, the first row {row}; cut the log there, "
-            "or, for a measured channel, name a `mask` column that is false in those rows"
-        )
-    return _plausible(values, what)
+def _too_long(mapping: Mapping, duration: float) -> list[Defect]:
+    shifts = {name: c.shift for name, c in mapping.channels.items() if c.shift}
+    return [Defect(f"channels.{name}.shift", text) for name, text in too_long(shifts, duration)]
 
 
-def _plausible(values: Array, what: str) -> Array:
-    wild = np.argwhere(np.abs(np.where(np.isfinite(values), values, 0.0)) > LARGEST)
-    if len(wild):
-        row = wild[0]
-        raise InputError(
-            f"{what}: {values[tuple(row)]:.3g} at row {row[0]} ({len(wild)} such values), which nothing measures; "
-            "correct the column or its unit, or leave out those rows"
-        )
-    return values
+def _shifted(
+    mapping: Mapping, table: Table, time: Array, used: list[Use], defects: _Defects
+) -> tuple[LogColumns, Array] | None:
+    """Columns and times of a log of one clock, its shifts taken out."""
+    defects += _too_long(mapping, float(time[-1]))
+    moved = None if defects else defects.attempt("channels", lambda: shift_table(table, time, used))
+    return None if moved is None else (LogColumns(moved[0], len(moved[1])), moved[1])
+
+
+def _parts(mapping: Mapping, columns: LogColumns, alignment: Alignment | None, defects: _Defects) -> dict[str, Any]:
+    """What a `Log` is made of, by name of its attributes; None for what could not be read."""
+    m, attempt = mapping, defects.attempt
+    return {
+        "controls": {
+            k: attempt(f"controls.{k}", lambda c=c: _signal(columns, c.columns, c.unit)) for k, c in m.controls.items()
+        },
+        "exogenous": {
+            k: attempt(f"exogenous.{k}", lambda c=c: _signal(columns, c.columns, c.unit))
+            for k, c in m.exogenous.items()
+        },
+        "channels": {
+            k: attempt(f"channels.{k}", lambda k=k, c=c: _channel(k, c, columns, alignment))
+            for k, c in m.channels.items()
+        },
+        "known": {
+            f"{k.field}:{'+'.join(k.of)}": attempt(
+                f"known.{k.field}",
+                lambda k=k: units.to_si(finite(columns.product(k.columns, k.scale) + k.offset, "its columns"), k.unit),
+            )
+            for k in m.known
+        },
+        "servo": {
+            k: attempt(f"controls.{k}.servo", lambda s=c.servo: _servo(columns, s))
+            for k, c in m.controls.items()
+            if c.servo
+        },
+    }
 
 
 def _signal(columns: LogColumns, names: tuple[str, ...], unit: str) -> Array:
-    return units.to_si(_finite(columns.one(names[0]), f"column {names[0]!r}"), unit)
+    return units.to_si(finite(columns.one(names[0]), f"column {names[0]!r}"), unit)
 
 
 def _servo(columns: LogColumns, servo: Servo) -> dict[str, Array]:
     terms = {"gain": servo.gain, "supply": servo.supply, "damping": servo.damping}
-    return {name: _finite(columns.product(term.columns, term.scale), name) for name, term in terms.items()}
+    return {name: finite(columns.product(term.columns, term.scale), name) for name, term in terms.items()}
 
 
 def _channel(name: str, entry: Measured, columns: LogColumns, alignment: Alignment | None) -> Channel:
     parsed = parse_channel(name)
-    raw = columns.many(entry.columns)
+    names = tuple(_after_shift(columns, name, entry.shift) for name in entry.columns)
+    raw = columns.many(names)
     width = len(entry.axes) if entry.axes else parsed.width or (1 if parsed.kind in ("joint", "force") else None)
     if width is not None and raw.shape[1] != width:
         raise InputError(
             f"{raw.shape[1]} columns where {width} {'are' if width > 1 else 'is'} wanted; name them in `columns`"
         )
-    mask = columns.mask(entry.mask) if entry.mask else None
+    mask = columns.mask(_after_shift(columns, entry.mask, entry.shift)) if entry.mask else None
     present: NDArray[np.bool_] = np.asarray(np.isfinite(raw).all(1))
     rates = {} if alignment is None else alignment.rates
-    rate = entry.rate or next((rates[name] for name in entry.columns if name in rates), None)
+    rate = entry.rate or next((rates[name] for name in names if name in rates), None)
     if rate is not None and not present.all():  # between a slow sensor's samples and in gaps nothing was measured
         mask = present if mask is None else np.logical_and(mask, present)
-    _finite(raw, f"columns {', '.join(entry.columns)}", mask)
+    finite(raw, f"columns {', '.join(entry.columns)}", mask)
     if not present.any():
         raise InputError(f"columns {', '.join(entry.columns)}: every row is NaN or infinite; name other columns")
     unit = entry.unit or "1"
@@ -273,6 +263,11 @@ def _channel(name: str, entry: Measured, columns: LogColumns, alignment: Alignme
         axes=entry.axis_indices,
         rate=rate,
     )
+
+
+def _after_shift(columns: LogColumns, name: str, shift: float) -> str:
+    """A column's name with its shift taken out; its own where it has none, is a constant or is not there."""
+    return shifted(name, shift) if shifted(name, shift) in columns else name
 
 
 def _held(values: Array, present: NDArray[np.bool_]) -> Array:

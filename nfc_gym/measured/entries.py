@@ -81,10 +81,22 @@ class _Signal(_Columns):
     columns: tuple[str, ...] = Field(min_length=1)
 
 
-class TimeColumn(_Signal):
-    """Where the time is."""
+class TimeColumn(_Columns):
+    """Where the time is: a column; or, of logs that have no clock, the `interval` in s from one row to the next."""
 
     unit: Unit = "s"
+    interval: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.interval is not None and self.columns:
+            raise PydanticCustomError("both", "has both `column` and `interval`; keep one")
+        if self.interval is not None and self.unit != "s":
+            raise PydanticCustomError("time", "`interval` is in s; leave out `unit`")
+        if self.interval is None and (len(self.columns) != 1 or units.si_unit(self.unit) != "s"):
+            text = "time is one column, in s, ms, us or ns; or `interval`, the seconds from row to row"
+            raise PydanticCustomError("time", text)
+        return self
 
 
 class Term(_Columns):
@@ -134,6 +146,7 @@ class Measured(_Signal):
     axes: tuple[Literal["x", "y", "z"] | Annotated[int, Field(ge=0)], ...] | None = None
     smooth: Annotated[int, Field(ge=1)] = 1
     mask: str | None = None
+    shift: Finite = 0.0  # s by which its stamps are late: a sample stamped t was taken at t - shift
 
     @property
     def axis_indices(self) -> tuple[int, ...] | None:

@@ -24,12 +24,13 @@ from nfc_gym.measured.calibrate import calibrate, compared
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
+from nfc_gym.measured.elsewhere import STARTS, hollows
 from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.halved import step_error
 from nfc_gym.measured.identify import table
 from nfc_gym.measured.kept import pack_state, unpack_state
-from nfc_gym.measured.metric import metric
+from nfc_gym.measured.metric import Metric, metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.numerics import fingerprint, one_blas_thread
 from nfc_gym.measured.outcome import report, summary, write
@@ -291,20 +292,43 @@ def _keep_found(stages: Stages, found: Found) -> None:
 
 
 def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit, Array]:
-    """Calibrated and extended model refitted on every fit segment; the physics step's error in the latter's numbers."""
-    out, under = [], None
+    """Calibrated and extended model refitted on every fit segment; what step and search leave open of the latter."""
     assert found.rest is not None
-    for name, start in (("calibrated", found.calibrated), ("extended", found.rest.fitted)):
-        sigma = whole.covariance(start.plant, start.x)
-        if run.stages.get(f"final {name}") is None:
-            run.say(f"fitting the {name} model on all {len(whole)} segments")
-            fitted, _, extra = settle(whole, sigma, start.plant, start.x)
-            run.stages.put(f"final {name}", {"x": fitted.x.tolist(), "slack": extra.tolist()})
-        kept = {k: np.array(v, float) for k, v in run.stages.get(f"final {name}").items()}
-        under = metric(whole, sigma, kept["slack"])
-        out.append(stand(whole, under, start.plant, kept["x"]))
-    assert under is not None
-    return out[0], out[1], step_error(whole, under, out[1])
+    last = found.rest.fitted
+    effects = bool(last.plant.effects)
+    # Psi alone began its way here from several places; its intervals are asked for only where there is nothing beside.
+    calibrated = extended = _settled(run, "calibrated", found.calibrated, whole, starts=1 if effects else STARTS)
+    if effects:
+        # What psi alone went to is another place for the same psi to begin.
+        psi = calibrated.fitted.x[: len(last.plant.space)]
+        extended = _settled(run, "extended", last, whole, (np.concatenate([psi, last.x[len(psi) :]]),))
+    unsure = np.hypot(step_error(whole, extended.under, extended.fitted), extended.open)
+    return calibrated.fitted, extended.fitted, unsure
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """A model on every fit segment, its metric there, and (size,) what the search for its parameters leaves open."""
+
+    fitted: Fit
+    under: Metric
+    open: Array
+
+
+def _settled(
+    run: _Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = (), starts: int = STARTS
+) -> _Settled:
+    """Fit a model from where it stands and, where bodies touch, from other places (size,) too."""
+    plant, stage = start.plant, f"final {name}"
+    if run.stages.get(stage) is None:
+        run.say(f"fitting the {name} model on all {len(whole)} segments")
+        fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
+        tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
+        ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
+        run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "open": ended.open.tolist()})
+    x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "open"))
+    under = metric(whole, whole.covariance(plant, x if whole.rough else start.x), extra)
+    return _Settled(stand(whole, under, plant, x), under, unsure)
 
 
 def _identify(

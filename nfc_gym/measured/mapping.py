@@ -66,13 +66,6 @@ class Mapping(Strict):
     segments: Segments = Segments()
     effects: EffectChoice = EffectChoice()
 
-    @field_validator("time")
-    @classmethod
-    def _time_unit(cls, value: TimeColumn) -> TimeColumn:
-        if len(value.columns) != 1 or units.si_unit(value.unit) != "s":
-            raise PydanticCustomError("time", "time is one column, in s, ms, us or ns")
-        return value
-
     @field_validator("channels")
     @classmethod
     def _channels(cls, value: dict[str, Measured]) -> dict[str, Measured]:

@@ -34,6 +34,17 @@ def held(time: Array, values: Array, at: Array) -> Array:
     return np.where((index < 0)[:, None], np.nan, values[np.maximum(index, 0)])
 
 
+def flagged(time: Array, values: Array, at: Array) -> Array:
+    """Flags (N, k) of samples at times (N,) s: (T, k) at times `at`, 1 where those on either side are both 1, else 0.
+
+    What is interpolated between a good sample and a bad one is bad. Other values than 0 and 1 are held as they are, for
+    others to refuse.
+    """
+    if not np.isin(values, (0.0, 1.0)).all():
+        return held(time, values, at)
+    return np.where(interpolated(time, values, at, np.inf) == 1, 1.0, 0.0)
+
+
 def interpolated(time: Array, values: Array, at: Array, gap: float, rotation: bool = False) -> Array:
     """Samples (N, k) at times (N,) s, interpolated to (T, k) at times `at`; NaN outside and in pauses over `gap` s.
 

@@ -64,7 +64,7 @@ def _sampling(log: Log) -> Iterator[Suspicion]:
     if not 1e-5 < median < 1.0:
         message = f"samples are {median:.3g} s apart"
         severity = "warning" if 1e-7 < median < 60.0 else "error"  # no robot is measured so
-        yield Suspicion(severity, "time", "unit", message, "check `time.unit` (s, ms, us or ns)")
+        yield Suspicion(severity, "time", "unit", message, "check `time.unit` (s, ms, us or ns) or `time.interval`")
 
 
 def _command(name: str, values: Array, model: mujoco.MjModel | None) -> Iterator[Suspicion]:

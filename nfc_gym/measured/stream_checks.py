@@ -17,7 +17,7 @@ def stream_notes(alignment: Alignment) -> Iterator[Suspicion]:
     """A note for each stream that was resampled, and one for what was cut off; warnings where much was lost."""
     for r in alignment.resampled:
         yield Suspicion(
-            "warning" if r.missing > MANY_MISSING else "note", f"streams.{r.stream}", f"resampled {r.how}",
+            "warning" if r.missing > MANY_MISSING else "note", f"streams.{r.stream}", f"resampled {r.how} {r.shift}",
             _said(r, alignment), _advice(r, alignment),
         )  # fmt: skip
         if r.late > LATE:
@@ -52,7 +52,10 @@ def stream_notes(alignment: Alignment) -> Iterator[Suspicion]:
 
 
 def _said(r: Resampled, alignment: Alignment) -> str:
-    verb = {"linear": "interpolated linearly", "slerp": "interpolated by slerp", "hold": "held"}[r.how]
+    verb = {
+        "linear": "interpolated linearly", "slerp": "interpolated by slerp", "hold": "held",
+        "both": "true between true samples,",
+    }[r.how]  # fmt: skip
     told = [
         f"{verb} from {r.rate:.4g} Hz ({r.clock}) to the {r.base_rate:.4g} Hz of {alignment.base} ({alignment.clock})"
     ]
@@ -62,6 +65,8 @@ def _said(r: Resampled, alignment: Alignment) -> str:
         told.append(f"{r.missing:.2%} of its rows in gaps over {1e3 * r.gap:.3g} ms (the longest {r.longest:.3g} s)")
     else:
         told.append(f"for {r.longest:.3g} s at most")
+    if r.shift:
+        told.append(f"its stamps shifted by {-1e3 * r.shift:.3g} ms")
     if r.repeated or r.disordered:
         told.append(f"{r.repeated} repeated and {r.disordered} disordered stamps")
     return ", ".join(told)
@@ -70,6 +75,6 @@ def _said(r: Resampled, alignment: Alignment) -> str:
 def _advice(r: Resampled, alignment: Alignment) -> str:
     if r.missing > MANY_MISSING:
         return "rows in gaps are not compared; look for lost messages"
-    if r.how != "hold" and r.rate > 1.5 * r.base_rate:
+    if r.how in ("linear", "slerp") and r.rate > 1.5 * r.base_rate:
         return f"name {r.stream}.time as the time column to use all its samples"
     return ""

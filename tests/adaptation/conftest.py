@@ -1,8 +1,11 @@
 """One thread and one seed, so that runs agree to the bit; a policy of the Jackal, as `nfc-gym pretrain` makes it."""
 
+import sys
 from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # `carts`: importlib mode does not add the folder
 
 torch = pytest.importorskip("torch", reason="needs PyTorch: pip install 'nfc_gym[rl]'")
 pytest.importorskip("torchrl", reason="needs TorchRL: pip install 'nfc_gym[rl]'")

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from carts import QUICK, cart, everything, trajectory, watcher
 
 from nfc_gym import InputError
 from nfc_gym.adaptation import learn_from_mission, load_policy
@@ -17,7 +18,6 @@ from nfc_gym.adaptation.beliefs import Sequential
 from nfc_gym.adaptation.normal import quiet_trajectories, quiet_windows, stretches, windows_of
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
 from nfc_gym.inference.config import NetworkConfig, Sizes
-from nfc_gym.inference.contrast import Contrast, ContrastConfig
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.detector import WindowDetector
 from nfc_gym.inference.network import Network
@@ -30,46 +30,11 @@ from nfc_gym.simulate import Simulator
 from nfc_gym.simulate.machine import Machine
 
 JACKAL, COPTER = "nfc_gym/JackalFlat-v0", "nfc_gym/QuadcopterFlat-v0"
-BOX = PriorBox("cart", ("mass", "damping"), ("kg", "N s/m"), (0.5, 0.0), (1.5, 2.0))
-QUICK = TrainConfig(epochs=4, batch=64, rate=1e-3, warmup=5, average=0.9)
-
-
-def trajectory(states: np.ndarray, actions: np.ndarray, alarms: tuple[int, ...] = ()) -> Trajectory:
-    scores = np.zeros(len(actions))
-    scores[list(alarms)] = 2.0
-    return Trajectory(
-        states, actions, np.zeros(len(actions)), scores, 1.0, np.zeros((len(states), 0)), np.zeros((0, 0))
-    )
-
-
-def cart(steps: int, seed: int, push: float) -> Trajectory:
-    """A cart that is pushed at random, in a slow wave of a strength."""
-    rng = np.random.default_rng(seed)
-    mass, damping = 0.5 + rng.random(), 2 * rng.random()
-    actions, states = push * rng.standard_normal((steps, 1)), [rng.standard_normal(2)]
-    for a in actions[:, 0]:
-        speed = states[-1][1] + 0.1 * (a - damping * states[-1][1]) / mass
-        states.append(np.array([states[-1][0] + 0.1 * speed, speed]))
-    out = np.array(states)
-    return trajectory(out - np.linspace(0, 1, steps + 1)[:, None] * [out[-1, 0], 0.0], actions)
-
-
-def everything(t: Trajectory) -> np.ndarray:
-    return np.ones(len(t), bool)
 
 
 @pytest.fixture(scope="module")
 def detector() -> WindowDetector:
-    """Trained and calibrated on gentle pushes."""
-    torch.manual_seed(0)
-    parts = windows_of([cart(400, k, 1.0) for k in range(30)], 10, everything)
-    states, actions = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
-    tensors = [torch.as_tensor(x, dtype=torch.float32) for x in (states, actions)]
-    windows = TensorWindows({"states": tensors[0], "actions": tensors[1], "psi": torch.full((len(states), 2), 0.5)})
-    net = Contrast.of(windows.tensors, BOX, ContrastConfig(features=16))
-    train(net, *windows.split(0.2), QUICK)
-    held_out = windows_of([cart(400, 1000 + k, 1.0) for k in range(10)], 10, everything)
-    return WindowDetector(net).calibrated(*(np.concatenate([p[i] for p in held_out]) for i in (0, 1)), 0.05)
+    return watcher()
 
 
 def test_false_alarms_on_the_missions_own_motion_fall(detector: WindowDetector, tmp_path: Path) -> None:

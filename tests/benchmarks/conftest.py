@@ -9,6 +9,8 @@ import pytest
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 
+sys.path.insert(0, str(Path(__file__).parent))  # `rail`: importlib mode does not add the folder
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _benchmarks_on_the_path() -> Iterator[None]:

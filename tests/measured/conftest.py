@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))  # `writers`, `hidden_laws`: importlib mode does not add the folder
+sys.path.insert(0, str(Path(__file__).parent))  # `writers`, `rotor`, ...: importlib mode does not add the folder
 
 MODEL = """
 <mujoco>

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nfc_gym.core import InputError
-from nfc_gym.measured.align import GAP, Use, align
+from nfc_gym.measured.align import GAP, Use, align, shifted
 from nfc_gym.measured.readers import Stream, Streams
 from nfc_gym.measured.resampling import Clock, held, interpolated, nearest_rows
 from nfc_gym.physics.state import quat_difference, quat_multiply, vector_to_quat
@@ -171,3 +171,29 @@ def test_what_cannot_be_brought_together_is_an_error() -> None:
     same = align(table, "/a.raw", [Use(("/a.w",), "linear", True), Use(("parameters.mass",), "linear")])
     np.testing.assert_array_equal(same.table["/a.w"], np.ones(5))
     assert same.table["parameters.mass"] == 2.5
+
+
+def test_of_one_stream_some_columns_are_shifted_with_their_masks() -> None:
+    time, late = 0.01 * np.arange(200), 0.0137
+    flags = np.ones(200)
+    flags[100] = 0
+    base = stream("/b", time, x=2 * time, y=3 * time, good=flags)
+    other = stream("/o", time, busy=flags)
+    masks = [Use((name,), "both", shift=late, beside=("/b.y",)) for name in ("/b.good", "/o.busy")]
+    use = [Use(("/b.x",), "linear", True), Use(("/b.y",), "linear", True, late), *masks]
+    found = align(Streams([base, other]), "/b.time", use)
+    grid = found.table["/b.time"]
+    assert grid[-1] == pytest.approx(time[-1] - 0.02)  # 1.99 - 0.0137 is the last that was measured of y
+    np.testing.assert_allclose(found.table["/b.x"], 2 * grid, atol=1e-12)
+    np.testing.assert_allclose(found.table[shifted("/b.y", late)], 3 * (grid + late), atol=1e-9)
+    # The row at 0.98 s takes y of 0.9937 s, that at 0.99 s y of 1.0037 s; the other stream has a clock of its own.
+    np.testing.assert_array_equal(np.flatnonzero(found.table[shifted("/b.good", late)] == 0), [98, 99])
+    np.testing.assert_array_equal(np.flatnonzero(found.table["/o.busy"] == 0), [100])
+    assert {r.shift for r in found.resampled} == {late, 0.0}
+
+
+def test_a_shift_needs_a_topics_own_times() -> None:
+    time = 0.01 * np.arange(50)
+    table = Streams([stream("/a", time, raw=time, w=time)])
+    with pytest.raises(InputError, match=r"`shift` is taken from a topic's own times.*name one of /a\.time"):
+        align(table, "/a.raw", [Use(("/a.w",), "linear", True, 0.01)])

@@ -160,3 +160,7 @@ def test_as_a_program(tmp_path: Path) -> None:
     assert "Traceback" in debug.stderr
     version = subprocess.run([*run, "--version"], capture_output=True, text=True, check=True)
     assert version.stdout.strip() == __version__
+    module = [sys.executable, "-m", "nfc_gym.cli", "chek"]
+    as_module = subprocess.run(module, capture_output=True, text=True, check=False)
+    assert as_module.returncode == 2
+    assert "No such command" in plain(as_module.stderr)

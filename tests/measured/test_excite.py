@@ -1,4 +1,4 @@
-"""A rotor at constant speed hides whether dry or viscous friction brakes it: the table says so, and `excite` ends it.
+"""At constant speed dry and viscous friction are one: `excite` proposes the commands that tell them apart.
 
 What the proposed commands tell apart is checked by code that shares nothing with the package: both machines are stepped
 by formulas of these tests, and the rival is refitted by scipy.
@@ -14,86 +14,21 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from rotor import INERTIA, INTERVAL, LEVEL, MAPPING, NOISE, SPEED, record, steady
 from scipy.optimize import least_squares
 from typer.testing import CliRunner, Result
 
 from nfc_gym.cli import app
 from nfc_gym.core import InputError
 from nfc_gym.measured.advice import advise
-from nfc_gym.measured.bench import candidates, make_bench
-from nfc_gym.measured.contest import price
+from nfc_gym.measured.bench import make_bench
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.excite import excite
-from nfc_gym.measured.fisher import Lens, left_over, span, without
-from nfc_gym.measured.fit import fit
-from nfc_gym.measured.identify import table
-from nfc_gym.measured.metric import metric
 from nfc_gym.measured.questions import look, reported
-from nfc_gym.measured.stakes import Stakes
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.saved import to_row
 
-INERTIA, LEVEL, SPEED, NOISE = 0.01, 0.2, 5.0, 0.02  # kg m^2, N m, rad/s, rad/s
-SEGMENT, INTERVAL = 0.4, 0.01  # s
-
-MODEL = """
-<mujoco>
-  <option timestep="0.005" integrator="implicitfast" gravity="0 0 0"/>
-  <worldbody>
-    <body name="disc">
-      <joint name="shaft" axis="0 0 1" {more}/>
-      <geom name="disc" type="cylinder" size="0.1 0.02" mass="2"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="shaft" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
-
-MAPPING = """
-version: 1
-model: rotor.xml
-logs:
-  - {path: "fit_*.csv", split: fit}
-  - {path: "select.csv", split: select}
-  - {path: "verify.csv", split: verify}
-time: {column: t, unit: ms}
-controls:
-  "ctrl:motor": {column: torque, unit: Nm}
-channels:
-  "joint:shaft:vel": {column: v, unit: rad/s, noise: 0.02}
-segments: {length: 0.4, history: 0.0, horizons: [0.1, 0.2, 0.4]}
-effects: {only: [coulomb, damping_poly]}
-"""
-
-Torque = Callable[[np.ndarray, int], np.ndarray]
-
-
-def steady(time: np.ndarray, seed: int) -> np.ndarray:
-    """Just what dry friction takes."""
-    return np.full(len(time), LEVEL)
-
-
-def lively(time: np.ndarray, seed: int) -> np.ndarray:
-    """Through rest and both directions."""
-    return 0.5 * np.sin(2.1 * time + seed) + 0.4 * np.sin(7.3 * time + 2 * seed)
-
-
-def record(folder: Path, torque: Torque = steady, level: float = LEVEL, speed: float = SPEED) -> Path:
-    """Logs of a machine with dry friction, a model without any, and the mapping; returns the mapping's path."""
-    folder.mkdir(parents=True, exist_ok=True)
-    real = mujoco.MjModel.from_xml_string(MODEL.format(more=f'frictionloss="{level}"'))
-    time = np.arange(300) * INTERVAL
-    for seed, name in enumerate(("fit_0", "fit_1", "fit_2", "select", "verify")):
-        rng, data, rows = np.random.default_rng(seed), mujoco.MjData(real), []
-        data.qvel[0] = speed
-        for t, u in zip(time, torque(time, seed), strict=True):
-            rows.append((1000 * t, u, data.qvel[0] + NOISE * rng.normal()))
-            data.ctrl[0] = u
-            mujoco.mj_step(real, data, 2)
-        np.savetxt(folder / f"{name}.csv", rows, "%.9g", ",", header="t,torque,v", comments="")
-    (folder / "rotor.xml").write_text(MODEL.format(more=""))
-    (folder / "mapping.yaml").write_text(MAPPING)
-    return folder / "mapping.yaml"
+SEGMENT = 0.4  # s
 
 
 @pytest.fixture(scope="module")
@@ -120,75 +55,6 @@ def call(*args: object) -> Result:
 
 def plain(text: str) -> str:
     return " ".join(re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]", " ", text).split())
-
-
-# ---- what the logs at hand show -------------------------------------------------------------------------------------
-
-
-def seen(path: Path) -> tuple[Lens, Stakes, list[Any]]:
-    """The logs of a mapping, from the model as given: no friction at all."""
-    bench = make_bench(load(path), 1)
-    logs = [*bench.dataset.of("fit"), *bench.dataset.of("select")]
-    problem, plant = bench.problem(logs), bench.plant
-    lens = Lens(problem, metric(problem, problem.covariance(plant, plant.null)), plant, plant.null)
-    return lens, Stakes(int(problem.mask.sum()), 1.0, 0.02), candidates(bench, logs)
-
-
-def test_at_constant_speed_dry_and_viscous_friction_are_one(tmp_path: Path) -> None:
-    rows = {r["id"]: r for r in table(*(lambda a, s, c: (a, c, s))(*seen(record(tmp_path, lambda t, s: 0 * t, 0.0))))}
-    assert rows["coulomb:shaft"]["worst_mimic"] == "damping_poly:shaft"
-    assert rows["damping_poly:shaft"]["worst_mimic"] == "coulomb:shaft"
-    assert rows["coulomb:shaft"]["similarity"] > 0.99
-    assert not rows["coulomb:shaft"]["distinguishable"]
-    assert rows["coulomb:shaft"]["unit"] == "N m"
-    lively_rows = {r["id"]: r for r in table(*(lambda a, s, c: (a, c, s))(*seen(record(tmp_path, lively, 0.0, 0.0))))}
-    assert lively_rows["coulomb:shaft"]["angle"] > max(8, 5 * rows["coulomb:shaft"]["angle"])
-
-
-def test_an_effect_of_the_smallest_size_gains_what_the_table_says(tmp_path: Path) -> None:
-    """A machine with just that much friction, fitted: the drop of the loss is the needed one, to its scatter."""
-    lens, stakes, pool = seen(record(tmp_path / "null", lively, 0.0, 0.0))
-    row = next(r for r in table(lens, pool, stakes) if r["id"] == "coulomb:shaft")
-    lens, _, pool = seen(record(tmp_path / "real", lively, row["smallest_detectable"], 0.0))
-    coulomb = next(e for e in pool if e.id == "coulomb:shaft")
-    plant = lens.plant.with_effects([coulomb])
-    fitted = fit(lens.problem, lens.under, plant, plant.null + 1e-3)
-    gain = float((lens.base**2).sum() - (fitted.white**2).sum())
-    needed = stakes.needed(1)
-    assert gain == pytest.approx(needed**2, abs=3 * 2 * needed)
-    assert fitted.x[0] == pytest.approx(row["smallest_detectable"], rel=0.5)
-
-
-def test_the_smallest_size_is_found_in_all_but_one_of_two_hundred_draws() -> None:
-    stakes = Stakes(count=1000, dispersion=1.3, worth=0.02)
-    least = price(1000, 2, 1.3) + 0.02 * 1000 * 1.3
-    rng, length = np.random.default_rng(0), stakes.needed(2)
-    gains = length**2 + 2 * length * rng.normal(size=200_000)  # |r|^2 - |r - c|^2 with r = c + noise
-    assert (gains > least).mean() == pytest.approx(0.995, abs=0.001)
-    assert Stakes(1000, 1.3, 0.02, repeats=4.0).needed(2) == pytest.approx(length / 2)
-
-
-def test_what_declared_damping_imitates_is_no_finding(tmp_path: Path) -> None:
-    path = record(tmp_path, lambda t, s: 0 * t, 0.0)
-    text = (
-        "parameters:\n  - {name: bearing, field: dof_damping, of: [shaft], low: 0.0, high: 0.5, nominal: 0.001}\nlogs:"
-    )
-    path.write_text(path.read_text().replace("logs:", text, 1))
-    lens, stakes, pool = seen(path)
-    row = next(r for r in table(lens, pool, stakes) if r["id"] == "coulomb:shaft")
-    assert row["detectable_share"] < 0.2
-    assert row["absorbed_by"] == "bearing"
-
-
-def test_left_over_is_what_a_projection_leaves() -> None:
-    rng = np.random.default_rng(0)
-    columns = rng.normal(size=(30, 5))
-    columns[:, 3] = columns[:, 1] + columns[:, 2]  # nothing new
-    left = without(columns[:, 0], span(columns[:, 1:]))
-    assert span(columns[:, 1:]).shape == (30, 3)
-    assert left_over(columns.T @ columns, 0, range(1, 5)) == pytest.approx(left @ left)
-    assert left_over(columns.T @ columns, 3, (1, 2, 4)) == pytest.approx(0, abs=1e-6)
-    assert left_over(columns.T @ columns, 0, ()) == pytest.approx(columns[:, 0] @ columns[:, 0])
 
 
 # ---- a better motion ------------------------------------------------------------------------------------------------

@@ -20,6 +20,22 @@ from minari.data_collector import EpisodeBuffer  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is set to None")  # of what minari would like to be told besides
 
+MACHINE = (
+    "<mujoco><worldbody><body name='b'><joint name='x' type='slide'/><geom size='.1'/></body></worldbody>"
+    "<actuator><motor name='m' joint='x'/></actuator></mujoco>"
+)
+SPRING = """
+version: 1
+model: machine.xml
+parameters: [{name: mass, field: body_mass, of: [b], unit: kg, low: 1, high: 9}]
+logs: [{path: "spring/test-*"}]
+time: {column: time}
+controls: {"ctrl:m": {column: "actions[0]", unit: N}}
+channels:
+  "joint:x:pos": {column: "observations.state[0]", unit: m, noise: 0.01}
+  "joint:x:vel": {column: "observations.state[1]", unit: m/s, noise: 0.01}
+"""
+
 
 def collect(
     folder: Path, monkeypatch: pytest.MonkeyPatch, lengths: tuple[int, ...], infos: bool = True, **kwargs: Any
@@ -80,27 +96,32 @@ def test_time_without_infos_is_that_of_the_environment_registered_here(
 
 def test_a_mapping_of_a_data_set_is_checked_and_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     collect(tmp_path, monkeypatch, (60, 60, 60))
-    (tmp_path / "machine.xml").write_text(
-        "<mujoco><worldbody><body name='b'><joint name='x' type='slide'/><geom size='.1'/></body></worldbody>"
-        "<actuator><motor name='m' joint='x'/></actuator></mujoco>"
-    )
-    (tmp_path / "mapping.yaml").write_text("""
-version: 1
-model: machine.xml
-parameters: [{name: mass, field: body_mass, of: [b], unit: kg, low: 1, high: 9}]
-logs: [{path: "spring/test-*"}]
-time: {column: time}
-controls: {"ctrl:m": {column: "actions[0]", unit: N}}
-channels:
-  "joint:x:pos": {column: "observations.state[0]", unit: m, noise: 0.01}
-  "joint:x:vel": {column: "observations.state[1]", unit: m/s, noise: 0.01}
-""")
+    (tmp_path / "machine.xml").write_text(MACHINE)
+    (tmp_path / "mapping.yaml").write_text(SPRING)
     assert [str(f) for f in check(tmp_path / "mapping.yaml") if f.severity == "error"] == []
     data = load(tmp_path / "mapping.yaml")
     assert [log.name for log in data.logs] == [f"test-v0/episode_{i}" for i in range(3)]
     assert sorted(data.splits.values()) == ["fit", "select", "verify"]
     assert {file.name for file in data.files} == {"main_data.hdf5", "metadata.json"}
     np.testing.assert_allclose(data.logs[0].channels["joint:x:pos"].values, np.cos(0.02 * np.arange(60)), rtol=1e-6)
+
+
+def test_a_data_set_that_tells_no_time_takes_an_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    collect(tmp_path, monkeypatch, (60, 60, 60), infos=False)
+    gym.registry.pop("Spring-v0")
+    from nfc_gym.measured.readers import minari_set
+
+    minari_set._interval.cache_clear()
+    text = SPRING.replace("time: {column: time}", "time: {interval: 0.02}")
+    (tmp_path / "machine.xml").write_text(MACHINE)
+    (tmp_path / "mapping.yaml").write_text(text)
+    assert [str(f) for f in check(tmp_path / "mapping.yaml") if f.severity == "error"] == []
+    for log in load(tmp_path / "mapping.yaml").logs:
+        np.testing.assert_allclose(log.time, 0.02 * np.arange(60))
+        np.testing.assert_allclose(log.channels["joint:x:pos"].values, np.cos(log.time), rtol=1e-6)
+    (tmp_path / "mapping.yaml").write_text(SPRING)
+    with pytest.raises(InputError, match=r"no column 'time'.*of a log without a clock say `interval`"):
+        load(tmp_path / "mapping.yaml")
 
 
 def test_damaged_and_foreign_data_sets_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """A mapping of a bag: what `nfc-gym check` says of its streams and clocks, and the log that is loaded."""
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,43 @@ def test_a_clock_offset_is_found_with_its_number_and_nothing_is_shifted(tmp_path
     assert "error" not in warnings
     log = load(path).logs[0]
     np.testing.assert_allclose(log.channels["sensor:gyro"].values[:, 2], yaw_rate(log.time + 0.2 - 0.0123), atol=6e-2)
+
+
+def test_the_offset_that_is_advised_is_taken_out(tmp_path: Path, dataset: Any) -> None:
+    path = dataset(tmp_path, late=0.0123)
+    advice = next(f.advice for f in check(path) if f.where == "channels.sensor:gyro" and f.severity == "warning")
+    advised = re.search(r"write `(shift: (\S+))` under channels\.sensor:gyro", advice)
+    assert advised
+    assert float(advised[2]) == pytest.approx(0.0123, abs=0.0005)
+    path.write_text(path.read_text().replace("unit: rad/s, noise: 0.01}\nseg", f"unit: rad/s, {advised[1]}}}\nseg"))
+    assert advised[1] in path.read_text()
+    said = told(path)
+    assert "error" not in said
+    assert "nothing was shifted" not in said
+    assert "note channels.sensor:gyro: its stamps are taken to be 12." in said
+    assert "its stamps shifted by -12." in said
+    for log in load(path).logs:  # time zero is the first row that both clocks reach
+        np.testing.assert_allclose(log.channels["sensor:gyro"].values[:, 2], yaw_rate(log.time + 0.2), atol=6e-2)
+
+
+def test_what_a_shift_leaves_is_advised_on_top(tmp_path: Path, dataset: Any) -> None:
+    edit = ("unit: rad/s, noise: 0.01}\nseg", "unit: rad/s, noise: 0.01, shift: 0.004}\nseg")
+    finding = next(
+        f for f in check(dataset(tmp_path, edit, late=0.0123)) if "sensor:gyro" in f.where and f.severity == "warning"
+    )
+    assert "nothing was shifted beyond its `shift` of 0.004 s" in finding.message
+    advised = re.search(r"`shift: (\S+)`", finding.advice)
+    assert advised
+    assert float(advised[1]) == pytest.approx(0.0123, abs=0.0005)
+
+
+def test_a_shift_longer_than_the_log_and_an_interval_are_refused(tmp_path: Path, dataset: Any) -> None:
+    edit = ("unit: rad/s, noise: 0.01}\nseg", "unit: rad/s, noise: 0.01, shift: -6}\nseg")
+    said = told(dataset(tmp_path / "long", edit), "error")
+    assert "channels.sensor:gyro.shift: in 3 of 3 logs, first run_0: -6 s is no shorter than the log" in said
+    said = told(dataset(tmp_path / "rows", ("time: {column: /js.time}", "time: {interval: 0.01}")), "error")
+    assert "`interval` is for logs without a clock" in said
+    assert "/js.time" in said
 
 
 def test_a_gap_is_a_mask_for_a_sensor_and_an_error_in_the_base(tmp_path: Path, dataset: Any) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("torch", reason="the head is a network")
 
-from nfc_gym.cli import _consulted
+from nfc_gym.cli.measured import consulted
 from nfc_gym.core import InputError
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
@@ -69,17 +69,17 @@ def test_another_robots_motion_is_refused(head: Path) -> None:
 
 def test_close_loop_takes_a_head_for_a_head_and_a_posterior_for_a_posterior(head: Path, tmp_path: Path) -> None:
     assert heads(head) == (True, False)
-    belief, witness = _consulted(head)
+    belief, witness = consulted(head)
     assert belief is None
     assert witness is not None
     machine = Machine(ROBOT)
     network = Network(TINY, Sizes(20, 21, 4), PriorBox.of(machine.space, "quadcopter"))
     plain = tmp_path / "psi.safetensors"
     checkpoint.save(plain, network)
-    assert _consulted(plain) == (plain, None)
+    assert consulted(plain) == (plain, None)
     with pytest.raises(InputError, match="holds no structure head"):
         Witness(plain)
-    assert _consulted(None) == (None, None)
+    assert consulted(None) == (None, None)
 
 
 def test_windows_without_effects_or_on_rough_ground_teach_nothing(tmp_path: Path) -> None:

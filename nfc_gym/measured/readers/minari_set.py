@@ -7,7 +7,8 @@ that action i answers to, so the episode's last observation, which no action fol
 are left out.
 
 `time` is `infos.time` where that was recorded, else the row times the environment's control interval `dt`, for which
-the environment must be registered here; its own program is run, never one that the data set names.
+the environment must be registered here; its own program is run, never one that the data set names. Where neither is
+known there is no `time`, and the mapping says `time: {interval: S}`, the seconds of a control step.
 """
 
 import functools

@@ -1,0 +1,224 @@
+"""Commands of neural posteriors: simulate, train, infer; torch is loaded only inside them."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from nfc_gym.cli.outcome import outcome
+from nfc_gym.core import InputError
+
+if TYPE_CHECKING:
+    from nfc_gym.inference.posterior import Window
+
+
+def simulate(
+    ctx: typer.Context,
+    environment: Annotated[str, typer.Argument(metavar="ID", help="For instance nfc_gym/JackalFlat-v0.")],
+    windows: Annotated[int, typer.Option(metavar="N", min=1, help="How many windows.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for manifest.json and the shards.")],
+    seed: Annotated[int, typer.Option(min=0, help="The same arguments and seed give the same bits.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, max=1024, help="Processes; 0 takes all cores.")] = 0,
+    effects: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of windows with an effect that the model lacks.")
+    ] = 0.5,
+    proposal: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw psi from this (.npz of psi, or a posterior) and not from the prior."),
+    ] = None,
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            metavar="POLICY",
+            help="Moves some windows: .safetensors of `nfc-gym pretrain`, an id (its packaged policy), TorchScript "
+            "(.pt), or .npz of a perceptron.",
+        ),
+    ] = None,
+    policy_share: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of windows that it moves.")
+    ] = 0.5,
+    motor: Annotated[
+        float,
+        typer.Option("--motor-noise", metavar="SD", min=0, max=1, help="Of motors, a share of the actions' range."),
+    ] = 0.02,
+    maps: Annotated[bool, typer.Option("--maps", help="Keep the elevation maps too, 64 KB a window.")] = False,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Use a Ray cluster: its address, auto, or local.")
+    ] = None,
+) -> None:
+    """Make a training set: windows of simulated motion with the psi, the effect and the terrain that made each.
+
+    Each window is simulated under its own psi, drawn from the prior, on its own ground, excited richly or moved by a
+    policy, and half of the windows have an effect that the model lacks (friction in a joint, a payload, slip ...): what
+    that adds to a control step is the residual delta_s to be learned. Windows that come apart are drawn anew.
+
+    The same arguments and seed give the same bits with any --jobs. Interrupted, even killed, the same command goes on:
+    finished shards stay. DIR holds manifest.json, which says what every array is, and shard_00000.safetensors, ...;
+    nfc_gym.inference.windows.Windows(DIR) reads them. A sequential round draws psi from --proposal.
+
+    Example: nfc-gym simulate nfc_gym/JackalFlat-v0 --windows 100000 --out windows/jackal
+    """
+    with outcome(ctx, resumes=True):
+        from nfc_gym.simulate import simulate as run
+
+        mover = policy
+        if policy is not None and Path(policy).suffix.lower() in ("", ".safetensors"):
+            from nfc_gym.adaptation import load_policy
+
+            mover = load_policy(policy).perceptron()  # plain arrays: any process can be sent them
+        run(
+            environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=proposal, policy=mover,
+            policy_share=policy_share, motor=motor, ray=ray, console=Console(),
+        )  # fmt: skip
+        if maps:
+            from nfc_gym.simulate.maps import keep_maps
+
+            keep_maps(out, jobs, Console())
+
+
+def train(
+    ctx: typer.Context,
+    windows: Annotated[Path, typer.Argument(metavar="DIR", help="What `nfc-gym simulate` wrote.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.safetensors", help="The posterior.")],
+    encoder: Annotated[str, typer.Option(help="Of the motion: tcn, nn, qmc-rff, qmc-fks, none.")] = "tcn",
+    density: Annotated[str, typer.Option(help="Of psi: score (diffusion), mixture, flow (splines).")] = "score",
+    delta_s: Annotated[bool, typer.Option(help="Infer the residual dynamics too.")] = True,
+    maps: Annotated[
+        bool, typer.Option("--maps", help="See the elevation map; needs windows simulated with --maps.")
+    ] = False,
+    structure: Annotated[
+        bool,
+        typer.Option("--structure", help="In place of a posterior: a head for close-loop, which family it lacks."),
+    ] = False,
+    noise: Annotated[
+        float, typer.Option(metavar="FACTOR", min=0, help="Times the sensor noise that the windows' manifest assumes.")
+    ] = 1.0,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the windows, at most.")] = 100,
+    batch: Annotated[int, typer.Option(min=1, help="Windows a step.")] = 256,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first weights, the order and the noise.")] = 0,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto is a GPU where there is one.")] = "auto",
+) -> None:
+    """Train a posterior: from a window of motion to a distribution over psi (and delta_s) that could have made it.
+
+    Done once a robot; `nfc-gym infer` then takes milliseconds a window. A twentieth of the windows is held out, and the
+    weights kept are those of the epoch that did best on it. Interrupted, even killed, the same command goes on: the
+    state lies in FILE.safetensors.training, which may be deleted at the end.
+
+    What the motion does not show comes back as wide as the prior, however long one trains: simulate motion like the one
+    that you will log.
+
+    With --structure the file holds a structure head instead: shown motion and what a calibrated model without effects
+    misses of it, it says which family of effects is at work; `nfc-gym close-loop --posterior` then looks there first.
+
+    Example: nfc-gym train windows/jackal --out jackal.safetensors
+    """
+    with outcome(ctx, resumes=True):
+        from nfc_gym.core import MissingExtra
+        from nfc_gym.inference.windows import Manifest
+        from nfc_gym.simulate.machine import Machine
+
+        try:
+            from nfc_gym.inference import jobs
+        except ImportError as e:
+            raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
+        from nfc_gym.inference.config import NetworkConfig
+        from nfc_gym.inference.progress import Spoken
+        from nfc_gym.inference.space import PriorBox
+        from nfc_gym.inference.train import TrainConfig
+
+        machine = Machine(Manifest.read(windows).environment)
+        prior = PriorBox.of(machine.space, machine.kind.name)
+        config = NetworkConfig(
+            encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
+        )
+        training, how = TrainConfig(epochs=epochs, batch=batch, seed=seed), {"report": Spoken(), "noise": noise}
+        if structure:
+            from nfc_gym.simulate.teach import train_structure
+
+            done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
+        else:
+            done = jobs.train_posterior(windows, prior, out, config, training, device=device, **how)
+        if done.best:
+            said = f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
+        else:
+            said = "nothing that was learned held on the windows held out: simulate more of them"
+        typer.echo(f"{out}: {said} ({done.seconds:.0f} s)")
+
+
+def infer(
+    ctx: typer.Context,
+    posterior: Annotated[Path, typer.Argument(metavar="FILE.safetensors", help="What `nfc-gym train` wrote.")],
+    window: Annotated[
+        Path,
+        typer.Argument(
+            metavar="WINDOW", help=".npz with `states` (n + 1, s) and `actions` (n, a); or a mapping file of logs."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help=".npz: the draws; .safetensors: the posterior given this window."),
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, help="Draws.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    log: Annotated[str | None, typer.Option(metavar="NAME", help="Of a mapping's logs; default the first.")] = None,
+    until: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where the window ends in that log.")] = None,
+) -> None:
+    """Say what psi could have made a window of motion, and draw from that posterior.
+
+    `states` are `obs["proprio"]` of the robot at each control step and `actions` what was commanded, in [-1, 1], both
+    in the order of the training set's manifest; with a posterior that sees maps, `elevation` (128, 128) too. A window
+    longer than the training set's counts from its end. The table gives each parameter's median and 90 % interval; one
+    that the window does not show stays as wide as the prior, and is marked.
+
+    A mapping file (or the folder that RecordLog wrote) names logs instead; what the robot would have observed is then
+    made of their channels, for robots that feel no forces: Jackal, Quadcopter, Quadruped.
+
+    Either kind of --out goes into RandomizePsi, into `nfc-gym simulate --proposal` and into `nfc-gym close-loop
+    --posterior`.
+
+    Example: nfc-gym infer jackal.safetensors window.npz --out psi.npz
+    """
+    with outcome(ctx):
+        from rich.table import Table
+
+        from nfc_gym.core import MissingExtra
+
+        try:
+            from nfc_gym.inference import jobs
+        except ImportError as e:
+            raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
+
+        mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
+        seen = _window(posterior, window, log, until) if mapped else window
+        _, found = jobs.infer(posterior, seen, samples=samples, seed=seed, out=out)
+        table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
+        for each in found:
+            note = "  not shown" if each.width >= jobs.AS_WIDE else ""
+            interval = f"{each.low:.4g} to {each.high:.4g}"
+            table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
+        Console(highlight=False, width=None if sys.stdout.isatty() else 140).print(table)
+
+
+def _window(posterior: Path, mapping: Path, log: str | None, until: float | None) -> "Window":
+    """The window of motion that a posterior wants, from a log of a mapping."""
+    from nfc_gym.inference.checkpoint import load as read
+    from nfc_gym.inference.posterior import Window
+    from nfc_gym.measured.dataset import load
+    from nfc_gym.measured.states import estimate_states
+    from nfc_gym.simulate.machine import Machine
+    from nfc_gym.simulate.observed import commands, observed
+
+    environment = read(posterior)[2].get("environment")
+    if environment is None:
+        raise InputError(f"{posterior}: does not say of which environment it is: give the window as an .npz")
+    logs = {each.name: each for each in load(mapping / "mapping.yaml" if mapping.is_dir() else mapping).logs}
+    if log is not None and log not in logs:
+        raise InputError(f"{mapping}: no log {log!r}; there are: {', '.join(logs)}")
+    chosen = logs[log] if log is not None else next(iter(logs.values()))
+    machine = Machine(environment)
+    states = estimate_states(machine.model, chosen, raw=True)
+    end = len(chosen) if until is None else int((chosen.time <= until + 1e-9).sum())
+    parts = (chosen.time, states.qpos, states.qvel, commands(machine, chosen.controls))
+    return Window(*observed(machine, *(part[:end] for part in parts)))

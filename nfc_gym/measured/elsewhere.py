@@ -1,0 +1,76 @@
+"""Fits that begin elsewhere: where bodies touch, least squares end in one of many hollows, and not in the deepest.
+
+An ant's legs trade mass with one another: fits of the same logs that began elsewhere end with hips lighter by a tenth,
+and the one that expects its own errors best is nearer to the truth than the one whose errors are smallest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured.box import box
+from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.metric import Metric, metric
+from nfc_gym.measured.problem import Problem
+from nfc_gym.physics.rollout import Plant
+
+Array = NDArray[np.float64]
+STARTS = 3
+_AWAY = 0.3  # standard deviation of the starts about a fit, in scaled parameters
+_ROUNDS = 10  # iterations of each fit
+
+
+@dataclass(frozen=True)
+class Hollows:
+    """Where fits of one model to the same data ended.
+
+    Attributes:
+      x: (size,) the likeliest.
+      open: (size,) root mean square distance of the others from it: what the search for it leaves open.
+    """
+
+    x: Array
+    open: Array
+
+
+def hollows(
+    problem: Problem,
+    under: Metric,
+    extra: Array,
+    found: Fit,
+    seed: int,
+    others: tuple[Array, ...] = (),
+    starts: int = STARTS,
+    tick: Callable[[int], None] = lambda start: None,
+) -> Hollows:
+    """Fit again from starts about a fit, and keep the likeliest, each by the noise that it expects itself.
+
+    Args:
+      problem: measured blocks; where nothing touches, the fit at hand is the answer.
+      under: metric to fit under.
+      extra: (m,) its slack, which all share.
+      found: the fit at hand.
+      seed: of the starts.
+      others: (size,) each, starts besides.
+      starts: how many are drawn.
+      tick: called with the number of each start, from 1.
+    """
+    if not problem.rough:
+        return Hollows(found.x, np.zeros(len(found.x)))
+    plant, limits = found.plant, box(found.plant)
+    around = np.random.default_rng(seed).normal(size=(starts, len(limits.scale)))
+    z = np.clip(limits.at(found.x) + _AWAY * around, limits.floor, limits.roof)
+    ends = [found.x]
+    for number, start in enumerate([*limits.x(z, found.x), *others], 1):
+        tick(number)
+        ends.append(fit(problem, under, plant, start, _ROUNDS).x)
+    best = ends.pop(int(np.argmin([surprise(problem, extra, plant, x) for x in ends])))
+    return Hollows(best, np.sqrt(((np.stack(ends) - best) ** 2).mean(0)))
+
+
+def surprise(problem: Problem, extra: Array, plant: Plant, x: Array) -> float:
+    """Of a model at x (size,) by the noise that it expects itself and slack (m,): `Metric.surprise` of all blocks."""
+    own = metric(problem, problem.covariance(plant, x), extra)
+    return float(own.surprise(problem.residual(plant, x[None])).sum())

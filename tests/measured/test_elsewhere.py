@@ -1,0 +1,68 @@
+"""Fits that begin elsewhere: the likeliest hollow is found, and the others say what is open."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nfc_gym.measured.elsewhere import hollows
+from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.metric import metric
+from nfc_gym.measured.problem import Columns, Problem
+
+
+class Wells(Problem):
+    """Errors x^2 - 1 + tilt x: hollows near -1 and 1, the deeper one near -1 for a positive tilt.
+
+    Models beyond zero expect `loud` times the noise of the others.
+    """
+
+    def __init__(self, tilt: float, loud: float = 1.0, rough: bool = True) -> None:
+        self.tilt, self.loud, self.rough = tilt, loud, rough
+        self.mask = np.ones((10, 2), bool)
+        self.log_of, self.time_of, self.names = np.zeros(10, int), np.arange(10.0), ("log",)
+        self.columns = Columns(("a", "b"), ("1", "1"), np.zeros(2), ("joint:j",) * 2)
+
+    def residual(self, plant: Any, x: np.ndarray) -> np.ndarray:
+        depth = np.stack([x[:, 0] ** 2 - 1, self.tilt * (x[:, 0] + 1)], -1)
+        return np.repeat(depth[:, None], 10, 1)
+
+    def covariance(self, plant: Any, x: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(0.1**2 * (self.loud if x[0] > 0 else 1.0) ** 2 * np.eye(2), (10, 2, 2))
+
+    def take(self, index): ...  # type: ignore[override]
+    def synthetic(self, plant, x, rng): ...  # type: ignore[override]
+
+
+def stood(problem: Wells, x: float) -> tuple[Any, Fit]:
+    space = SimpleNamespace(low=np.array([-2.0]), high=np.array([2.0]), free=np.ones(1, bool))
+    same = lambda x: x  # noqa: E731
+    plant: Any = SimpleNamespace(space=space, effects=(), null=np.zeros(1), chart=same, unchart=same, size=1)
+    under = metric(problem, problem.covariance(plant, np.zeros(1)))
+    white = under.whiten(problem.residual(plant, np.array([[x]])))[0]
+    return under, Fit(plant, np.array([x]), white, np.zeros((*white.shape, 1)))
+
+
+def test_the_deeper_hollow_is_kept_and_the_other_says_what_is_open() -> None:
+    problem = Wells(0.1)
+    under, shallow = stood(problem, 1.0)
+    found = hollows(problem, under, np.zeros(2), shallow, 0, (np.array([-0.8]),))
+    assert found.x == pytest.approx(-1.0, abs=0.02)
+    assert 0.5 < found.open[0] < 2.1  # the fit at hand, at least, is two away
+
+
+@pytest.mark.parametrize(("loud", "end"), [(0.2, 1.0), (1.0, -1.0)])
+def test_the_likeliest_is_not_the_one_with_the_smallest_errors(loud: float, end: float) -> None:
+    """Near 1 an error of 0.02 is left, near -1 none; but who expects a noise of 0.02 is surer than who expects 0.1."""
+    problem = Wells(0.01, loud)
+    under, exact = stood(problem, -1.0)
+    assert hollows(problem, under, np.zeros(2), exact, 0, (np.array([0.9]),)).x == pytest.approx(end, abs=0.02)
+
+
+def test_where_nothing_touches_the_fit_at_hand_is_the_answer() -> None:
+    problem = Wells(0.1, rough=False)
+    under, shallow = stood(problem, 1.0)
+    found = hollows(problem, under, np.zeros(2), shallow, 0, (np.array([-0.8]),))
+    assert found.x == 1.0
+    assert found.open == 0.0
