@@ -162,10 +162,10 @@ class Search:
     def _contest(self, arena: Arena, screen: Screen, begins: bool) -> tuple[list[Screened], Round, Judged | None]:
         """The contest of one round: its screening, what is reported of it, and what it accepted.
 
-        Where a structure head names suspects they compete first, with the families that lead plain screening. All
-        candidates compete where none of these is accepted and something is left to explain, as they do without a head:
-        what it excludes must be found all the same. A quiet round after the first, which has next to nothing left to
-        explain, asks the suspects alone.
+        Where a structure head names suspects they compete first, with the families that lead plain screening, in the
+        first round; all candidates do if none of these is accepted and something is left to explain: what a head
+        excludes must be found all the same. Later rounds mostly accept nothing, and two contests would cost more than
+        one: all candidates compete at once, but where next to nothing is left to explain the suspects alone.
         """
 
         def held(screened: list[Screened], short: int) -> tuple[list[Screened], Round, Judged | None]:
@@ -173,8 +173,8 @@ class Search:
             return screened, *contest.hold()
 
         lookout, quiet = self.lookout, arena.leftover < _QUIET
-        if lookout.suspects is not None:
-            screened = lookout.closer(screen, lookout.first(screen, self.named, begins or not quiet))
+        if lookout.suspects is not None and (begins or quiet):
+            screened = lookout.closer(screen, lookout.first(screen, self.named, begins))
             first = held(screened, self.options.first)
             if first[2] is not None or quiet:
                 return first
