@@ -73,7 +73,7 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     began = time.monotonic()
     seed = _kept(folder / "seed.json", lambda: args.seed if args.seed is not None else secrets.randbits(31))
     print(f"seed {seed} (drawn at run time unless given)", flush=True)
-    course = Course(256, 128, 2, small=True) if args.quick else Course(args.windows, epochs=args.epochs)
+    course = Course(96, 64, 1, small=True) if args.quick else Course(args.windows, epochs=args.epochs)
     rows: list[dict[str, Any]] = []
     for robot in args.robots:
         head = taught(robot, course, folder, seed)
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
 def tasks(robot: str, args: argparse.Namespace, seed: int) -> list[Task]:
     """Single effects, families in an order drawn from the seed; then machines that lack nothing."""
     if args.quick:
-        families, size = ("wind",), Size(3, 0.9, ("wind", "slope"), 1)
+        families, size = ("wind",), Size(3, 0.5, ("wind",), 1)
         return [Task(robot, "single", families, plan.seed_of(seed, robot, "quick"), size)]
     families = np.random.default_rng(plan.seed_of(seed, robot, "order")).permutation(sorted(ROBOTS[robot].kinds))
     chosen = [str(families[i % len(families)]) for i in range(args.trials)]

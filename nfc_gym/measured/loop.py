@@ -42,7 +42,7 @@ from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
-from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, count_named, kept, looked_at, restored
+from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
@@ -218,7 +218,7 @@ def _fold(
     began_table = time.monotonic()
     outcome["identifiability"] = table(known.lens, close, known.stakes)
     tabled = time.monotonic() - began_table
-    outcome["structure"] = None if suspects is None else suspects.told(*map(count_named, (close, pool)), tabled)
+    outcome["structure"] = None if suspects is None else suspects.told(close, pool, tabled)
     advice = advise(bench, [*fitting, *selecting], outcome, known, tell, seed)
     outcome["identifiability"] = advice.rows
     outcome["findings"] += advice.findings

@@ -78,8 +78,9 @@ class Suspects:
             sum_ += self.probabilities[family]
         return tuple(out)
 
-    def told(self, rows: int, of: int, seconds: float) -> dict[str, Any]:
-        """For `report.json`; the identifiability table has so many rows of the pool's, which took so many seconds."""
+    def told(self, close: Sequence[Effect], pool: Sequence[Effect], seconds: float) -> dict[str, Any]:
+        """For `report.json`; the identifiability table has rows for `close`, some of a pool, and took so long."""
+        rows, of = (sum(not e.generic for e in effects) for effects in (close, pool))
         ranked = sorted(self.probabilities.items(), key=lambda pair: -pair[1])
         return {
             "file": self.file, "windows": self.windows, "seconds": self.seconds,
@@ -153,11 +154,6 @@ def looked_at(pool: Sequence[Effect], suspects: Suspects, rounds: Sequence[Any])
     named = {i for r in rounds for i in (*r.accepted, *r.equivalents)}
     families = {i.partition(":")[0] for i in ranked | named} | set(suspects.likely)
     return [e for e in pool if e.family in families]
-
-
-def count_named(pool: Sequence[Effect]) -> int:
-    """How many of a pool may be named as a cause."""
-    return sum(not e.generic for e in pool)
 
 
 def kept(suspects: Suspects) -> dict[str, Any]:

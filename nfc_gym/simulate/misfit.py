@@ -125,7 +125,7 @@ def of_windows(
             expected = predicted(machine, starts, np.clip(psi, space.low, space.high), batch["actions"].astype(float))
             seen = batch["states"] + sd * rng.standard_normal(batch["states"].shape)
             both = shown(machine, seen, expected, sd)
-        fine = np.isfinite(both).all((1, 2))
+        fine = np.asarray(np.isfinite(both).all((1, 2)))
         out.append(np.where(fine[:, None, None], both, 0.0).astype(np.float32))
         good.append(fine)
     return np.concatenate(out), np.concatenate(good)

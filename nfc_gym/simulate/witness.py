@@ -85,7 +85,7 @@ class Witness:
         rng, sd, told = np.random.default_rng(seed), np.array(self.notes["noise"]), []
         for _ in range(_DRAWS):
             noisy = seen + self._lacking(noise) * rng.standard_normal(seen.shape)
-            told.append(told_by(self.network, shown(machine, noisy, predicted, sd), actions))
+            told.append(told_by(self.network, shown(machine, noisy, predicted, sd).astype(float), actions))
         found = combined(np.mean(told, 0), shares_of(self.families, self.notes))
         return dict(zip(self.families, found.tolist(), strict=True))
 
