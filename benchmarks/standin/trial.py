@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,23 @@ _NEAR = 0.9  # of the least X / X_null that counts as acting
 Model = tuple[Plant, Array]
 
 
-def trial(task: Task, folder: Path, threads: int = 1) -> Row:
-    """Run one trial in an empty folder."""
-    began = time.process_time()
+@dataclass(frozen=True)
+class Case:
+    """A machine whose logs lie in a folder: what it hides, how that is judged, X / X_null of it, and its mapping."""
+
+    machine: Machine
+    outside: Outside | None
+    ratio: float
+    mapping: Path
+
+    @property
+    def hidden(self) -> Hidden:
+        """What the machine hides."""
+        return self.machine.hidden
+
+
+def prepared(task: Task, folder: Path) -> Case:
+    """Draw the machine of a trial and write its logs and mapping into an empty folder."""
     rng = np.random.default_rng(task.seed)
     kit = ROBOTS[task.robot]
     psi = draw_psi(kit.psi, rng)
@@ -40,8 +55,17 @@ def trial(task: Task, folder: Path, threads: int = 1) -> Row:
     seeds = [int(s) for s in rng.integers(2**31, size=task.size.logs)]
     exclude = outside.exclude if outside else ()
     mapping = write_case(folder, kit, machine, task.size.seconds, seeds, task.size.only, exclude)
-    report = close_loop(mapping, folder / "report", seed=task.seed % 2**31, jobs=threads)
-    row.hidden, row.seconds = hidden.text, report["seconds"]
+    return Case(machine, outside, row.ratio, mapping)
+
+
+def trial(task: Task, folder: Path, threads: int = 1) -> Row:
+    """Run one trial in an empty folder."""
+    began = time.process_time()
+    kit, row = ROBOTS[task.robot], Row(task.robot, task.group, list(task.families), task.seed)
+    case = prepared(task, folder)
+    machine, hidden, outside, psi = case.machine, case.hidden, case.outside, case.machine.psi
+    report = close_loop(case.mapping, folder / "report", seed=task.seed % 2**31, jobs=threads)
+    row.hidden, row.seconds, row.ratio = hidden.text, report["seconds"], case.ratio
     score(row, report, hidden, outside)
     row.effect, row.psi = estimates(report, hidden), psi_estimates(report, psi, kit.weighed)
     if outside is None:

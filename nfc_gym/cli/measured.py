@@ -13,6 +13,7 @@ from nfc_gym.core import InputError
 
 if TYPE_CHECKING:
     from nfc_gym.measured.checks import Finding
+    from nfc_gym.simulate.witness import Witness
 
 MappingFile = Annotated[
     Path, typer.Argument(metavar="MAPPING.yaml", help="Names the model, its parameters and the logs.")
@@ -80,7 +81,11 @@ def close_loop(
     ] = None,
     posterior: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Start from a posterior of this machine, which `nfc-gym infer --out` wrote."),
+        typer.Option(
+            metavar="FILE",
+            help="Start from a posterior of this machine, which `nfc-gym infer --out` wrote; or the structure head of "
+            "`nfc-gym train --structure`, which says which effects to look at first.",
+        ),
     ] = None,
     time_saved: Annotated[
         bool, typer.Option("--time-saved", help="Calibrate without the posterior too, to say what it saved.")
@@ -90,10 +95,24 @@ def close_loop(
     with outcome(ctx, resumes=True):
         from nfc_gym.measured.loop import close_loop as run
 
+        belief, witness = consulted(posterior)
         run(
-            mapping, out, seed=seed, jobs=jobs, overwrite=overwrite, resume=resume, fold=fold, posterior=posterior,
-            compare=time_saved, console=Console(),
+            mapping, out, seed=seed, jobs=jobs, overwrite=overwrite, resume=resume, fold=fold, posterior=belief,
+            compare=time_saved, witness=witness, console=Console(),
         )  # fmt: skip
+
+
+def consulted(posterior: Path | None) -> "tuple[Path | None, tuple[Witness, Path] | None]":
+    """What of a posterior's file the loop starts from, and its structure head: a file may hold either, or both."""
+    if posterior is None or posterior.suffix.lower() != ".safetensors" or not posterior.is_file():
+        return posterior, None
+    try:
+        from nfc_gym.simulate.witness import Witness, heads
+    except ImportError:
+        return posterior, None  # who opens it says what is missing
+    structure, window = heads(posterior)
+    witness = (Witness(posterior), posterior) if structure else None
+    return posterior if window or not structure else None, witness
 
 
 def predict(

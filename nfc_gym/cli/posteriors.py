@@ -88,6 +88,13 @@ def train(
     maps: Annotated[
         bool, typer.Option("--maps", help="See the elevation map; needs windows simulated with --maps.")
     ] = False,
+    structure: Annotated[
+        bool,
+        typer.Option("--structure", help="In place of a posterior: a head for close-loop, which family it lacks."),
+    ] = False,
+    noise: Annotated[
+        float, typer.Option(metavar="FACTOR", min=0, help="Times the sensor noise that the windows' manifest assumes.")
+    ] = 1.0,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the windows, at most.")] = 100,
     batch: Annotated[int, typer.Option(min=1, help="Windows a step.")] = 256,
     seed: Annotated[int, typer.Option(min=0, help="Of the first weights, the order and the noise.")] = 0,
@@ -101,6 +108,9 @@ def train(
 
     What the motion does not show comes back as wide as the prior, however long one trains: simulate motion like the one
     that you will log.
+
+    With --structure the file holds a structure head instead: shown motion and what a calibrated model without effects
+    misses of it, it says which family of effects is at work; `nfc-gym close-loop --posterior` then looks there first.
 
     Example: nfc-gym train windows/jackal --out jackal.safetensors
     """
@@ -123,8 +133,13 @@ def train(
         config = NetworkConfig(
             encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
         )
-        training = TrainConfig(epochs=epochs, batch=batch, seed=seed)
-        done = jobs.train_posterior(windows, prior, out, config, training, device=device, report=Spoken())
+        training, how = TrainConfig(epochs=epochs, batch=batch, seed=seed), {"report": Spoken(), "noise": noise}
+        if structure:
+            from nfc_gym.simulate.teach import train_structure
+
+            done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
+        else:
+            done = jobs.train_posterior(windows, prior, out, config, training, device=device, **how)
         if done.best:
             said = f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
         else:

@@ -95,13 +95,18 @@ class StoredWindows:
       stored: has `manifest`, a length and `batches(size, seed, rows, names)`, which gives dicts of arrays.
       rows: (k,) which windows; default all.
       maps: read the elevation maps too: `map`, as perceived, and `delta_e`, truth minus perceived.
+      noise: what multiplies the sensor noise that the set's manifest assumes.
 
     Raises:
-      InputError: the set holds no maps and they are asked for.
+      InputError: the set holds no maps and they are asked for, or a noise below 0.
     """
 
-    def __init__(self, stored: Any, rows: NDArray[np.integer] | None = None, maps: bool = False) -> None:
-        self.stored, self.manifest, self.maps = stored, stored.manifest, maps
+    def __init__(
+        self, stored: Any, rows: NDArray[np.integer] | None = None, maps: bool = False, noise: float = 1.0
+    ) -> None:
+        if not 0 <= noise < np.inf:
+            raise InputError(f"windows: noise multiplies the sensors' own, want 0 or more, got {noise!r}")
+        self.stored, self.manifest, self.maps, self.noise = stored, stored.manifest, maps, noise
         self.rows = np.arange(len(stored)) if rows is None else rows
         missing = [n for n in _MAPS if n not in stored.names]
         if maps and missing:
@@ -113,13 +118,14 @@ class StoredWindows:
 
     def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
         """See `WindowSet.batches`; None is an order of its own, the same each time."""
-        for arrays in self.stored.batches(size, 0 if seed is None else seed, self.rows, self.names):
+        for arrays in self.stored.batches(size, 0 if seed is None else seed, self.rows, self.names, self.noise):
             yield {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
 
     def split(self, share: float) -> tuple["StoredWindows", "StoredWindows"]:
         """The first windows, and the last `share` of them: to train on and to hold out."""
         cut = len(self) - max(1, round(share * len(self)))
-        first, last = (StoredWindows(self.stored, rows, self.maps) for rows in (self.rows[:cut], self.rows[cut:]))
+        parts = (self.rows[:cut], self.rows[cut:])
+        first, last = (StoredWindows(self.stored, rows, self.maps, self.noise) for rows in parts)
         return first, last
 
 

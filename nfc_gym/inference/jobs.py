@@ -44,7 +44,7 @@ def device_of(name: str) -> torch.device:
 
 def train_posterior(
     folder: Path, prior: PriorBox, out: Path, config: NetworkConfig, training: TrainConfig, *, device: str = "auto",
-    report: Report = quiet,
+    report: Report = quiet, noise: float = 1.0,
 ) -> Outcome:  # fmt: skip
     """Train a network on a folder of windows into a checkpoint; a run that was stopped goes on.
 
@@ -56,6 +56,7 @@ def train_posterior(
       training: see `TrainConfig`.
       device: `auto`, `cpu`, `cuda`.
       report: is told of the progress.
+      noise: what multiplies the sensor noise that the windows' manifest assumes, for sensors that are better or worse.
 
     Raises:
       InputError: no such windows, windows without maps where the network needs them, or a name of another ending.
@@ -71,7 +72,7 @@ def train_posterior(
     place = place_of(about.state_names)
     sizes = Sizes(about.horizon, len(about.state_names), len(about.action_names), place=place)
     network = Network(config, sizes, prior, training.seed)
-    first, held_out = StoredWindows(stored, maps=config.elevation).split(HELD_OUT)
+    first, held_out = StoredWindows(stored, maps=config.elevation, noise=noise).split(HELD_OUT)
     state = out.with_name(out.name + ".training")
     state.mkdir(parents=True, exist_ok=True)
     outcome = train(network, first, held_out, training, folder=state, device=device_of(device), report=report)
@@ -79,6 +80,7 @@ def train_posterior(
         "environment": about.environment, "states": list(about.state_names), "windows": len(stored),
         "best": outcome.best, "stopped": outcome.stopped,
         "seconds": outcome.seconds, "held_out": outcome.held_out, "start": outcome.start,
+        "noise": [noise * sd for sd in about.state_noise],
     }  # fmt: skip
     checkpoint.save(out, network.cpu(), notes=notes)
     return outcome

@@ -18,6 +18,7 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.segments import Layout, servos
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, estimate_states
+from nfc_gym.measured.suspects import Witness
 from nfc_gym.physics.effects import complete_inertia, propose
 from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrides
 from nfc_gym.physics.effects.conditions import conditioned
@@ -38,6 +39,7 @@ class Bench:
       states: of every log, by name.
       belief: of a posterior that calibration starts from.
       compare: calibrate from nominal values too, to say what that saved.
+      witness: a structure head that is asked about the fit logs, and the name of its file.
     """
 
     dataset: Dataset
@@ -46,6 +48,7 @@ class Bench:
     states: dict[str, States]
     belief: Belief | None = None
     compare: bool = False
+    witness: tuple[Witness, str] | None = None
 
     @property
     def mode(self) -> str:
@@ -61,13 +64,20 @@ class Bench:
             return kind(model, logs, states, segments.length, max(1, -(-sum(map(len, self.dataset.logs)) // _SAMPLES)))
         return self.rollouts(logs, states, most)
 
-    def rollouts(self, logs: Sequence[Log], states: Sequence[States], most: int | None = None) -> RolloutProblem:
-        """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs."""
+    def rollouts(
+        self, logs: Sequence[Log], states: Sequence[States], most: int | None = None, length: float | None = None
+    ) -> RolloutProblem:
+        """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs.
+
+        Args:
+          length: s, of each segment, compared at its end; default as the mapping says.
+        """
         segments, model = self.dataset.mapping.segments, self.plant.model
+        length, horizons = (segments.length, segments.horizons) if length is None else (length, (length,))
         controls = self.dataset.mapping.controls
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")
-        layout = Layout(segments.length, segments.history, segments.horizons, segments.length, model.opt.timestep)
+        layout = Layout(length, segments.history, horizons, length, model.opt.timestep)
         whole = RolloutProblem(
             model, logs, states, layout, servos(model, laws), linear, settle=segments.start == "settled"
         )

@@ -8,6 +8,7 @@ import numpy as np
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screen, Screened, screen_all
+from nfc_gym.measured.suspects import Suspects
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.conditions import MARK
 
@@ -20,6 +21,9 @@ _KEEP = 60  # candidates that are screened again in every round, whatever they g
 _SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
 _SURE = 2  # of them, whose gain by straight lines counts where the look around finds less
 _PURSUED = 40  # candidates that a smooth problem takes a few steps further before it shortlists
+_FIRST = 10  # of the suspected families' candidates that are screened in full, besides the best of each family
+_BESIDE, _MOST_BESIDE = 2, 4  # families that lead plain screening and join the suspected ones: always, and at most
+_ALIKE = 0.5  # of the best gain there: what a family beyond the first two must reach to join them
 
 
 class Lookout:
@@ -29,11 +33,19 @@ class Lookout:
       problem: on the fit logs.
       rng: of the draws with which rough problems look around.
       say: progress.
+      suspects: what a structure head holds possible; None where there is no head.
     """
 
-    def __init__(self, problem: Problem, rng: np.random.Generator, say: Callable[[str], None]) -> None:
-        self.problem, self.rng, self.say = problem, rng, say
+    def __init__(
+        self,
+        problem: Problem,
+        rng: np.random.Generator,
+        say: Callable[[str], None],
+        suspects: Suspects | None = None,
+    ) -> None:
+        self.problem, self.rng, self.say, self.suspects = problem, rng, say, suspects
         self.hopeless: set[str] = set()
+        self._glance: tuple[Screen, list[Screened]] | None = None  # the last one at all candidates, and for whom
 
     def screen(self, screen: Screen, pool: Sequence[Effect], field: int | None = None) -> list[Screened]:
         """Candidates that are not at work yet, by what they gain as far as straight lines tell, best first.
@@ -42,14 +54,38 @@ class Lookout:
           field: how many of a large pool are screened in full, besides the best of each family.
         """
         field = field or (_COSTLY if self.problem.rough else _FIELD)
-        taken = {_plain(e) for e in screen.current.plant.effects}
-        left = [e for e in pool if _plain(e) not in taken and (e.id not in self.hopeless or len(e.where) > 1)]
+        left = self._left(screen, pool)
         self.say(f"screening {len(left)} candidates")
         found = screen_all(screen, self._promising(screen, left, field))
         # Places that show nothing at all are not looked at again; sets of places stay, since they stand for many.
         floor = 1e-3 * float(screen.projected @ screen.projected)
         self.hopeless |= {f.effect.id for f in found[_KEEP:] if f.gain < floor}
         return found
+
+    def first(self, screen: Screen, pool: Sequence[Effect], glance: bool) -> list[Screened]:
+        """The same of the suspected families alone, and of those that lead a glance at all candidates.
+
+        Args:
+          glance: look at all candidates on some of the blocks, so that a head which is wrong hides nothing that plain
+            screening sees. Without it the suspected families are all.
+        """
+        assert self.suspects is not None
+        left, likely = self._left(screen, pool), set(self.suspects.likely)
+        chosen = [e for e in left if e.family in likely]
+        if glance:
+            self.say(f"glancing at {len(left)} candidates")
+            best = list({r.effect.family: r for r in reversed(self._rough(screen, left))}.values())[::-1]
+            beside = [r for r in best if r.gain > 0][:_MOST_BESIDE]
+            beside = [r for i, r in enumerate(beside) if i < _BESIDE or r.gain > _ALIKE * beside[0].gain]
+            likely |= {r.effect.family for r in beside}
+            chosen = [e for e in left if e.family in likely]
+        self.say(f"screening {len(chosen)} candidates of {', '.join(sorted(likely)) or 'no family'} first")
+        return screen_all(screen, self._promising(screen, chosen, _FIRST))
+
+    def _left(self, screen: Screen, pool: Sequence[Effect]) -> list[Effect]:
+        """Candidates that are not at work yet and may show."""
+        taken = {_plain(e) for e in screen.current.plant.effects}
+        return [e for e in pool if _plain(e) not in taken and (e.id not in self.hopeless or len(e.where) > 1)]
 
     def closer(self, screen: Screen, found: list[Screened]) -> list[Screened]:
         """The leading candidates by what they gain in truth, then the rest as screening has them."""
@@ -87,11 +123,22 @@ class Lookout:
         thin = self._thinned(screen)
         if len(pool) <= field or thin is screen:
             return pool
-        rough = screen_all(thin, pool, every_size=not self.problem.rough)
+        rough = self._rough(screen, pool)
         least = _FAINT * rough[0].gain if self.problem.rough else 0.0
         families = {r.effect.family: r.effect for r in reversed(rough) if r.gain >= least}
         best = [r.effect for r in rough[:field]]
         return best + [e for e in families.values() if e not in best]
+
+    def _rough(self, screen: Screen, pool: list[Effect]) -> list[Screened]:
+        """Candidates by what they gain on some of the blocks; what the last glance saw is not rolled out anew."""
+        of, seen = self._glance if self._glance is not None else (None, [])
+        known = {id(r.effect): r for r in seen} if of is screen else {}
+        thin = self._thinned(screen)
+        new = screen_all(thin, [e for e in pool if id(e) not in known], every_size=not self.problem.rough)
+        found = sorted([*new, *(known[id(e)] for e in pool if id(e) in known)], key=lambda s: -s.gain)
+        if self.suspects is not None:
+            self._glance = screen, [*known.values(), *new]
+        return found
 
 
 def _times(factor: float, found: Screened, least: float) -> Screened:

@@ -42,6 +42,7 @@ from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
+from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]
@@ -70,6 +71,7 @@ def close_loop(
     fold: str | None = None,
     posterior: Path | None = None,
     compare: bool = False,
+    witness: tuple[Witness, Path] | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
     """Close the loop on the logs that a mapping file names.
@@ -86,6 +88,8 @@ def close_loop(
       posterior: of psi given a window of this machine's motion (see `belief`): calibration starts from it, and the
         report shows what it inferred beside what was fitted.
       compare: calibrate once more from nominal values, to say how much time the posterior saved.
+      witness: a structure head (`simulate.witness`) and its file: the families of effects that it holds possible,
+        given the fit logs, are looked at first (see `suspects`), and the report says what it held.
       console: where progress goes; None is silent.
 
     Returns:
@@ -102,8 +106,10 @@ def close_loop(
         bench = make_bench(dataset, jobs)
         if posterior is not None:
             bench.belief, bench.compare = read_belief(posterior, bench.plant.space, seed), compare
+        if witness is not None:
+            bench.witness = witness[0], witness[1].name
         _require_stable(bench)
-        key = _key(bench, seed, mapping, *([posterior] if posterior else []))
+        key = _key(bench, seed, mapping, *([posterior] if posterior else []), *([witness[1]] if witness else []))
         return _close_loop(bench, dataset, out, seed, key, overwrite, resume, fold, console)
 
 
@@ -204,10 +210,15 @@ def _fold(
     calibrated, extended, step = _final(run, found, whole)
     final = calibrated, extended
     pool = candidates(bench, [*fitting, *selecting])
+    suspects = restored(stages.get("suspects"))
+    close = pool if suspects is None else looked_at(pool, suspects, found.rounds)
     known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
     outcome = report(bench, fold, found, final, step, bench.problem(verifying), whole, seed, tell)
     outcome["posterior"] = compared(bench, stages.get("calibrated"), extended, whole, outcome["parameters"])
-    outcome["identifiability"] = table(known.lens, pool, known.stakes)
+    began_table = time.monotonic()
+    outcome["identifiability"] = table(known.lens, close, known.stakes)
+    tabled = time.monotonic() - began_table
+    outcome["structure"] = None if suspects is None else suspects.told(close, pool, tabled)
     advice = advise(bench, [*fitting, *selecting], outcome, known, tell, seed)
     outcome["identifiability"] = advice.rows
     outcome["findings"] += advice.findings
@@ -238,7 +249,7 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     calibrated = stand(work, metric(work, sigma), plant, x)
     pool = candidates(bench, fitting)
     data = Data(work, sigma), Data(select, select.covariance(plant, x))
-    search = Search(*data, pool, Options(seed=run.seed), run.say)
+    search = Search(*data, pool, Options(seed=run.seed), run.say, _suspects(run, fitting, x))
     if run.stages.get("found") is None:
         _keep_found(run.stages, _hunt(run, search, calibrated, pool))
     kept = run.stages.get("found")
@@ -250,6 +261,19 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     found = Found(calibrated, extended, np.array(kept["slack"], float), list(state.rounds), **names)
     found.rest = search.rest(found)
     return found
+
+
+def _suspects(run: _Run, fitting: Sequence[Log], x: Array) -> Suspects | None:
+    """What the structure head says of the fit logs and the calibrated model, asked once a run; None without a head."""
+    if run.bench.witness is None:
+        return None
+    if run.stages.get("suspects") is None:
+        witness, file = run.bench.witness
+        found = ask(witness, file, run.bench, fitting, x, run.seed)
+        told = ", ".join(f"{f} {found.probabilities[f]:.2f}" for f in (NONE, *found.likely) if f in found.probabilities)
+        run.say(f"{file}, asked about {found.windows} windows: {told}")
+        run.stages.put("suspects", kept(found))
+    return restored(run.stages.get("suspects"))
 
 
 def _hunt(run: _Run, search: Search, calibrated: Fit, pool: list[Effect]) -> Found:

@@ -49,6 +49,7 @@ def render(report: Row, shown: Row) -> str:
         proposals=[_effect(e, report["proposals"]) for e in report.get("proposals") or []],
         parameters=[_parameter(p) for p in report.get("parameters") or []],
         posterior=story.believed(report.get("posterior")),
+        structure=story.suspected(report),
         rounds=[_round(r) for r in report.get("rounds") or []],
         places=_misfit_rows(misfit, "place", stages),
         logs_misfit=_misfit_rows(misfit, "log", stages),

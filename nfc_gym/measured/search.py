@@ -18,8 +18,9 @@ from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.remainder import CLEARLY, SILENT, LawSearch, Remainder
 from nfc_gym.measured.rounds import Contest, Round
-from nfc_gym.measured.screen import Screen
+from nfc_gym.measured.screen import Screen, Screened
 from nfc_gym.measured.settle import settle, slack
+from nfc_gym.measured.suspects import Suspects
 from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.law import Law
@@ -29,6 +30,7 @@ Array = NDArray[np.float64]
 Say = Callable[[str], None]
 _AGAIN = 4  # iterations of the first round's fit, which starts from a calibrated model
 _GENERICS = 12  # generic alternatives that are screened in full, besides the best of each kind
+_QUIET = 0.02  # nats a number beyond the noise, below which only suspects are looked at: half of what is searched for
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Options:
       swaps: exchanges of an earlier law at most.
       worth: share of the excess that an effect must explain to be named.
       short: candidates refitted in each round.
+      first: of the suspects, where a structure head names them.
       seed: of bootstrap and chance draws.
     """
 
@@ -47,6 +50,7 @@ class Options:
     swaps: int = 2
     worth: float = 0.02
     short: int = 8
+    first: int = 5
     seed: int = 0
 
 
@@ -94,14 +98,22 @@ class Found:
 class Search:
     """One greedy search on fit and selection problems."""
 
-    def __init__(self, fit_data: Data, select: Data, candidates: Sequence[Effect], options: Options, say: Say) -> None:
+    def __init__(
+        self,
+        fit_data: Data,
+        select: Data,
+        candidates: Sequence[Effect],
+        options: Options,
+        say: Say,
+        suspects: Suspects | None = None,
+    ) -> None:
         self.fit_data, self.select = fit_data, select
         self.named = [e for e in candidates if not e.generic]
         self.generics = [e for e in candidates if e.generic and not isinstance(e, Law)]
         self.laws = [e for e in candidates if isinstance(e, Law)]
         self.options, self.say = options, say
         self.rng = np.random.default_rng(options.seed)
-        self.lookout = Lookout(fit_data.problem, self.rng, say)
+        self.lookout = Lookout(fit_data.problem, self.rng, say, suspects)
 
     def settle(self, plant: Plant, x: Array, polished: bool = False) -> Arena:
         """The arena of the round that starts from a model, which is refitted first."""
@@ -125,9 +137,7 @@ class Search:
         while True:
             arena = self._begin(state)
             screen = Screen(self.fit_data.problem, arena.under, arena.current)
-            screened = self.lookout.closer(screen, self.lookout.screen(screen, self.named))
-            contest = Contest(arena, screen, screened, self.options.short, self.options.worth, self.named)
-            outcome, best = contest.hold()
+            screened, outcome, best = self._contest(arena, screen, not rounds)
             rounds.append(outcome)
             full = len(arena.current.plant.effects) >= self.options.most
             better = best.fitted if best is not None and not full else self._exchange(arena, rounds)
@@ -148,6 +158,28 @@ class Search:
             arena = self.settle(bare.plant, bare.x, polished=True)
         nearest = screened[0].effect.id if screened else None
         return Found(calibrated, arena.current, arena.extra, rounds, label, nearest, dropped)
+
+    def _contest(self, arena: Arena, screen: Screen, begins: bool) -> tuple[list[Screened], Round, Judged | None]:
+        """The contest of one round: its screening, what is reported of it, and what it accepted.
+
+        Where a structure head names suspects they compete first, with the families that lead plain screening, in the
+        first round; all candidates do if none of these is accepted and something is left to explain: what a head
+        excludes must be found all the same. Later rounds mostly accept nothing, and two contests would cost more than
+        one: all candidates compete at once, but where next to nothing is left to explain the suspects alone.
+        """
+
+        def held(screened: list[Screened], short: int) -> tuple[list[Screened], Round, Judged | None]:
+            contest = Contest(arena, screen, screened, short, self.options.worth, self.named)
+            return screened, *contest.hold()
+
+        lookout, quiet = self.lookout, arena.leftover < _QUIET
+        if lookout.suspects is not None and (begins or quiet):
+            screened = lookout.closer(screen, lookout.first(screen, self.named, begins))
+            first = held(screened, self.options.first)
+            if first[2] is not None or quiet:
+                return first
+            self.say("none of the suspects explains it: all candidates compete")
+        return held(lookout.closer(screen, lookout.screen(screen, self.named)), self.options.short)
 
     def rest(self, found: Found) -> Remainder:
         """What the named effects left, and the laws that are believed of it."""

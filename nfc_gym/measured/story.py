@@ -100,6 +100,28 @@ def _begun(posterior: dict[str, Any]) -> list[str]:
     return out
 
 
+def suspected(report: dict[str, Any]) -> dict[str, Any] | None:
+    """What a structure head held possible beside what was found: sentences, and a row for each family of either."""
+    told = report.get("structure")
+    if not told:
+        return None
+    families, first = told.get("families") or {}, told.get("looked_at_first") or []
+    found = [e.get("family") for e in report.get("effects") or []]
+    shown = [f for f in families if f in {"none", *first, *found}] + [f for f in found if f not in families]
+    rows = [{"family": f, "probability": families.get(f), "first": f in first, "found": f in found} for f in shown]
+    sentences = [
+        f"{told.get('file')} was asked about {counted(told.get('windows') or 0, 'window')} of the fit logs, in "
+        f"{quantity(told.get('seconds'), 's')}. Its families competed first, beside those that lead plain screening; "
+        "all others competed where these left something to explain."
+    ]
+    if told.get("left_out"):
+        sentences.append(
+            f"The identifiability table leaves out {counted(told['left_out'], 'candidate')} of families that were not "
+            f"looked at closely, which saved about {quantity(told.get('seconds_spared'), 's')}."
+        )
+    return {"sentences": sentences, "rows": rows}
+
+
 def changes(report: dict[str, Any]) -> list[Change]:
     """Errors of every group at the longest horizon at which the calibrated model has one."""
     error = report.get("error") or {}

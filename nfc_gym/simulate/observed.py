@@ -42,26 +42,42 @@ def observed(machine: Machine, time: Array, qpos: Array, qvel: Array, ctrl: Arra
       InputError: a robot whose observation a log cannot say, samples at other times than control steps, or commands
         that no action makes.
     """
-    machine = Machine(machine.environment.replace("Rough", "Flat"))  # nothing that is read here depends on the ground
+    require_unfeeling(machine)
+    rows = _grid(time, machine.dt)
+    actions = actions_of(machine, ctrl[rows[:-1]])
+    return proprio(machine, qpos[None, rows], qvel[None, rows], actions[None])[0], actions
+
+
+def require_unfeeling(machine: Machine) -> None:
+    """Raises `InputError` for a robot whose observation holds forces, which positions and velocities do not tell."""
     if machine.kind.name in FEELING:
         raise InputError(
             f"{machine.environment}: its observation holds contact forces, which positions and velocities do not "
             "tell; give the observed states themselves, in an .npz"
         )
-    rows = _grid(time, machine.dt)
-    sims = machine.simulations(1, 1, [])
-    sims.begin(np.arange(1), {"psi": machine.space.nominal[None]})
-    robot, view = sims.robot, sims.view
-    actions = _actions(machine, ctrl[rows[:-1]])
-    out = []
-    for k, row in enumerate(rows):
-        view.qpos[...], view.qvel[...] = qpos[row], qvel[row]
+
+
+def proprio(machine: Machine, qpos: Array, qvel: Array, actions: Array) -> Array:
+    """(W, H+1, s) observations along W stretches of motion; what motion does not say of a task is what a reset gives.
+
+    Args:
+      machine: the robot.
+      qpos, qvel: (W, H+1, nq), (W, H+1, nv) at control steps.
+      actions: (W, H, a) between them.
+    """
+    machine = Machine(machine.environment.replace("Rough", "Flat"))  # nothing that is read here depends on the ground
+    n = len(qpos)
+    sims = machine.simulations(n, 1, [])
+    sims.begin(np.arange(n), {"psi": np.tile(machine.space.nominal, (n, 1))})
+    robot, view, out = sims.robot, sims.view, []
+    for k in range(qpos.shape[1]):
+        view.qpos[...], view.qvel[...] = qpos[:, k], qvel[:, k]
         sims.batch.forward()
         if k:
-            view.task.update(robot.advance(view, actions[None, k - 1]))
+            view.task.update(robot.advance(view, actions[:, k - 1]))
         view.before, view.now = (view.now if k else robot.derive(view)), robot.derive(view)
-        out.append(np.concatenate(robot.proprio(view), -1)[0])
-    return np.array(out), actions
+        out.append(np.concatenate(robot.proprio(view), -1))
+    return np.stack(out, 1)
 
 
 def _grid(time: Array, dt: float) -> NDArray[np.intp]:
@@ -79,8 +95,12 @@ def _grid(time: Array, dt: float) -> NDArray[np.intp]:
     return rows
 
 
-def _actions(machine: Machine, ctrl: Array) -> Array:
-    """(n, a) actions whose commands are `ctrl` (n, nu): commands depend on them linearly, up to a constant."""
+def actions_of(machine: Machine, ctrl: Array) -> Array:
+    """(n, a) actions whose commands are `ctrl` (n, nu): commands depend on them linearly, up to a constant.
+
+    Raises:
+      InputError: commands that no action makes.
+    """
     robot, size = machine.settings.robot(machine.model), machine.kind.action_size
     sims = machine.simulations(size + 1, 1, [])
     sims.begin(np.arange(size + 1), {"psi": np.tile(machine.space.nominal, (size + 1, 1))})

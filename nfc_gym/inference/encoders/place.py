@@ -12,18 +12,18 @@ def place_of(names: Sequence[str]) -> dict[str, Any] | None:
 
     Returns:
       `quat` (4) and `pos` (2) indices of the base, and `turned`, pairs of indices of horizontal components in the
-      world's frame; None where the states do not hold both position and attitude.
+      world's frame; `pos` is empty where the states hold velocities in the world's frame and no position (the
+      Quadcopter's), and None is returned where they do not hold an attitude beside either.
     """
     at = {name: i for i, name in enumerate(names)}
     body = next((n.rsplit(":", 1)[0] for n in names if n.startswith("body:") and n.endswith(":quat.w")), None)
-    if body is None or f"{body}:pos.x" not in at or f"{body}:pos.y" not in at:
+    if body is None:
         return None
-    pairs = [(f"{body}:{what}.x", f"{body}:{what}.y") for what in ("linvel", "angvel")]
-    return {
-        "quat": [at[f"{body}:quat.{c}"] for c in "wxyz"],
-        "pos": [at[f"{body}:pos.{c}"] for c in "xy"],
-        "turned": [[at[a], at[b]] for a, b in pairs if a in at and b in at],
-    }
+    pairs = [[f"{body}:{what}.x", f"{body}:{what}.y"] for what in ("pos", "linvel", "angvel")]
+    pos, *turned = [[at[a], at[b]] if a in at and b in at else [] for a, b in pairs]
+    if not pos and not any(turned):
+        return None
+    return {"quat": [at[f"{body}:quat.{c}"] for c in "wxyz"], "pos": pos, "turned": [p for p in turned if p]}
 
 
 class Place(nn.Module):
@@ -49,9 +49,9 @@ class Place(nn.Module):
         sign = torch.where(turned[0] < 0, -1.0, 1.0)
         for i, part in zip(self.quat, turned, strict=True):
             columns[i] = sign * part
-        a, b = self.pos
-        columns[a], columns[b] = columns[a] - columns[a][:, :1], columns[b] - columns[b][:, :1]
+        for a in self.pos:
+            columns[a] = columns[a] - columns[a][:, :1]
         c, s = heading.cos(), heading.sin()
-        for a, b in (self.pos, *self.pairs):
+        for a, b in (*([self.pos] if self.pos else []), *self.pairs):
             columns[a], columns[b] = c * columns[a] + s * columns[b], c * columns[b] - s * columns[a]
         return torch.stack(columns, -1)

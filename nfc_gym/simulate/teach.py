@@ -1,0 +1,93 @@
+"""`nfc-gym train --structure`: a head that says which family of effects a calibrated model lacks."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.inference import checkpoint
+from nfc_gym.inference.config import NetworkConfig, Sizes
+from nfc_gym.inference.data import Batch, TensorWindows
+from nfc_gym.inference.network import Network
+from nfc_gym.inference.progress import Report, quiet
+from nfc_gym.inference.space import PriorBox
+from nfc_gym.inference.train import Outcome, TrainConfig, train
+from nfc_gym.inference.windows import Windows
+from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.misfit import of_windows
+from nfc_gym.simulate.observed import require_unfeeling
+from nfc_gym.simulate.witness import MISFIT
+
+HELD_OUT = 0.05  # of the windows, by which epochs are compared
+SMALL = NetworkConfig(encoder="nn", density="mixture", components=1, width=384, features=256, hidden=256)
+
+
+class Head(Network):
+    """A network of which the structure head alone learns; its density stays the prior's."""
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Mean cross-entropy of the families over a batch."""
+        assert self.structure is not None
+        given = self.encode(batch["states"], batch["actions"])
+        return {"structure": self.structure.loss(batch["family"], given.features).mean()}  # type: ignore[operator]
+
+
+def train_structure(
+    folder: Path, out: Path, training: TrainConfig, *, config: NetworkConfig = SMALL, noise: float = 1.0,
+    repeats: int = 2, device: str | torch.device = "cpu", report: Report = quiet,
+) -> Outcome:  # fmt: skip
+    """Train a structure head on a folder of windows into a checkpoint; a run that was stopped goes on.
+
+    Args:
+      folder: what `nfc-gym simulate` wrote, with effects, on flat ground.
+      out: the checkpoint, `.safetensors`.
+      training: see `TrainConfig`.
+      config: of the network; its families are those of the windows.
+      noise: what multiplies the sensor noise that the windows' manifest assumes.
+      repeats: how often each window is shown, with other noise and other errors of start and parameters.
+      device: to train on.
+      report: is told of the progress.
+
+    Raises:
+      InputError: windows on rough ground, without effects, or of a robot that feels forces.
+    """
+    if out.suffix != ".safetensors":
+        raise InputError(f"{out}: a structure head is kept in a file that ends in .safetensors")
+    stored = Windows(folder)
+    about, machine = stored.manifest, Machine(stored.manifest.environment)
+    require_unfeeling(machine)
+    if machine.rough:
+        raise InputError(f"{folder}: windows on rough ground; a structure head is trained on flat ground")
+    cut = len(stored) - max(1, round(HELD_OUT * len(stored)))  # no repeat of a window is on both sides
+    first, shares = taught(stored, np.tile(np.arange(cut), repeats), machine, noise, training.seed)
+    held_out, _ = taught(stored, np.arange(cut, len(stored)), machine, noise, training.seed + 1)
+    if shares[0] == 1:
+        raise InputError(f"{folder}: no window has an effect; simulate them with --effects 0.75")
+    prior = PriorBox.of(machine.space, machine.kind.name)
+    config = NetworkConfig(**{**config.to_dict(), "families": tuple(about.families)})
+    network = Head(config, Sizes.of(first.tensors), prior, training.seed)
+    state = out.with_name(out.name + ".training")
+    state.mkdir(parents=True, exist_ok=True)
+    outcome = train(network, first, held_out, training, folder=state, device=device, report=report)
+    notes = {
+        MISFIT: True, "environment": about.environment, "windows": len(stored), "shares": shares,
+        "noise": [noise * sd for sd in about.state_noise],
+        "best": outcome.best, "stopped": outcome.stopped, "seconds": outcome.seconds,
+        "held_out": outcome.held_out, "start": outcome.start,
+    }  # fmt: skip
+    checkpoint.save(out, network.cpu(), notes=notes)
+    return outcome
+
+
+def taught(
+    stored: Windows, rows: NDArray[np.intp], machine: Machine, noise: float, seed: int
+) -> tuple[TensorWindows, list[float]]:
+    """Motion, misfit and family of those windows that can be replayed, and the families' shares among them."""
+    states, fine = of_windows(machine, stored, rows, noise, np.random.default_rng(seed))
+    batch = stored.take(rows[fine], ["actions", "psi", "family"])
+    shares = np.bincount(batch["family"], minlength=len(stored.manifest.families)) / max(len(batch["family"]), 1)
+    arrays = {"states": states[fine], **batch}
+    return TensorWindows({k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}), shares.tolist()
