@@ -92,7 +92,7 @@ class StoredWindows:
     """Some rows of a stored set, read as they are needed: numpy batches made tensors.
 
     Args:
-      stored: has `manifest`, a length and `batches(size, seed, rows, names)`, which gives dicts of arrays.
+      stored: has `manifest`, a length and `batches(size, seed, rows, names, noise)`, which gives dicts of arrays.
       rows: (k,) which windows; default all.
       maps: read the elevation maps too: `map`, as perceived, and `delta_e`, truth minus perceived.
       noise: what multiplies the sensor noise that the set's manifest assumes.

@@ -197,7 +197,7 @@ class Stored:
     def __len__(self) -> int:
         return len(self.arrays["psi"])
 
-    def batches(self, size, seed, rows, names):
+    def batches(self, size, seed, rows, names, noise):
         order = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed % 2**60)).numpy()]
         for i in range(0, len(order), size):
             yield {n: self.arrays[n][order[i : i + size]] for n in names}

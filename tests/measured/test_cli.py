@@ -84,7 +84,7 @@ def test_options_reach_the_loop(loop: Any) -> None:
     options.pop("console")
     assert options == {
         "mapping": Path("m.yaml"), "out": Path("o"), "seed": 3, "jobs": 2,
-        "overwrite": False, "resume": False, "fold": "a", "posterior": Path("p.npz"), "compare": True,
+        "overwrite": False, "resume": False, "fold": "a", "posterior": Path("p.npz"), "compare": True, "witness": None,
     }  # fmt: skip
 
 
