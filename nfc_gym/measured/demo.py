@@ -20,7 +20,7 @@ from nfc_gym.measured.hidden import Array
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.stages import digest, write_whole
 
-_LOGS, _SECONDS = 6, 2.35  # 8 s to fit: the whole loop then takes less than two minutes on two cores
+_LOGS, _SECONDS = 6, 2.35  # 8 s to fit: the whole loop then takes two to three minutes on two cores
 _OURS = {"logs", "mapping.yaml", "envelope.json", "report"}
 
 
