@@ -2,7 +2,7 @@
 
     python benchmarks/inference.py [--quick] [--tasks linear_gaussian two_moons slcp] [--densities score mixture flow]
                                    [--seeds 0 1 2] [--simulations N] [--observations N] [--samples N] [--json FILE]
-                                   [--no-latency] [--clock wall|cpu]
+                                   [--no-latency] [--clock wall|cpu] [--device cpu|cuda]
 
 C2ST is the accuracy of a classifier between posterior draws and exact ones, 0.5 being perfect; its baseline column is
 the same classifier between two sets of exact draws. Every seed is a network and simulations of its own,
@@ -107,7 +107,7 @@ def known(table: Table, task: Task, density: str, linear: bool, args: argparse.N
                   at_most=0.05 if goal else None, seeds=seeds)  # fmt: skip
 
 
-def latency(table: Table, turns: int, clock: str) -> None:
+def latency(table: Table, turns: int, clock: str, device: str) -> None:
     """From a window of a Jackal's size (H = 50, s = 15, a = 2, d = 17) to 100 samples of psi, encoder included."""
     names = tuple(f"p{i}" for i in range(17))
     box = PriorBox("latency", names, ("1",) * 17, (0.0,) * 17, (1.0,) * 17)
@@ -115,12 +115,17 @@ def latency(table: Table, turns: int, clock: str) -> None:
     window = Window(rng.normal(size=(51, 15)), rng.normal(size=(50, 2)))
     contestants: dict[str, Callable[[], object]] = {}
     for config in (NetworkConfig(), NetworkConfig(summaries=True, linear=True), NetworkConfig(density="flow")):
-        posterior = NeuralPosterior(Network(config, Sizes(50, 15, 2), box))
-        name = f"{config.encoder}{' + summaries' if config.summaries else ''}, {config.density}"
+        posterior = NeuralPosterior(Network(config, Sizes(50, 15, 2), box)).to(device)
+        name = f"100 samples of 17 psi: {config.encoder}{' + summaries' if config.summaries else ''}, {config.density}"
         contestants[name] = lambda posterior=posterior: posterior.given(window).sample(100, rng)
+    maps = NeuralPosterior(Network(NetworkConfig(elevation=True, delta_e=True), Sizes(50, 15, 2), box)).to(device)
+    seen = maps.given(Window(window.states, window.actions, rng.normal(0.0, 0.05, (128, 128))))
+    contestants["8 samples of 17 psi and of delta_e"] = lambda: seen.sample(8, rng)
     for name, seconds in race(contestants, turns).items():
-        what = f"latency, 100 samples of 17 psi, batch 1, {torch.get_num_threads()} threads, {clock} time: {name}"
-        table.add(what, 1e3 * seconds, "ms", at_most=40.0 if "score" in name else None)
+        place = f"{torch.get_num_threads()} threads" if device == "cpu" else torch.cuda.get_device_name(device)
+        what = f"latency, {name}, batch 1, {place}, {clock} time"
+        goal = 40.0 if device == "cpu" else 2.0
+        table.add(what, 1e3 * seconds, "ms", at_most=goal if "score" in name else None)
 
 
 def main() -> None:
@@ -138,6 +143,7 @@ def main() -> None:
     parser.add_argument(
         "--clock", choices=("wall", "cpu"), default="wall", help="of the latency; cpu on a busy machine"
     )
+    parser.add_argument("--device", default="cpu", help="of the latency (default cpu)")
     parser.add_argument("--quick", action="store_true", help="one seed, few simulations and observations: a minute")
     parser.add_argument("--json", type=Path, help="write the rows here")
     args = parser.parse_args()
@@ -153,7 +159,7 @@ def main() -> None:
                 for linear in {"linear": (True,), "prior": (False,), "both": (True, False)}[args.base]:
                     known(table, task, density, linear, args)
     if args.latency:
-        latency(table, 10 if args.quick else 25, args.clock)
+        latency(table, 10 if args.quick else 25, args.clock, args.device)
     if args.json:
         args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
 

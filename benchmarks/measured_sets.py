@@ -1,10 +1,11 @@
 """The six recorded machines: prepare the logs, close the loop on each, predict, score, print a table with the goals.
 
-    python benchmarks/measured_sets.py --data ../shared [--sets emps ...] [--work DIR] [--jobs N] [--json FILE]
-                                       [--figures docs/machines] [--quick]
+    python benchmarks/measured_sets.py --data ../shared [--sets emps ...] [--work DIR] [--jobs N] [--at-once N]
+                                       [--json FILE] [--figures docs/machines] [--quick]
 
 The recordings, their splits and their scores are those of `score/recordings.py` in the data folder; everything that is
 particular to a machine is in its folder under `benchmarks/measured/`: the model to start from, and a mapping file.
+What is finished in the work folder is not run again.
 Without the data the benchmark says so and ends. `--quick` runs one set (one fold of it) to show that the way through
 works.
 """
@@ -15,7 +16,10 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+from nfc_gym.measured.dataset import load
 
 HERE = Path(__file__).resolve().parent
 # set -> (what `nfc-gym predict --mode` is asked for, figure of the start, figure of the reference, goal), by the scorer
@@ -45,7 +49,7 @@ def command(*words: object) -> list[str]:
 
 
 def prepare(data: Path, work: Path) -> None:
-    """Write the prepared logs of all sets, and each set's mapping and model beside them."""
+    """Write the prepared logs of all sets, and each set's mapping and model beside them; loops that were run stay."""
     subprocess.run(
         [sys.executable, data / "score" / "recordings.py", "prepare", work / "prepared"],
         check=True,
@@ -53,16 +57,21 @@ def prepare(data: Path, work: Path) -> None:
     )
     for name in SETS:
         folder = work / name
-        if folder.exists():
-            shutil.rmtree(folder)
-        shutil.copytree(HERE / "measured" / name, folder)
+        shutil.rmtree(folder / "logs", ignore_errors=True)
+        shutil.copytree(HERE / "measured" / name, folder, dirs_exist_ok=True)
         shutil.move(work / "prepared" / name, folder / "logs")
 
 
-def run_set(name: str, data: Path, work: Path, jobs: int, seed: int) -> dict[str, list[float]]:
+def run_set(name: str, args: argparse.Namespace) -> dict[str, list[float]]:
     """Close the loop on a set and score each stage's predictions: stage -> the figures that the goals are about."""
+    data, work = args.data, args.work
     mapping, out = work / name / "mapping.yaml", work / name / "loop"
-    subprocess.run(command("close-loop", mapping, "--out", out, "--jobs", jobs, "--seed", seed), check=True)
+    close = command("close-loop", mapping, "--out", out, "--jobs", args.jobs, "--seed", args.seed)
+    folds = [f.name for f in load(mapping).folds]
+    if args.at_once > 1 and len(folds) > 1:  # the whole run finds them done
+        with ThreadPoolExecutor(args.at_once) as pool:
+            list(pool.map(lambda fold: subprocess.run([*close, "--fold", fold], check=True), folds))
+    subprocess.run(close, check=True)
     figures = {}
     for stage in STAGES:
         file = work / name / f"{stage}.npz"
@@ -95,7 +104,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=HERE.parents[1] / "shared", help="folder with data/ and score/")
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument("--work", type=Path, default=Path("results/measured_sets"))
-    parser.add_argument("--jobs", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=0, help="threads of a loop; 0 takes all cores")
+    parser.add_argument("--at-once", type=int, default=1, help="folds of a set at a time, each with --jobs threads")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--figures", type=Path, metavar="FOLDER", help="draw one picture a set there")
@@ -109,7 +119,7 @@ def main() -> None:
     rows = []
     for name in ["emps"] if args.quick else args.sets:
         began = time.monotonic()
-        figures = run_set(name, args.data, args.work, args.jobs, args.seed)
+        figures = run_set(name, args)
         seconds = time.monotonic() - began
         if args.figures:
             from measured.figure import draw  # matplotlib, of which nothing else here knows

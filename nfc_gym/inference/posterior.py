@@ -15,6 +15,7 @@ from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.network import Encoded, Network
 from nfc_gym.inference.random import seeded
+from nfc_gym.inference.replay import Passes
 from nfc_gym.inference.space import PriorBox
 
 Array = NDArray[np.float64]
@@ -48,13 +49,15 @@ class NeuralPosterior:
       kept: of the window it was given, one row.
       notes: kept in its file.
       parts: of a fidelity that its draws speak of; default all that the network infers.
+      passes: of the network, from an earlier posterior of the same; what it captured for a GPU is used again.
     """
 
     def __init__(
         self, network: Network, kept: Encoded | None = None, notes: dict[str, Any] | None = None,
-        parts: tuple[str, ...] = (),
+        parts: tuple[str, ...] = (), passes: Passes | None = None,
     ) -> None:  # fmt: skip
         self.parts = parts or network.parts
+        self.passes = passes or Passes(network)
         self.network, self.kept, self.notes = network.eval(), kept, dict(notes or {})
 
     @property
@@ -75,8 +78,8 @@ class NeuralPosterior:
         def row(x: Array) -> Tensor:
             return torch.as_tensor(x, dtype=torch.float32, device=device)[None]
 
-        kept = self.network.encode(row(states), row(actions), None if elevation is None else row(elevation))
-        return NeuralPosterior(self.network, kept, self.notes, self.parts)
+        kept = self.passes.encode(row(states), row(actions), None if elevation is None else row(elevation))
+        return NeuralPosterior(self.network, kept, self.notes, self.parts, self.passes)
 
     def _checked(self, window: Window) -> tuple[Array, Array, Array | None]:
         size = self.network.sizes
@@ -118,7 +121,7 @@ class NeuralPosterior:
         wrong = [p for p in parts if p not in self.network.parts]
         if wrong or "psi" not in parts:
             raise InputError(f"posterior: parts are psi and others of {', '.join(self.network.parts)}, got {parts}")
-        return NeuralPosterior(self.network, self.kept, self.notes, parts)
+        return NeuralPosterior(self.network, self.kept, self.notes, parts, self.passes)
 
     @torch.no_grad()
     def sample(self, n: int, rng: np.random.Generator, **how: Any) -> Fidelity:
@@ -137,7 +140,7 @@ class NeuralPosterior:
                 maps = torch.cat([p[1] for p in pairs]).double().cpu().numpy()
             else:
                 counts = [min(_ROWS, n - at) for at in range(0, n, _ROWS)]
-                drawn = torch.cat([self.network.sample(k, kept, blocks, **how)[0] for k in counts])
+                drawn = torch.cat([self.passes.sample(k, kept, blocks, **how)[0] for k in counts])
         psi, delta = self.prior.from_z(drawn[:, : self.prior.size].double().cpu().numpy()), None
         if blocks == 2:
             y = torch.where(self.network.varies, drawn[:, self.prior.size :], 0.0)

@@ -79,7 +79,7 @@ def test_v_and_its_relations() -> None:
     x, noise = torch.randn(5, 3, dtype=torch.float64), torch.randn(5, 3, dtype=torch.float64)
     at, v = phi.cos() * x + phi.sin() * noise, phi.cos() * noise - phi.sin() * x
     torch.testing.assert_close(diffusion.clean(at, v, phi), x)
-    grid = diffusion.angles(10)
+    grid = diffusion.angles(10, phi)
     assert grid[0] == pytest.approx(math.pi / 2)
     assert grid[-1] == pytest.approx(diffusion.FLOOR)
     assert (grid.diff() < 0).all()

@@ -22,9 +22,13 @@ FLOOR = 2e-3  # smallest angle: detail of that size of the prior's spread is lef
 MOST = math.pi / 2
 
 
-def angles(steps: int) -> Tensor:
-    """(steps + 1,) from pi / 2 down to `FLOOR`, denser towards the end, where narrow posteriors take shape."""
-    return FLOOR + (MOST - FLOOR) * torch.linspace(1, 0, steps + 1, dtype=torch.float64).pow(3)
+def angles(steps: int, like: Tensor) -> Tensor:
+    """(steps + 1,) from pi / 2 down to `FLOOR`, denser towards the end, where narrow posteriors take shape.
+
+    Of the type and on the device of `like`, and made there.
+    """
+    even = torch.linspace(1, 0, steps + 1, dtype=torch.float64, device=like.device)
+    return (FLOOR + (MOST - FLOOR) * even.pow(3)).to(like.dtype)
 
 
 def clean(x: Tensor, v: Tensor, phi: Tensor) -> Tensor:
@@ -52,14 +56,14 @@ def integrate(rate: Field, x: Tensor, grid: Tensor) -> Tensor:
 
 def flow(field_on: On, noise: Tensor, steps: int = 12) -> Tensor:
     """Noise to samples by the probability-flow ODE, in steps + 1 evaluations; noise of `FLOOR` is left in them."""
-    grid = angles(steps).to(noise.dtype).to(noise.device)
+    grid = angles(steps, noise)
     return integrate(field_on(grid), noise, grid)
 
 
 def reverse_sde(field_on: On, noise: Tensor, steps: int = 150) -> Tensor:
     """Noise to samples by the reverse SDE, in its exact transitions given the mean of the clean x (Ho et al. 2020)."""
     x = noise
-    grid = angles(steps).to(noise.dtype).to(noise.device)
+    grid = angles(steps, noise)
     field = field_on(grid)
     for i, (a, b) in enumerate(pairwise(grid)):
         v = field(x, i)
@@ -76,9 +80,9 @@ def log_density(field_on: On, x: Tensor, steps: int = 16) -> Tensor:
     log p(x) = log N(x_end) + integral of div v dphi (Song et al. 2021, equation 39), by Runge and Kutta's method of
     fourth order: a bias here would be one of every density reported, so it is held to a hundredth of a nat.
     """
-    ends = angles(steps).flip(0)
+    ends = angles(steps, x.new_empty((), dtype=torch.float64)).flip(0)
     middles = (ends[:-1] + ends[1:]) / 2
-    grid = torch.cat([ends, middles]).sort().values.to(x.dtype).to(x.device)  # the odd ones are middles
+    grid = torch.cat([ends, middles]).sort().values.to(x.dtype)  # the odd ones are middles
     field = field_on(grid)
 
     def rate(both: Tensor, i: int) -> Tensor:

@@ -1,0 +1,92 @@
+"""A network's passes over one window on a GPU, as CUDA graphs: hundreds of small kernels, launched at once."""
+
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nfc_gym.inference.heads.score import Score
+from nfc_gym.inference.network import Encoded, Network
+from nfc_gym.inference.random import seeded
+
+Pass = Callable[..., tuple[Tensor, ...]]
+_WARM = 3  # passes before a capture: libraries choose their kernels and take their memory in the first ones
+_MOST = 4096  # draws: above that a GPU is busy with arithmetic and not with launches
+
+
+class Replayed:
+    """A function of tensors, captured once and replayed with new values of the same shapes.
+
+    Random numbers go on from torch's generator of the device at each replay, as they would without a graph. The
+    function must not copy from or to the processor.
+
+    Args:
+      function: tensors to a tuple of tensors, all on one CUDA device.
+      arguments: the first values.
+    """
+
+    def __init__(self, function: Pass, *arguments: Tensor) -> None:
+        self.inputs = [a.clone() for a in arguments]
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.device(arguments[0].device), seeded(0):
+            side = torch.cuda.Stream()
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                for _ in range(_WARM):
+                    function(*self.inputs)
+            torch.cuda.current_stream().wait_stream(side)
+            with torch.cuda.graph(self.graph):
+                self.outputs = function(*self.inputs)
+
+    def __call__(self, *arguments: Tensor) -> tuple[Tensor, ...]:
+        """The function's values, in memory of their own."""
+        for kept, new in zip(self.inputs, arguments, strict=True):
+            kept.copy_(new)
+        self.graph.replay()
+        return tuple(o.clone() for o in self.outputs)
+
+
+class Passes:
+    """Encoding one window and drawing from what was kept of it, as the network does both.
+
+    What comes a second time on a GPU, with the same shapes and number of draws, is captured and replayed from then on.
+    Densities other than the score model, whose sampling asks the processor what to do next, run as they are.
+
+    Args:
+      network: its weights may change in place; once it is moved, make another.
+    """
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self._seen: set[Hashable] = set()
+        self._captured: dict[Hashable, Replayed] = {}
+
+    def encode(self, states: Tensor, actions: Tensor, elevation: Tensor | None) -> Encoded:
+        """See `Network.encode`."""
+        given = (states, actions) if elevation is None else (states, actions, elevation)
+
+        def run(*x: Tensor) -> tuple[Tensor, ...]:
+            return tuple(t for t in self.network.encode(*x) if t is not None)
+
+        return Encoded(*self._replayed(("encode", len(given)), run, *given))
+
+    def sample(self, n: int, given: Encoded, blocks: int, **how: Any) -> Tensor:
+        """See `Network.sample`."""
+
+        def run(features: Tensor, mean: Tensor) -> tuple[Tensor, ...]:
+            return (self.network.sample(n, Encoded(features, mean), blocks, **how),)
+
+        if n > _MOST or not isinstance(self.network.density, Score):
+            return run(given.features, given.mean)[0]
+        return self._replayed(("sample", n, blocks, *sorted(how.items())), run, given.features, given.mean)[0]
+
+    def _replayed(self, key: Hashable, run: Pass, *given: Tensor) -> tuple[Tensor, ...]:
+        if not given[0].is_cuda:
+            return run(*given)
+        if key not in self._seen:
+            self._seen.add(key)
+            return run(*given)
+        if key not in self._captured:
+            self._captured[key] = Replayed(run, *given)
+        return self._captured[key](*given)
