@@ -129,7 +129,7 @@ class Arena:
         white = self.under.whiten(self.fit_data.problem.residual(plant, starts))
         start = starts[int(loss(white).sum(-1).argmin())]
         # Who leads is fitted again in full; where roll-outs are costly a first look must do with the slopes at hand.
-        return self._refit(plant, start, 10, self.current.jacobian, quick=self.fit_data.problem.rough)
+        return self._refit(plant, start, 10, self.current.jacobian, quick=self.fit_data.problem.costly)
 
     def _refit(self, plant: Plant, start: Array, rounds: int, known: Array, quick: bool = False) -> Judged:
         """Fit and judge; `known` (S, m, j) is the Jacobian of the first j free parameters.
@@ -150,7 +150,7 @@ class Arena:
         starts = np.stack([np.concatenate([x, pick.theta]) for x in (leader.fitted.x[:width], moved, current.x)])
         values = loss(self.under.whiten(self.fit_data.problem.residual(plant, starts))).sum(-1)
         known = leader.fitted.jacobian[..., : current.jacobian.shape[-1]]
-        return self._refit(plant, starts[int(values.argmin())], 10, known, quick=self.fit_data.problem.rough)
+        return self._refit(plant, starts[int(values.argmin())], 10, known, quick=self.fit_data.problem.costly)
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
         """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -69,21 +70,34 @@ class Bench:
     ) -> RolloutProblem:
         """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs.
 
+        They count as rough where bodies do touch in these logs: a robot that flies over a floor never meets it.
+
         Args:
           length: s, of each segment, compared at its end; default as the mapping says.
         """
+        whole = self._rollouts(logs, states, length)
+        whole.rough = whole.rough and self._touching
+        if most is None or len(whole) <= most:
+            return whole
+        return whole.take(np.unique(np.linspace(0, len(whole) - 1, most).round().astype(int)))
+
+    @cached_property
+    def _touching(self) -> bool:
+        """Whether bodies touch in the nominal model's roll-outs of any log."""
+        logs = self.dataset.logs
+        every = self._rollouts(logs, [self.states[log.name] for log in logs])
+        return every.touches(self.plant, self.plant.null)
+
+    def _rollouts(self, logs: Sequence[Log], states: Sequence[States], length: float | None = None) -> RolloutProblem:
         segments, model = self.dataset.mapping.segments, self.plant.model
         length, horizons = (segments.length, segments.horizons) if length is None else (length, (length,))
         controls = self.dataset.mapping.controls
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")
         layout = Layout(length, segments.history, horizons, length, model.opt.timestep)
-        whole = RolloutProblem(
+        return RolloutProblem(
             model, logs, states, layout, servos(model, laws), linear, settle=segments.start == "settled"
         )
-        if most is None or len(whole) <= most:
-            return whole
-        return whole.take(np.unique(np.linspace(0, len(whole) - 1, most).round().astype(int)))
 
 
 def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:

@@ -103,7 +103,7 @@ def _accepted(lens: Lens, effect: Effect) -> _View:
 
 def _look(lens: Lens, effect: Effect, basis: Array, again: tuple[Lens, Array] | None) -> _View:
     """A candidate at its realistic sizes, whole and parameter by parameter, in one batch; again from other starts."""
-    sets = realistic(effect, every_size=not lens.problem.rough)
+    sets = realistic(effect, every_size=not lens.problem.costly)
     change = lens.columns(effect, np.concatenate([rows for pair in sets for rows in pair]))
     at, whole, spans = 0, [], []
     for thetas, rows in sets:

@@ -18,9 +18,9 @@ _ENOUGH = 12  # blocks that such a thinning must leave, and does leave where eac
 _WORST = 6  # blocks with the largest errors that join them there
 _FAINT = 0.05  # of the best gain: what the best of a family must reach there to be among the field whatever its rank
 _KEEP = 60  # candidates that are screened again in every round, whatever they gained
-_SCOUTED = 16  # candidates, each the best of its family, that a rough problem looks around before refitting
+_SCOUTED = 16  # candidates, each the best of its family, that a costly problem looks around before refitting
 _SURE = 2  # of them, whose gain by straight lines counts where the look around finds less
-_PURSUED = 40  # candidates that a smooth problem takes a few steps further before it shortlists
+_PURSUED = 40  # candidates that a problem that costs little takes a few steps further before it shortlists
 _FIRST = 10  # of the suspected families' candidates that are screened in full, besides the best of each family
 _BESIDE, _MOST_BESIDE = 2, 4  # families that lead plain screening and join the suspected ones: always, and at most
 _ALIKE = 0.5  # of the best gain there: what a family beyond the first two must reach to join them
@@ -31,7 +31,7 @@ class Lookout:
 
     Args:
       problem: on the fit logs.
-      rng: of the draws with which rough problems look around.
+      rng: of the draws with which costly problems look around.
       say: progress.
       suspects: what a structure head holds possible; None where there is no head.
     """
@@ -53,7 +53,7 @@ class Lookout:
         Args:
           field: how many of a large pool are screened in full, besides the best of each family.
         """
-        field = field or (_COSTLY if self.problem.rough else _FIELD)
+        field = field or (_COSTLY if self.problem.costly else _FIELD)
         left = self._left(screen, pool)
         self.say(f"screening {len(left)} candidates")
         found = screen_all(screen, self._promising(screen, left, field))
@@ -89,7 +89,7 @@ class Lookout:
 
     def closer(self, screen: Screen, found: list[Screened]) -> list[Screened]:
         """The leading candidates by what they gain in truth, then the rest as screening has them."""
-        if self.problem.rough:
+        if self.problem.costly:
             leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
             thin = self._thinned(screen)
             whole = float(screen.current.losses.sum() / thin.current.losses.sum())
@@ -112,8 +112,8 @@ class Lookout:
         blocks, current = len(self.problem), screen.current
         if blocks < _THIN * _ENOUGH:
             return screen
-        index = np.arange(0, blocks, blocks // _ENOUGH if self.problem.rough else _THIN)
-        if self.problem.rough:
+        index = np.arange(0, blocks, blocks // _ENOUGH if self.problem.costly else _THIN)
+        if self.problem.costly:
             index = np.union1d(index, np.argsort(current.losses)[-_WORST:])
         part = Fit(current.plant, current.x, current.white[index], current.jacobian[index])
         return Screen(self.problem.take(index), screen.metric.take(index), part)
@@ -124,7 +124,7 @@ class Lookout:
         if len(pool) <= field or thin is screen:
             return pool
         rough = self._rough(screen, pool)
-        least = _FAINT * rough[0].gain if self.problem.rough else 0.0
+        least = _FAINT * rough[0].gain if self.problem.costly else 0.0
         families = {r.effect.family: r.effect for r in reversed(rough) if r.gain >= least}
         best = [r.effect for r in rough[:field]]
         return best + [e for e in families.values() if e not in best]
@@ -134,7 +134,7 @@ class Lookout:
         of, seen = self._glance if self._glance is not None else (None, [])
         known = {id(r.effect): r for r in seen} if of is screen else {}
         thin = self._thinned(screen)
-        new = screen_all(thin, [e for e in pool if id(e) not in known], every_size=not self.problem.rough)
+        new = screen_all(thin, [e for e in pool if id(e) not in known], every_size=not self.problem.costly)
         found = sorted([*new, *(known[id(e)] for e in pool if id(e) in known)], key=lambda s: -s.gain)
         if self.suspects is not None:
             self._glance = screen, [*known.values(), *new]

@@ -38,6 +38,7 @@ class Problem(ABC):
       names: names of the logs.
       time_of: (S,) seconds into its log at which each block starts.
       rough: whether residuals are rough functions of the parameters, as they are where bodies touch.
+      costly: whether a residual costs so much that a search looks about before it refits: roll-outs of robots.
     """
 
     columns: Columns
@@ -46,6 +47,7 @@ class Problem(ABC):
     names: tuple[str, ...]
     time_of: Array
     rough = False
+    costly = False
 
     def __len__(self) -> int:
         return len(self.log_of)

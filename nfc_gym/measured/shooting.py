@@ -79,7 +79,7 @@ class RolloutProblem(Problem):
         self._observers = [o for key, c in logs[0].channels.items() if (o := observer(model, key, c.axes)) is not None]
         self.names = tuple(log.name for log in logs)
         apart = model.geom_bodyid[:, None] != model.geom_bodyid
-        self.rough = bool((apart & ((model.geom_contype[:, None] & model.geom_conaffinity) != 0)).any())
+        self.rough = self.costly = bool((apart & ((model.geom_contype[:, None] & model.geom_conaffinity) != 0)).any())
         self._place(where, None)
 
     def _place(self, where: Cut, measured: list[Array] | None) -> None:
