@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.box import box
+from nfc_gym.measured.box import Box, box
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import Metric, metric
 from nfc_gym.measured.problem import Problem
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 STARTS = 3
 _AWAY = 0.3  # standard deviation of the starts about a fit, in scaled parameters
 _ROUNDS = 10  # iterations of each fit
+_SAME = 3.0  # standard errors, root mean square over the parameters, within which two fits ended in one hollow
+_SETTLED = 2  # fits in a row that end where others have: more of them would too
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ def hollows(
 ) -> Hollows:
     """Fit again from starts about a fit, and keep the likeliest, each by the noise that it expects itself.
 
+    It ends early where fits keep ending in hollows that others have found.
+
     Args:
       problem: measured blocks; where nothing touches, the fit at hand is the answer.
       under: metric to fit under.
@@ -62,12 +66,26 @@ def hollows(
     plant, limits = found.plant, box(found.plant)
     around = np.random.default_rng(seed).normal(size=(starts, len(limits.scale)))
     z = np.clip(limits.at(found.x) + _AWAY * around, limits.floor, limits.roof)
-    ends = [found.x]
-    for number, start in enumerate([*limits.x(z, found.x), *others], 1):
+    ends, apart, quiet = [found.x], [found.x], 0
+    for number, start in enumerate([*others, *limits.x(z, found.x)], 1):
         tick(number)
         ends.append(fit(problem, under, plant, start, _ROUNDS).x)
-    best = ends.pop(int(np.argmin([surprise(problem, extra, plant, x) for x in ends])))
-    return Hollows(best, np.sqrt(((np.stack(ends) - best) ** 2).mean(0)))
+        new = all(_errors_between(found, limits, ends[-1], x) > _SAME for x in apart)
+        quiet = 0 if new else quiet + 1
+        if new:
+            apart.append(ends[-1])
+        elif quiet == _SETTLED:
+            break
+    if len(apart) > 1:  # each hollow is judged by the noise that it expects; within one all expect the same
+        apart.sort(key=lambda x: surprise(problem, extra, plant, x))
+    away = np.stack([x for x in ends if x is not apart[0]] or [apart[0]]) - apart[0]
+    return Hollows(apart[0], np.sqrt((away**2).mean(0)))
+
+
+def _errors_between(found: Fit, limits: Box, a: Array, b: Array) -> float:
+    """Distance of two ends (size,) in standard errors of a fit near them, root mean square over its parameters."""
+    moved = found.jacobian @ (limits.at(a) - limits.at(b))
+    return float(np.sqrt((moved**2).sum() / max(len(limits.scale), 1)))
 
 
 def surprise(problem: Problem, extra: Array, plant: Plant, x: Array) -> float:

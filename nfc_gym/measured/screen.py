@@ -35,7 +35,6 @@ class Screened:
       theta: (k,) parameters to start a fit from.
       shift: (j,) change of the fitted model's scaled free parameters that goes with it.
       columns: (n, k') projected whitened change at the probe that did best, for the identifiability table.
-      probe: (k',) size of the probed parameters.
     """
 
     effect: Effect
@@ -43,7 +42,6 @@ class Screened:
     theta: Array
     shift: Array
     columns: Array
-    probe: Array
 
 
 def probe_sets(effect: Effect, every_size: bool = True) -> list[Array]:
@@ -122,9 +120,7 @@ class Screen:
         x = np.concatenate([np.repeat(self.current.x[None], len(rows), 0), rows], 1)
         white = self.metric.whiten(self.problem.residual(plant, x))
         change = (self.weight * (white - self.current.white)).reshape(len(rows), -1).T
-        best = Screened(
-            effect, 0.0, sets[0][0], np.zeros(self.full_tangent.shape[1]), np.zeros((len(self.target), 0)), np.zeros(0)
-        )
+        best = Screened(effect, 0.0, sets[0][0], np.zeros(self.full_tangent.shape[1]), np.zeros((len(self.target), 0)))
         at = 0
         for probe in sets:
             raw = change[:, at : at + len(probe)]
@@ -132,10 +128,7 @@ class Screen:
             at += len(probe)
             gain, theta, multiple = self._combine(effect, probe, columns)
             if gain > best.gain or best.columns.shape[1] == 0:
-                sizes = (probe - effect.null)[
-                    np.arange(len(probe)), [i for i, p in enumerate(effect.params) if not p.shape]
-                ]
-                best = Screened(effect, gain, theta, self._shift(raw @ multiple), columns, sizes)
+                best = Screened(effect, gain, theta, self._shift(raw @ multiple), columns)
         return best
 
     def scout(self, found: Screened, rng: np.random.Generator, draws: int = 16) -> Screened:

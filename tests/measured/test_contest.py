@@ -238,7 +238,7 @@ def test_plainer_laws_are_tried_though_screening_left_them_out() -> None:
 
 def candidate(name: str, columns: list[list[float]]) -> Screened:
     effect: Any = SimpleNamespace(id=name)
-    return Screened(effect, 1.0, np.zeros(1), np.zeros(1), np.array(columns, float).reshape(-1, 4).T, np.ones(1))
+    return Screened(effect, 1.0, np.zeros(1), np.zeros(1), np.array(columns, float).reshape(-1, 4).T)
 
 
 def test_likeness_asks_what_the_other_could_do_of_what_the_one_does() -> None:

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nfc_gym.measured.box import box
 from nfc_gym.measured.elsewhere import hollows
-from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.fit import Fit, jacobian
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.problem import Columns, Problem
 
@@ -41,7 +42,8 @@ def stood(problem: Wells, x: float) -> tuple[Any, Fit]:
     plant: Any = SimpleNamespace(space=space, effects=(), null=np.zeros(1), chart=same, unchart=same, size=1)
     under = metric(problem, problem.covariance(plant, np.zeros(1)))
     white = under.whiten(problem.residual(plant, np.array([[x]])))[0]
-    return under, Fit(plant, np.array([x]), white, np.zeros((*white.shape, 1)))
+    slopes = jacobian(problem, under, box(plant), np.array([x]), white, np.array([0]))
+    return under, Fit(plant, np.array([x]), white, slopes)
 
 
 def test_the_deeper_hollow_is_kept_and_the_other_says_what_is_open() -> None:
@@ -66,3 +68,14 @@ def test_where_nothing_touches_the_fit_at_hand_is_the_answer() -> None:
     found = hollows(problem, under, np.zeros(2), shallow, 0, (np.array([-0.8]),))
     assert found.x == 1.0
     assert found.open == 0.0
+
+
+def test_fits_that_end_in_one_hollow_are_not_compared_and_soon_suffice() -> None:
+    problem = Wells(0.1)
+    under, deep = stood(problem, -1.0)
+    problem.covariance = None  # type: ignore[assignment]  (asking for it would fail)
+    begun: list[int] = []
+    found = hollows(problem, under, np.zeros(2), deep, 0, starts=6, tick=begun.append)
+    assert begun == [1, 2]
+    assert found.x == pytest.approx(-1.0, abs=0.02)
+    assert found.open < 0.02

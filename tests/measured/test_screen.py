@@ -14,6 +14,9 @@ from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects.each import split
+from nfc_gym.physics.effects.joint import SpringOffset
+from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -28,6 +31,15 @@ MODEL = """
     </body>
   </worldbody>
   <actuator><motor name="motor" joint="hinge" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+TWO = """
+<mujoco>
+  <option timestep="0.01" integrator="implicitfast"/>
+  <worldbody>
+    <body><joint name="a" axis="0 1 0" damping="0.1"/><geom size="0.05" pos="0 0 -0.3"/></body>
+    <body pos="0 1 0"><joint name="b" axis="0 1 0" damping="0.1"/><geom size="0.05" pos="0 0 -0.3"/></body>
+  </worldbody>
 </mujoco>
 """
 
@@ -105,3 +117,29 @@ def test_a_twin_begins_elsewhere_on_some_of_the_blocks(screen: Screen, monkeypat
     law = build("saturation", "motor", {"removed": 0.0})[0]
     here, there = (each.columns(law, np.array([[REMOVED]])) for each in (lens, twin))
     assert repeated(here[lens.shared].reshape(-1, 1), there.reshape(-1, 1))[0] > 0.95
+
+
+def test_springs_with_values_of_their_own_are_screened() -> None:
+    """Two parameters a place, one of them a shape, and rows that span the coordinates of a chart."""
+    model = mujoco.MjModel.from_xml_string(TWO)
+    rng, data, rows = np.random.default_rng(0), mujoco.MjData(model), []
+    data.qpos[:] = 0.5, -0.4
+    for _ in range(300):
+        rows.append((*data.qpos, *data.qvel))
+        data.qfrc_applied[:] = -0.2 * (data.qpos - 0.3)  # the springs that the model lacks
+        mujoco.mj_step(model, data)
+    seen = np.array(rows) + rng.normal(size=(300, 4)) * [0.001, 0.001, 0.01, 0.01]
+    names = ("a:pos", "b:pos", "a:vel", "b:vel")
+    noise = dict(zip(names, (0.001, 0.001, 0.01, 0.01), strict=True))
+    channels = {f"joint:{n}": Channel(seen[:, i], noise=noise[n]) for i, n in enumerate(names)}
+    log = Log("run", DT * np.arange(300), {}, channels)
+    problem = RolloutProblem(model, [log], [estimate_states(model, log)], Layout(0.3, 0.0, (0.1, 0.3), 0.3, DT))
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    under = metric(problem, problem.covariance(plant, plant.null))
+    screen = Screen(problem, under, stand(problem, under, plant, plant.null))
+    sizes = {"stiffness": {"probes": (0.1, 0.4)}, "rest": {"probes": (0.0, 0.5)}}
+    apart = split(SpringOffset(("a", "b"), sized(SpringOffset.PARAMS, **sizes)), plant)
+    assert apart is not None
+    found = screen.try_one(apart[0])
+    assert found.columns.shape[1] == 4
+    assert found.gain > 0
