@@ -133,7 +133,7 @@ class NeuralPosterior:
             raise InputError(f"sample: n must be 1 or more, got {n}")
         kept, maps = self._window(), None
         blocks = 2 if "delta_s" in self.parts else 1
-        with seeded(rng):
+        with seeded(rng, kept.mean.device):
             if "delta_e" in self.parts:
                 pairs = [self.network.sample_terrain(min(_MAPS, n - at), kept, **how) for at in range(0, n, _MAPS)]
                 drawn = torch.cat([p[0] for p in pairs])

@@ -8,12 +8,23 @@ import torch
 
 
 @contextmanager
-def seeded(seed: int | np.random.Generator) -> Iterator[None]:
-    """Torch's generators start from `seed` (or from a draw of a numpy generator) inside, and are restored after."""
+def seeded(seed: int | np.random.Generator, device: torch.device | None = None) -> Iterator[None]:
+    """Torch's generators start from `seed` (or from a draw of a numpy generator) inside, and are restored after.
+
+    Args:
+      seed: or a generator to draw one from.
+      device: where numbers are drawn, beside the processor; None for all GPUs, each of which takes its time.
+    """
     if isinstance(seed, np.random.Generator):
         seed = int(seed.integers(2**63))
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
+    if device is None:
+        gpus = list(range(torch.cuda.device_count()))
+    else:
+        gpus = [torch.cuda.current_device() if device.index is None else device.index] if device.type == "cuda" else []
+    with torch.random.fork_rng(gpus):
+        torch.random.default_generator.manual_seed(seed)
+        for gpu in gpus:
+            torch.cuda.default_generators[gpu].manual_seed(seed)
         yield
 
 

@@ -29,7 +29,7 @@ class Replayed:
     def __init__(self, function: Pass, *arguments: Tensor) -> None:
         self.inputs = [a.clone() for a in arguments]
         self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.device(arguments[0].device), seeded(0):
+        with torch.cuda.device(arguments[0].device), seeded(0, arguments[0].device):
             side = torch.cuda.Stream()
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):

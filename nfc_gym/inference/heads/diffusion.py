@@ -8,7 +8,7 @@ For x ~ N(0, I), v is 0: a network that starts at 0 starts at the prior, exactly
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
@@ -36,28 +36,28 @@ def clean(x: Tensor, v: Tensor, phi: Tensor) -> Tensor:
     return phi.cos() * x - phi.sin() * v
 
 
-def integrate(rate: Field, x: Tensor, grid: Tensor) -> Tensor:
+def integrate(rate: Field, x: Tensor, grid: Sequence[float]) -> Tensor:
     """Solve dx / dphi = rate(x, phi) along a grid of angles: Adams and Bashforth's method of second order.
 
     One evaluation a step, after one step of Heun's method. At 20 evaluations it is two to four times as accurate as
     Heun's method throughout, on Gaussians a tenth to a hundredth as wide as the prior.
     """
-    before: tuple[Tensor, Tensor] | None = None
-    for i, step in enumerate(grid.diff()):
-        now = rate(x, i)
+    before: tuple[float, Tensor] | None = None
+    for i, (at, to) in enumerate(pairwise(grid)):
+        step, now = to - at, rate(x, i)
         if before is None:
-            x = x + step / 2 * (now + rate(x + step * now, i + 1))
+            x = torch.add(x, now + rate(torch.add(x, now, alpha=step), i + 1), alpha=step / 2)
         else:
             last, past = before
-            x = x + step * (now + step / last / 2 * (now - past))
+            share = step / last / 2
+            x = torch.add(torch.add(x, now, alpha=step * (1 + share)), past, alpha=-step * share)
         before = step, now
     return x
 
 
 def flow(field_on: On, noise: Tensor, steps: int = 12) -> Tensor:
     """Noise to samples by the probability-flow ODE, in steps + 1 evaluations; noise of `FLOOR` is left in them."""
-    grid = angles(steps, noise)
-    return integrate(field_on(grid), noise, grid)
+    return integrate(field_on(angles(steps, noise)), noise, angles(steps, noise.new_empty(0, device="cpu")).tolist())
 
 
 def reverse_sde(field_on: On, noise: Tensor, steps: int = 150) -> Tensor:

@@ -39,7 +39,7 @@ class Block(nn.Module):
     def forward(self, h: Tensor, modulation: Tensor) -> Tensor:
         """The shape of h; the modulation (three times as wide) is broadcast against it."""
         shift, scale, gate = modulation.chunk(3, -1)
-        return h + gate * self.path(self.norm(h) * (1 + scale) + shift)
+        return torch.addcmul(h, gate, self.path(torch.addcmul(shift, self.norm(h), 1 + scale)))
 
 
 class Score(Density):
@@ -85,14 +85,15 @@ class Score(Density):
         c = nn.functional.silu(condition + self.time(time_features(phi)) + self.present(flags))
         return (*(cast(Block, b).modulate(c) for b in self.blocks), self.affine(c))
 
-    def v(self, x: Tensor, here: Tensor, modulations: Sequence[Tensor]) -> Tensor:
-        """v (..., d) at x; `here` is 1 for entries of blocks that are present."""
-        x = x * here
+    def v(self, x: Tensor, here: Tensor | None, modulations: Sequence[Tensor]) -> Tensor:
+        """v (..., d) at x; `here` is 1 for entries of blocks that are present, None where all are."""
+        x = x if here is None else x * here
         h = self.first(x)
         for block, modulation in zip(self.blocks, modulations, strict=False):
             h = block(h, modulation)
         slope, offset = modulations[-1].chunk(2, -1)
-        return (self.last(nn.functional.silu(h)) + slope * x + offset) * here
+        v = torch.addcmul(self.last(nn.functional.silu(h)) + offset, slope, x)
+        return v if here is None else v * here
 
     def here(self, blocks: Tensor) -> Tensor:
         """(..., d) 1 for entries of the first `blocks` blocks, else 0."""
@@ -118,15 +119,16 @@ class Score(Density):
     def field(self, features: Tensor, blocks: int | None) -> diffusion.On:
         """v on a grid of angles, as a function of x (B, n, width of the blocks)."""
         condition = self.condition(features)[:, None]
-        count = torch.full((), len(self.sizes) if blocks is None else blocks, device=features.device)
-        here = self.here(count)
         width, rest = self.width(blocks), self.width(None) - self.width(blocks)
+        count = torch.full((), len(self.sizes) if blocks is None else blocks, device=features.device)
+        here = self.here(count) if rest else None
 
         def on(grid: Tensor) -> diffusion.Field:
             every = self.modulations(grid[:, None, None], condition, count)  # (angles, B, 1, ...)
 
             def field(x: Tensor, i: int) -> Tensor:
-                return self.v(nn.functional.pad(x, (0, rest)), here, [m[i] for m in every])[..., :width]
+                whole = nn.functional.pad(x, (0, rest)) if rest else x
+                return self.v(whole, here, [m[i] for m in every])[..., :width]
 
             return field
 
