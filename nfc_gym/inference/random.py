@@ -22,7 +22,7 @@ def seeded(seed: int | np.random.Generator, device: torch.device | None = None) 
     else:
         gpus = [torch.cuda.current_device() if device.index is None else device.index] if device.type == "cuda" else []
     with torch.random.fork_rng(gpus):
-        torch.random.default_generator.manual_seed(seed)
+        torch.default_generator.manual_seed(seed)
         for gpu in gpus:
             torch.cuda.default_generators[gpu].manual_seed(seed)
         yield

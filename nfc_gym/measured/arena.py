@@ -1,7 +1,7 @@
 """Where the candidates of one round meet: one model to beat, one common metric, one verdict on each."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +25,15 @@ from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
+from nfc_gym.measured.shooting import RolloutProblem, finer
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import Each, split
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
+_OWN, _TURNS = 6, 2  # iterations of a fit under a model's own metric, with the slopes at hand; fits and slacks in turns
+_AT_HALF = 8  # iterations of a fit at half the step, with the slopes of the whole one
 _CHORD = 10  # free parameters beyond which a candidate's refit reuses the Jacobian of the model to beat
 _EDGE = 1e-2  # of a parameter's range: nearer to a bound than this is at it
 _ALIKE = 0.1  # of a parameter's effect on the motion: what must remain when all others imitate it
@@ -48,6 +51,23 @@ class Data:
         return Data(self.problem, self.problem.covariance(by.plant, by.x))
 
 
+@dataclass(frozen=True)
+class _Owned:
+    """A model as it is judged.
+
+    Attributes:
+      fitted: under the metrics that it is judged by.
+      by: these, on the fit and on the selection logs.
+      seen: the same fit under the arena's metric.
+      asked: the fit that it stands for, kept so that its id stays its own.
+    """
+
+    fitted: Fit
+    by: tuple[Metric, Metric]
+    seen: Fit
+    asked: Fit | None = None
+
+
 class Arena:
     """One model to beat, under one metric.
 
@@ -58,8 +78,9 @@ class Arena:
       extra: (m,) its slack, which the selection logs' metric shares.
       rng: of the bootstrap.
       say: progress.
-      own: judge each model by the noise that it expects itself, at the price of expecting it. Where bodies touch, noise
-        grows with the model's own impacts, and what one model expects would excuse its errors and not a rival's.
+      own: judge each model, fitted so, by a metric of its own: the noise that it expects and the slack that it needs,
+        at the price of both. Where bodies touch, noise grows with the model's own impacts, and what one model expects
+        or leaves unexplained would excuse its errors and not a rival's.
     """
 
     def __init__(
@@ -79,25 +100,41 @@ class Arena:
         self.on, self.extra, self.own = metric(select.problem, select.sigma, extra), extra, own
         self.blocks = clusters(fit_data.problem), clusters(select.problem)
         self.folds = fold_of(fit_data.problem)
-        self._expected: dict[int, tuple[Fit, tuple[Metric, Metric]]] = {}
+        self._owned: dict[int, _Owned] = {}
         self._face(current)
 
     def _face(self, current: Fit) -> None:
-        self.current, by = current, self._metrics(current)
+        self.current, own = current, self._own(current)
         self.base = losses(self.select.problem, self.on, current)
         self._sides = (
-            Side(self.fit_data.problem, self.blocks[0], left_out(self.fit_data.problem, by[0], current, self.folds)),
-            Side(self.select.problem, self.blocks[1], by[1].surprise(fitted_residual(self.select.problem, current))[0]),
+            Side(
+                self.fit_data.problem,
+                self.blocks[0],
+                left_out(self.fit_data.problem, own.by[0], own.fitted, self.folds),
+            ),
+            Side(
+                self.select.problem,
+                self.blocks[1],
+                own.by[1].surprise(fitted_residual(self.select.problem, own.fitted))[0],
+            ),
         )
 
-    def _metrics(self, fitted: Fit) -> tuple[Metric, Metric]:
-        """By which a model's errors count on the fit and on the selection logs."""
+    def _own(self, fitted: Fit) -> "_Owned":
+        """A model as it is judged: under the arena's metric, or fitted and seen under its own."""
         if not self.own:
-            return self.under, self.on
-        if id(fitted) not in self._expected:  # the fit is kept beside, so that its id stays its own
-            one, other = (metric(d.problem, d.expected(fitted).sigma, self.extra) for d in (self.fit_data, self.select))
-            self._expected[id(fitted)] = fitted, (one, other)
-        return self._expected[id(fitted)][1]
+            return _Owned(fitted, (self.under, self.on), fitted)
+        if id(fitted) not in self._owned:
+            plant, problem, select = fitted.plant, self.fit_data.problem, self.select.problem
+            sigma, best, by, extra = self.fit_data.expected(fitted).sigma, fitted, self.under, self.extra
+            for _ in range(_TURNS):
+                extra = slack(problem, sigma, plant, best.x)
+                before, by = by, metric(problem, sigma, extra)
+                best = fit(problem, by, plant, best.x, _OWN, known=by.translated(best.jacobian, before))
+            on = metric(select, self.select.expected(fitted).sigma, extra)
+            white, slopes = (self.under.translated(a, by) for a in (best.white[..., None], best.jacobian))
+            owned = _Owned(best, (by, on), Fit(plant, best.x, white[..., 0], slopes), fitted)
+            self._owned |= {id(fitted): owned, id(owned.seen): owned}
+        return self._owned[id(fitted)]
 
     def facing(self, current: Fit) -> "Arena":
         """The same arena with another model to beat."""
@@ -115,6 +152,24 @@ class Arena:
         under = metric(data.problem, data.sigma, extra)
         current = fit(data.problem, under, self.current.plant, self.current.x, 6)
         return Arena(data, select, current, under, extra, self.rng, self.say, own=rough)
+
+    def halved(self) -> "Arena":
+        """The arena of the same logs at half the physics step, for problems that are roll-outs.
+
+        Raises:
+          TypeError: the problem has no step.
+        """
+        problems = self.fit_data.problem, self.select.problem
+        if not all(isinstance(p, RolloutProblem) for p in problems):
+            raise TypeError("only roll-outs have a step to halve")
+        data, select = (Data(p.halved(), d.sigma) for p, d in zip(problems, (self.fit_data, self.select), strict=True))
+        current = _at_half(data.problem, self.under, self.current)
+        return Arena(data, select, current, self.under, self.extra, self.rng, self.say, own=self.own)
+
+    def enter_halved(self, coarse: Judged) -> Judged:
+        """Judge here, at half the step, a candidate that was fitted at the whole one."""
+        self.say(f"judging {self.label(coarse)} at half the physics step")
+        return self.judge(_at_half(self.fit_data.problem, self.under, coarse.fitted))
 
     # ---- entering ---------------------------------------------------------------------------------------------------
 
@@ -199,7 +254,9 @@ class Arena:
 
     def judge(self, fitted: Fit) -> Judged:
         """Compare a fitted model with the one to beat."""
-        return judge(fitted, self.current, self._metrics(fitted), self._sides, self.folds, self.rng)
+        own = self._own(fitted)
+        judged = judge(own.fitted, self.current, own.by, self._sides, self.folds, self.rng)
+        return replace(judged, fitted=own.seen)
 
     @property
     def leftover(self) -> float:
@@ -313,6 +370,11 @@ class Arena:
             "generic": new[0].generic,
             "sentence": " ".join(e.say(thetas[id(e)]) for e in new),
         }
+
+
+def _at_half(problem: Problem, under: Metric, coarse: Fit) -> Fit:
+    """A fit gone on with at half its step, by the slopes of the whole one."""
+    return fit(problem, under, finer(coarse.plant), coarse.x, _AT_HALF, known=coarse.jacobian)
 
 
 def _slopes_of_others(fitted: Fit, effect: Effect) -> Array:

@@ -38,6 +38,10 @@ class Metric:
         log_det = -2 * np.log(np.einsum("sii->si", self.inverse_root)).sum(1)
         return loss(self.whiten(residual)) + log_det
 
+    def translated(self, white: Array, other: "Metric") -> Array:
+        """What another metric of the same problem whitened, (S, m, n) columns, as this one has it."""
+        return self.inverse_root @ np.linalg.solve(other.inverse_root, white)
+
     def take(self, index: NDArray[np.intp]) -> "Metric":
         """The metric of some of the blocks."""
         return Metric(self.inverse_root[index], self.mask[index])

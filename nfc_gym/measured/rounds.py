@@ -1,7 +1,7 @@
 """One round of the search: refit the shortlist, judge it on the selection logs, and decide which law is accepted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from nfc_gym.measured.arena import Arena, contains
 from nfc_gym.measured.contest import Judged, mechanism, shortlist
@@ -17,9 +17,12 @@ _PAIRED = 3  # mechanisms that are tried in pairs
 _TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
 _LEFT = 0.1  # nats a number beyond the noise, below which a second law beside one that is believed has nothing to mend
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
+_SHARP = 0.1  # nats a number beyond the noise, below which the metric of the model to beat is sharp enough
+_FAR = 0.5  # of the best first gain: who gains less is beaten for good, and ranked by it
 _FAINT = 0.02  # nats a number beyond the noise, below which two laws have nothing to mend together
 _HOPE = 0.25  # of the gain that a law must reach: what screening must promise for a refit to be worth its time
 _MIMIC, _MIMICS = 0.95, 2  # cosine from which a law does much the same as the best one; how many such are refitted
+_RIVAL, _DUELS = 0.5, 2  # of the best gain: who comes so near meets the best again at half the step; how many do
 _BY_PSI = 0.1  # of a candidate's gain, beyond which its psi alone becomes the model to beat
 _ALIKE = 3  # families that may explain the data alike for one of them to be claimed
 
@@ -43,6 +46,12 @@ class Round:
     equivalents: list[str] = field(default_factory=list)
     reason: str = ""
     exchanged: str = ""
+
+
+def ranked(ranking: list[dict], news: list[dict]) -> list[dict]:
+    """A ranking in which some rows lead that were judged anew."""
+    ids = {row["id"] for row in news}
+    return news + [row for row in ranking if row["id"] not in ids]
 
 
 class Contest:
@@ -82,13 +91,15 @@ class Contest:
         # The report names the nearest even where there is no hope.
         entered = sorted((arena.enter([s]) for s in hopeful or picks[:1]), key=lambda j: -j.total)
         first = [j for j in entered if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
-        if not first:
+        # Where the metric is as sharp as the noise already, the second look shows what the first has shown.
+        if not first or (arena.leftover < _SHARP and all(j.total < 0 for j in first)):
             ranking = [arena.row(j) for j in entered]
             return Round([], 0.0, ranking, reason="no candidate reduces the misfit more than chance does"), None
         judged = self._final(first)
         arena = self.arena
+        far = _FAR * max(j.total for j in first)
         beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in judged)]
-        beaten = [arena.judge(j.fitted) for j in beaten]
+        beaten = [arena.judge(j.fitted) if j.total > far else j for j in beaten]
         outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *beaten]])
         believed = [j for j in judged if self._believed(j)]
         pairs = self._pairs(judged, entered) if arena.leftover > (_LEFT if believed else _FAINT) else []
@@ -102,8 +113,15 @@ class Contest:
         best = self._simplest(believed)
         if mimics := self._mimics(best, judged):
             judged = sorted([*judged, *mimics], key=lambda j: -j.total)
-            outcome.ranking = [arena.row(j) for j in mimics] + outcome.ranking
+            outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in mimics])
             best = self._simplest(believed := [j for j in judged if self._believed(j)])
+        if rivals := self._rivals(best, judged):
+            duel = self._at_half([best, *rivals])
+            # Their families' other forms were judged at the whole step alone, and lost to these there.
+            families = {arena.new(j)[0].family for j in duel}
+            judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
+            outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in duel])
+            best = self._simplest(believed := [j for j in judged if self._believed(j)] or [best])
         alike = [*(e.id for e in arena.new(best)), *self._equivalents([*judged, *beaten], best, believed[0])]
         if len({i.partition(":")[0] for i in alike}) > _ALIKE:
             # So many causes that do alike are no finding: each would be named for want of the others.
@@ -149,6 +167,27 @@ class Contest:
         near = [(likeness(one, s, self.screen.projected), s) for s in self.screened if s.effect.id not in asked]
         near = sorted((pair for pair in near if pair[0] > _MIMIC), key=lambda pair: -pair[0])
         return [arena.enter_beside(best, s) for _, s in near[:_MIMICS]]
+
+    def _rivals(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
+        """Where bodies touch, the leading candidates of other families that come near the law about to be accepted."""
+        arena, new = self.arena, self.arena.new(best)
+        if not self.rough or len(new) != 1:
+            return []
+        near: dict[str, Judged] = {}
+        for j in judged:
+            laws = arena.new(j)
+            if len(laws) == 1 and laws[0].family != new[0].family and j.total > _RIVAL * best.total:
+                near.setdefault(laws[0].family, j)
+        return list(near.values())[:_DUELS]
+
+    def _at_half(self, duel: Sequence[Judged]) -> list[Judged]:
+        """Candidates with the gains that they have at half the physics step, best first.
+
+        A coarse step errs in time by about half of itself, which a delay mends better than the lag that is at work.
+        """
+        fine = self.arena.halved()
+        found = [replace(fine.enter_halved(j), fitted=j.fitted) for j in duel]
+        return sorted(found, key=lambda j: -j.total)
 
     def _equivalents(self, judged: Sequence[Judged], best: Judged, leading: Judged) -> list[str]:
         """Ids of what explains the data as well as the law that is accepted."""

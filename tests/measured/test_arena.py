@@ -8,9 +8,10 @@ import pytest
 
 from nfc_gym.measured.arena import Arena, Data
 from nfc_gym.measured.contest import Judged
-from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.base import Param
 
 
@@ -128,3 +129,23 @@ def test_where_bodies_touch_who_expects_noise_pays_for_it(own: bool) -> None:
     expected = numbers * (2 * np.log(6) - 1) if own else 0.0
     assert found.gain == pytest.approx(expected, abs=0.2 * numbers)
     assert float(found.fit_gains.sum()) == pytest.approx(expected, abs=0.2 * numbers)
+
+
+def test_by_a_metric_of_its_own_a_model_is_refitted_and_pays_for_its_slack() -> None:
+    """Under the slack of a model that misses the slope, missing it costs nothing; under their own, all of the bend."""
+    shared, problem = arena(5.0)
+    data = shared.fit_data
+    blunt = slack(problem, data.sigma, None, np.zeros(1))  # type: ignore[arg-type]
+    under = metric(problem, data.sigma, blunt)
+    straight, bent = (stand(problem, under, m.plant, m.x) for m in (model(problem, [0.0]), model(problem, [0.0, 4.0])))
+    rng = np.random.default_rng(0)
+    common, own = (
+        Arena(data, shared.select, straight, under, blunt, rng, lambda text: None, own=own) for own in (False, True)
+    )
+    gains = [a.judge(bent).total for a in (common, own)]
+    # Four of eight numbers, 120 blocks, each with a spread of 0.1 in place of 2.9.
+    assert gains[1] == pytest.approx(480 * 2 * np.log(2.9 / 0.1), rel=0.1)
+    assert gains[1] > 2 * gains[0]
+    found = own.judge(bent).fitted
+    assert found.x[1] == pytest.approx(5.0, abs=0.1)
+    np.testing.assert_allclose(found.white, under.whiten(problem.residual(None, found.x[None]))[0], atol=1e-6)

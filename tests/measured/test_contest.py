@@ -1,5 +1,6 @@
 """Believing a candidate: folds that leave out, clusters that belong together, and gains that are not chance."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -271,3 +272,35 @@ def test_what_does_the_same_as_the_best_is_asked_before_the_best_is_believed() -
         for s in (lag, near[1])
     )
     assert contest._mimics(best, [best, asked]) == ["near_0", "near_2"]
+
+
+def rated(family: str, total: float, where: tuple[str, ...] = ("all",)) -> Judged:
+    effect = SimpleNamespace(id=f"{family}:{'+'.join(where)}", family=family, where=where)
+    return Judged(SimpleNamespace(plant=SimpleNamespace(effects=[effect])), np.zeros(1), np.zeros(1), total, 1.0)  # type: ignore[arg-type]
+
+
+def test_who_comes_near_the_best_meets_it_again_at_half_the_step() -> None:
+    """One of a family, no further form of the best's own, nobody far behind, and nobody where nothing touches."""
+    best, lag, apart = rated("delay", 100.0), rated("lag", 90.0), rated("lag", 85.0, ("one",))
+    gain, slip, faint = rated("gain", 70.0), rated("slip", 60.0), rated("wind", 20.0)
+    judged = [best, rated("delay", 95.0, ("one",)), lag, apart, gain, slip, faint]
+    said: list[Judged] = []
+
+    def again(j: Judged) -> Judged:
+        said.append(j)
+        return replace(j, total=200.0 if j is lag else 50.0, fitted=SimpleNamespace(step="half"))  # type: ignore[arg-type]
+
+    arena: Any = SimpleNamespace(
+        fit_data=SimpleNamespace(problem=SimpleNamespace(rough=True)),
+        new=lambda j: j.fitted.plant.effects,
+        halved=lambda: SimpleNamespace(enter_halved=again),
+    )
+    contest = Contest(arena, SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
+    rivals = contest._rivals(best, judged)
+    assert rivals == [lag, gain]
+    duel = contest._at_half([best, *rivals])
+    assert said == [best, lag, gain]
+    assert [j.total for j in duel] == [200.0, 50.0, 50.0]
+    assert duel[0].fitted is lag.fitted  # the search goes on at the whole step
+    contest.rough = False
+    assert contest._rivals(best, judged) == []

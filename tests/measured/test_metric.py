@@ -118,3 +118,11 @@ def test_unexplained_variance_is_what_the_noise_leaves() -> None:
     assert extra[0] == pytest.approx(9 * 0.25, rel=0.1)
     assert extra[1] < 0.1 * 4.0  # their plain variance would be 50 times as much
     np.testing.assert_array_equal(unexplained_variance(problem, 0.1 * residual * mask, sigma)[1], 0)
+
+
+def test_what_one_metric_whitened_is_seen_by_another() -> None:
+    problem, rng = Plain(np.ones((SIZE, WIDTH), bool)), np.random.default_rng(2)
+    one, other = metric(problem, covariance()), metric(problem, covariance(), np.arange(1.0, WIDTH + 1))
+    residual = rng.normal(size=(1, SIZE, WIDTH))
+    seen = other.translated(one.whiten(residual)[0][..., None], one)[..., 0]
+    np.testing.assert_allclose(seen, other.whiten(residual)[0], rtol=1e-9)
