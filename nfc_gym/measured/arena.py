@@ -1,7 +1,7 @@
 """Where the candidates of one round meet: one model to beat, one common metric, one verdict on each."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from nfc_gym.measured.contest import (
 )
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
+from nfc_gym.measured.owned import Data, Owned, owned
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
@@ -32,40 +33,10 @@ from nfc_gym.physics.effects.each import Each, split
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-_OWN, _TURNS = 6, 2  # iterations of a fit under a model's own metric, with the slopes at hand; fits and slacks in turns
 _AT_HALF = 8  # iterations of a fit at half the step, with the slopes of the whole one
 _CHORD = 10  # free parameters beyond which a candidate's refit reuses the Jacobian of the model to beat
 _EDGE = 1e-2  # of a parameter's range: nearer to a bound than this is at it
 _ALIKE = 0.1  # of a parameter's effect on the motion: what must remain when all others imitate it
-
-
-@dataclass
-class Data:
-    """A problem with the noise covariance (S, m, m) that a model expects."""
-
-    problem: Problem
-    sigma: Array
-
-    def expected(self, by: Fit) -> "Data":
-        """The same with what another model expects."""
-        return Data(self.problem, self.problem.covariance(by.plant, by.x))
-
-
-@dataclass(frozen=True)
-class _Owned:
-    """A model as it is judged.
-
-    Attributes:
-      fitted: under the metrics that it is judged by.
-      by: these, on the fit and on the selection logs.
-      seen: the same fit under the arena's metric.
-      asked: the fit that it stands for, kept so that its id stays its own.
-    """
-
-    fitted: Fit
-    by: tuple[Metric, Metric]
-    seen: Fit
-    asked: Fit | None = None
 
 
 class Arena:
@@ -100,7 +71,7 @@ class Arena:
         self.on, self.extra, self.own = metric(select.problem, select.sigma, extra), extra, own
         self.blocks = clusters(fit_data.problem), clusters(select.problem)
         self.folds = fold_of(fit_data.problem)
-        self._owned: dict[int, _Owned] = {}
+        self._owned: dict[int, Owned] = {}
         self._face(current)
 
     def _face(self, current: Fit) -> None:
@@ -119,21 +90,13 @@ class Arena:
             ),
         )
 
-    def _own(self, fitted: Fit) -> "_Owned":
-        """A model as it is judged: under the arena's metric, or fitted and seen under its own."""
+    def _own(self, fitted: Fit) -> Owned:
+        """A model as it is judged."""
         if not self.own:
-            return _Owned(fitted, (self.under, self.on), fitted)
+            return Owned(fitted, (self.under, self.on), fitted, fitted)
         if id(fitted) not in self._owned:
-            plant, problem, select = fitted.plant, self.fit_data.problem, self.select.problem
-            sigma, best, by, extra = self.fit_data.expected(fitted).sigma, fitted, self.under, self.extra
-            for _ in range(_TURNS):
-                extra = slack(problem, sigma, plant, best.x)
-                before, by = by, metric(problem, sigma, extra)
-                best = fit(problem, by, plant, best.x, _OWN, known=by.translated(best.jacobian, before))
-            on = metric(select, self.select.expected(fitted).sigma, extra)
-            white, slopes = (self.under.translated(a, by) for a in (best.white[..., None], best.jacobian))
-            owned = _Owned(best, (by, on), Fit(plant, best.x, white[..., 0], slopes), fitted)
-            self._owned |= {id(fitted): owned, id(owned.seen): owned}
+            one = owned(fitted, self.fit_data, self.select, self.under)
+            self._owned |= {id(fitted): one, id(one.seen): one}
         return self._owned[id(fitted)]
 
     def facing(self, current: Fit) -> "Arena":

@@ -8,10 +8,11 @@ gains as much at half the step; what stands in for the error of a first-order st
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.arena import Arena, Data
+from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import losses
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import Metric
+from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.shooting import RolloutProblem, finer
 from nfc_gym.physics.effects.base import Effect

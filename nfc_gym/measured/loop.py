@@ -17,7 +17,6 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together
 from nfc_gym.core.log import Log
 from nfc_gym.measured.advice import advise
-from nfc_gym.measured.arena import Data
 from nfc_gym.measured.belief import read_belief
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.calibrate import calibrate, compared
@@ -34,6 +33,7 @@ from nfc_gym.measured.metric import Metric, metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.numerics import fingerprint, one_blas_thread
 from nfc_gym.measured.outcome import report, summary, write
+from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.questions import Present, blocks_for
 from nfc_gym.measured.report import render_summary
@@ -231,7 +231,8 @@ def _fold(
     )
     if outcome["unexplained"]:
         left = outcome["unexplained"]
-        tell(f"[bold]UNEXPLAINED[/bold] at {left['coordinate']}: {left['description']}")
+        word = "[bold]UNEXPLAINED[/bold]" if outcome["verdict"] == "unexplained" else "left unexplained"
+        tell(f"{word} at {left['coordinate']}: {left['description']}")
     for finding in outcome["findings"]:
         tell(finding["text"])
     return outcome

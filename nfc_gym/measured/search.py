@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.arena import Arena, Data
+from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.fit import Fit, differs, fit
 from nfc_gym.measured.halved import artefacts
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.metric import metric
+from nfc_gym.measured.owned import Data
 from nfc_gym.measured.remainder import CLEARLY, SILENT, LawSearch, Remainder
 from nfc_gym.measured.rounds import Contest, Round
 from nfc_gym.measured.screen import Screen, Screened

@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nfc_gym.measured.arena import Arena, Data
+from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.metric import metric
+from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.base import Param

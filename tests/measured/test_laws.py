@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hidden_laws import BLOCK, CRAFT, STEP, WHEEL, Machine, Push, hover, nothing, record, slide, swing
 
-from nfc_gym.measured.arena import Arena, Data
+from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.owned import Data
 from nfc_gym.measured.remainder import LawSearch, Remainder
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle

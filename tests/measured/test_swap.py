@@ -6,9 +6,10 @@ import pytest
 from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, Log
-from nfc_gym.measured.arena import Arena, Data
+from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.fit import fit
 from nfc_gym.measured.lookout import Lookout
+from nfc_gym.measured.owned import Data
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.shooting import RolloutProblem
