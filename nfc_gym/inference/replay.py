@@ -12,6 +12,7 @@ from nfc_gym.inference.random import seeded
 
 Pass = Callable[..., tuple[Tensor, ...]]
 _WARM = 3  # passes before a capture: libraries choose their kernels and take their memory in the first ones
+_KEPT = 16  # graphs, each with memory of its own; the oldest gives way
 _MOST = 4096  # draws: above that a GPU is busy with arithmetic and not with launches
 
 
@@ -88,5 +89,7 @@ class Passes:
             self._seen.add(key)
             return run(*given)
         if key not in self._captured:
+            if len(self._captured) == _KEPT:
+                del self._captured[next(iter(self._captured))]
             self._captured[key] = Replayed(run, *given)
         return self._captured[key](*given)
