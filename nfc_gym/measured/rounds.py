@@ -169,14 +169,19 @@ class Contest:
         return [arena.enter_beside(best, s) for _, s in near[:_MIMICS]]
 
     def _rivals(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
-        """Where bodies touch, the leading candidates of other families that come near the law about to be accepted."""
+        """Where bodies touch, the leading candidates of other families that come near the law about to be accepted.
+
+        A law and its own special case are no rivals: what they share errs alike at any step.
+        """
         arena, new = self.arena, self.arena.new(best)
         if not self.rough or len(new) != 1:
             return []
         near: dict[str, Judged] = {}
         for j in judged:
             laws = arena.new(j)
-            if len(laws) == 1 and laws[0].family != new[0].family and j.total > _RIVAL * best.total:
+            if len(laws) != 1 or laws[0].family == new[0].family or j.total <= _RIVAL * best.total:
+                continue
+            if not contains(laws[0], new[0]) and not contains(new[0], laws[0]):
                 near.setdefault(laws[0].family, j)
         return list(near.values())[:_DUELS]
 

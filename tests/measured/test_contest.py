@@ -275,7 +275,10 @@ def test_what_does_the_same_as_the_best_is_asked_before_the_best_is_believed() -
 
 
 def rated(family: str, total: float, where: tuple[str, ...] = ("all",)) -> Judged:
-    effect = SimpleNamespace(id=f"{family}:{'+'.join(where)}", family=family, where=where)
+    own = FAMILIES[family]
+    effect = SimpleNamespace(
+        id=f"{family}:{'+'.join(where)}", family=family, where=where, simpler=own.simpler, covers=own.covers
+    )
     return Judged(SimpleNamespace(plant=SimpleNamespace(effects=[effect])), np.zeros(1), np.zeros(1), total, 1.0)  # type: ignore[arg-type]
 
 
@@ -304,3 +307,13 @@ def test_who_comes_near_the_best_meets_it_again_at_half_the_step() -> None:
     assert duel[0].fitted is lag.fitted  # the search goes on at the whole step
     contest.rough = False
     assert contest._rivals(best, judged) == []
+
+
+def test_a_law_and_its_special_case_do_not_meet_again() -> None:
+    arena: Any = SimpleNamespace(
+        fit_data=SimpleNamespace(problem=SimpleNamespace(rough=True)), new=lambda j: j.fitted.plant.effects
+    )
+    contest = Contest(arena, SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
+    plain, wider, other = rated("coulomb", 100.0), rated("stribeck", 99.0), rated("armature", 98.0)
+    assert contest._rivals(plain, [plain, wider, other]) == [other]
+    assert contest._rivals(wider, [wider, plain, other]) == [other]
