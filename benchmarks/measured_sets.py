@@ -5,7 +5,7 @@
 
 The recordings, their splits and their scores are those of `score/recordings.py` in the data folder; everything that is
 particular to a machine is in its folder under `benchmarks/measured/`: the model to start from, and a mapping file.
-What is finished in the work folder is not run again.
+A run that was killed goes on in the same work folder; a set that is finished there is measured anew.
 Without the data the benchmark says so and ends. `--quick` runs one set (one fold of it) to show that the way through
 works.
 """
@@ -67,8 +67,11 @@ def run_set(name: str, args: argparse.Namespace) -> dict[str, list[float]]:
     data, work = args.data, args.work
     mapping, out = work / name / "mapping.yaml", work / name / "loop"
     close = command("close-loop", mapping, "--out", out, "--jobs", args.jobs, "--seed", args.seed)
+    if (out / "report.json").exists():
+        shutil.rmtree(out)
     folds = [f.name for f in load(mapping).folds]
     if args.at_once > 1 and len(folds) > 1:  # the whole run finds them done
+        folds = [name for name in folds if not (out / name / "report.json").exists()]
         with ThreadPoolExecutor(args.at_once) as pool:
             list(pool.map(lambda fold: subprocess.run([*close, "--fold", fold], check=True), folds))
     subprocess.run(close, check=True)
