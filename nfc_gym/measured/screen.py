@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
+from scipy.optimize import least_squares, lsq_linear
 
 from nfc_gym.measured.box import box
 from nfc_gym.measured.fit import Fit, fit
@@ -190,7 +190,10 @@ class Screen:
         if overrides(effect, "chart"):
             null = effect.chart(effect.null)
             spanned = effect.chart(probe) - null
-            theta = np.clip(effect.unchart(np.asarray(null + solution @ spanned)), effect.low, effect.high)
+            free = np.asarray(effect.unchart(np.asarray(null + solution @ spanned)), np.float64)
+            theta = np.clip(free, effect.low, effect.high)
+            if (theta != free).any():
+                theta = _charted(effect, columns, -self.projected, spanned, [theta, *probe])
             multiple = np.asarray(np.linalg.lstsq(spanned.T, effect.chart(theta) - null, rcond=None)[0], np.float64)
             return self._gain(columns, multiple), theta, multiple
         sizing = [i for i, p in enumerate(effect.params) if not p.shape]
@@ -251,6 +254,24 @@ def _bounded(columns: Array, target: Array, free: Array, low: Array, high: Array
     out = np.zeros(len(free))
     out[shows] = lsq_linear(small[:, :-1], small[:, -1], (low[shows], high[shows])).x
     return out
+
+
+def _charted(effect: Effect, columns: Array, target: Array, spanned: Array, starts: Sequence[Array]) -> Array:
+    """Parameters (k,) within their bounds whose coordinates, in columns (n, k) of (k, k) steps, come nearest a target.
+
+    A lump whose mass psi can take up as well may weigh less than nothing to a straight line; cut to no mass at all, it
+    has no place either, and a lump that shifts the centre of mass as the logs want would count for nothing.
+    """
+    small = np.asarray(np.linalg.qr(np.column_stack([columns, target]), mode="r"), np.float64)
+    null, width = effect.chart(effect.null), effect.high - effect.low
+
+    def left(theta: Array) -> Array:
+        multiple = np.linalg.lstsq(spanned.T, effect.chart(theta) - null, rcond=None)[0]
+        return np.asarray(small[:, :-1] @ multiple - small[:, -1], np.float64)
+
+    inside = [np.clip(t, effect.low + 1e-6 * width, effect.high - 1e-6 * width) for t in starts]
+    found = [least_squares(left, t, bounds=(effect.low, effect.high), x_scale=width, max_nfev=50) for t in inside]
+    return np.asarray(min(found, key=lambda f: f.cost).x, np.float64)
 
 
 def _span(columns: Array) -> Array:

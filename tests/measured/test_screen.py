@@ -1,5 +1,7 @@
 """Looking closer where bodies may touch: sizes are climbed, and blocks with large errors are never left out."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.each import split
+from nfc_gym.physics.effects.inertial import ComShift, Payload
 from nfc_gym.physics.effects.joint import SpringOffset
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.parameters import ParameterSpace
@@ -37,7 +40,7 @@ TWO = """
 <mujoco>
   <option timestep="0.01" integrator="implicitfast"/>
   <worldbody>
-    <body><joint name="a" axis="0 1 0" damping="0.1"/><geom size="0.05" pos="0 0 -0.3"/></body>
+    <body name="left"><joint name="a" axis="0 1 0" damping="0.1"/><geom size="0.05" pos="0 0 -0.3"/></body>
     <body pos="0 1 0"><joint name="b" axis="0 1 0" damping="0.1"/><geom size="0.05" pos="0 0 -0.3"/></body>
   </worldbody>
 </mujoco>
@@ -119,6 +122,38 @@ def test_a_twin_begins_elsewhere_on_some_of_the_blocks(screen: Screen, monkeypat
     assert repeated(here[lens.shared].reshape(-1, 1), there.reshape(-1, 1))[0] > 0.95
 
 
+def of_two(model: mujoco.MjModel, rows: np.ndarray, rng: np.random.Generator) -> Screen:
+    """What two hinges did, (n, 4) positions and speeds, against their model."""
+    noise = {"a:pos": 0.001, "b:pos": 0.001, "a:vel": 0.01, "b:vel": 0.01}
+    seen = rows + rng.normal(size=rows.shape) * list(noise.values())
+    channels = {f"joint:{n}": Channel(seen[:, i], noise=sd) for i, (n, sd) in enumerate(noise.items())}
+    log = Log("run", DT * np.arange(len(rows)), {}, channels)
+    problem = RolloutProblem(model, [log], [estimate_states(model, log)], Layout(0.3, 0.0, (0.1, 0.3), 0.3, DT))
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    under = metric(problem, problem.covariance(plant, plant.null))
+    return Screen(problem, under, stand(problem, under, plant, plant.null))
+
+
+def test_a_lump_is_screened_where_straight_lines_want_less_than_no_mass() -> None:
+    """The first bob is lighter than its model and hangs off its place: a lump can do the second, and not the first."""
+    model = mujoco.MjModel.from_xml_string(TWO)
+    real = copy.copy(model)
+    real.body_mass[1] *= 0.95
+    real.body_inertia[1] *= 0.95
+    real.body_ipos[1, 0] += 0.03
+    rng, data, rows = np.random.default_rng(0), mujoco.MjData(real), []
+    data.qpos[:] = 0.5, -0.4
+    for _ in range(300):
+        rows.append((*data.qpos, *data.qvel))
+        mujoco.mj_step(real, data)
+    screen = of_two(model, np.array(rows), rng)
+    places = {axis: {"probes": (c, c + 0.05)} for axis, c in zip("xyz", (0.0, 0.0, -0.3), strict=True)}
+    shift = screen.try_one(ComShift(("left",), ComShift.PARAMS))
+    lump = screen.try_one(Payload(("left",), sized(Payload.PARAMS, mass={"probes": (0.08,)}, **places)))
+    assert lump.theta[0] > 0
+    assert lump.gain > 0.5 * shift.gain > 0
+
+
 def test_springs_with_values_of_their_own_are_screened() -> None:
     """Two parameters a place, one of them a shape, and rows that span the coordinates of a chart."""
     model = mujoco.MjModel.from_xml_string(TWO)
@@ -128,17 +163,9 @@ def test_springs_with_values_of_their_own_are_screened() -> None:
         rows.append((*data.qpos, *data.qvel))
         data.qfrc_applied[:] = -0.2 * (data.qpos - 0.3)  # the springs that the model lacks
         mujoco.mj_step(model, data)
-    seen = np.array(rows) + rng.normal(size=(300, 4)) * [0.001, 0.001, 0.01, 0.01]
-    names = ("a:pos", "b:pos", "a:vel", "b:vel")
-    noise = dict(zip(names, (0.001, 0.001, 0.01, 0.01), strict=True))
-    channels = {f"joint:{n}": Channel(seen[:, i], noise=noise[n]) for i, n in enumerate(names)}
-    log = Log("run", DT * np.arange(300), {}, channels)
-    problem = RolloutProblem(model, [log], [estimate_states(model, log)], Layout(0.3, 0.0, (0.1, 0.3), 0.3, DT))
-    plant = Plant(model, ParameterSpace(model, []), nthread=1)
-    under = metric(problem, problem.covariance(plant, plant.null))
-    screen = Screen(problem, under, stand(problem, under, plant, plant.null))
+    screen = of_two(model, np.array(rows), rng)
     sizes = {"stiffness": {"probes": (0.1, 0.4)}, "rest": {"probes": (0.0, 0.5)}}
-    apart = split(SpringOffset(("a", "b"), sized(SpringOffset.PARAMS, **sizes)), plant)
+    apart = split(SpringOffset(("a", "b"), sized(SpringOffset.PARAMS, **sizes)), screen.current.plant)
     assert apart is not None
     found = screen.try_one(apart[0])
     assert found.columns.shape[1] == 4
