@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from functools import cache, cached_property
 
 import mujoco
 import numpy as np
@@ -11,13 +12,14 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.instant import InstantProblem, Track
-from nfc_gym.physics.effects.base import Context, Forces, actuator_names, overrides
+from nfc_gym.physics.effects.base import Context, Effect, Forces, actuator_names, overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import resolve, write_field
 from nfc_gym.physics.past import trace
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
+_NO_CUT = 1e10  # dry friction, N or N m, that no motion overcomes
 _LOAD_PASSES = 3  # friction that depends on the actuator's load, and a load that includes the friction: iterations
 
 
@@ -47,108 +49,180 @@ class InverseProblem(InstantProblem):
 
     def evaluate(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
         """See `InstantProblem`."""
-        return [np.stack([actuator_forces(plant, row, t)[:, self.actuators] for row in x]) for t in tracks]
+        out: list[Array] = [np.zeros(0)] * len(tracks)
+        for dt in dict.fromkeys(t.dt for t in tracks):
+            of = [i for i, t in enumerate(tracks) if t.dt == dt]
+            for i, forces in zip(of, actuator_forces(plant, x, [tracks[i] for i in of]), strict=True):
+                out[i] = forces[..., self.actuators]
+        return out
 
 
-def actuator_forces(plant: Plant, x: Array, t: Track) -> Array:
-    """(T, nu) forces of joint actuators that the measured motion of a track needs at parameters x (size,).
+def actuator_forces(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
+    """Forces of joint actuators that measured motions need, at parameter vectors.
 
     Generalised forces come from `mj_inverse`, less what force effects add; dry friction that depends on the actuator's
     own load is iterated to consistency. Each joint is taken to have one actuator.
+
+    Args:
+      plant: the machine.
+      x: (P, size).
+      tracks: of one step dt.
+
+    Returns:
+      (P, T, nu) for each track.
     """
-    model, data = copy.copy(plant.model), mujoco.MjData(plant.model)
-    fields = ModelFields(model, plant.model)
-    for (name, of), values in t.known.items():
-        write_field(fields, resolve(model, name, of), values[0])
-    plant.write(fields, x)
-    fields.commit()
-    thetas = plant.split(x)[1]
-    base = model.dof_frictionloss.copy()
-    motion = _Motion(model, data, t)
-    rubbing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "friction")]
-    ctx = Context(
-        plant.model,
-        t.dt,
-        t.qpos,
-        t.qvel,
-        t.ctrl,
-        t.exogenous,
-        motion.data,
-        lambda name: _tile(base if name == "dof_frictionloss" else getattr(model, name), len(t.time)),
-    )
-    force = None if rubbing else motion.inverse(None)
-    for _ in range(_LOAD_PASSES if rubbing else 0):
-        level = np.tile(base, (len(t.time), 1))
-        for effect, theta in rubbing:
-            dofs, more = effect.friction(ctx, np.broadcast_to(theta, (len(t.time), len(theta))))
-            level[:, dofs] += more
-        force = motion.inverse(level)
-        if not motion.load_read:
-            break
-        motion.fields["qfrc_actuator"] = force
-    assert force is not None
-    pushing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "force")]
-    if pushing:
-        motion.fields["qfrc_actuator"] = force
-        out = Forces(np.zeros((len(t.time), model.nv)), np.zeros((len(t.time), model.nbody, 6)))
-        moments = np.arange(len(t.time))[:, None]
-        for effect, theta in pushing:
-            values = np.broadcast_to(theta, (len(t.time), len(theta)))
-            ctx.memory = trace(effect, ctx, values, [moments]) if overrides(effect, "follow") else None
-            effect.force(ctx, values, out)
-        force = force - out.qfrc - motion.carried(out.xfrc)
-    dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-    actuation = force[:, dofs] / model.actuator_gear[:, 0]
-    for effect, theta in zip(plant.effects, thetas, strict=True):
-        if overrides(effect, "demand"):
-            actuation = effect.demand(actuation, theta, t.exogenous, t.dt)
-    return actuation
+    psi, thetas = plant.split(x)
+    edits = [theta for e, theta in zip(plant.effects, thetas, strict=True) if overrides(e, "model")]
+    same = [row.tobytes() for row in np.concatenate([psi, *edits], -1)]  # parameter vectors of one and the same model
+    parts: list[_Needed] = []
+    for t in tracks:
+        motions: dict[bytes, _Motion] = {}
+        for key, row in zip(same, x, strict=True):
+            if key not in motions:
+                motions[key] = _Motion(plant, row, t)
+            parts.append(_Needed(plant, row, motions[key]))
+    if any(overrides(e, "force") for e in plant.effects):
+        _push(plant, x, tracks, parts)
+    count = len(x)
+    needs = [part.actuation() for part in parts]
+    return [np.stack(needs[i : i + count]) for i in range(0, len(needs), count)]
 
 
-def _tile(a: Array, rows: int) -> Array:
-    return np.broadcast_to(a, (rows, *np.shape(a)))
+def _push(plant: Plant, x: Array, tracks: Sequence[Track], parts: Sequence["_Needed"]) -> None:
+    """Take what the effects' forces do off what is needed, of all parameter vectors and tracks at once."""
+    count, model = len(x), plant.model
+    lengths = [len(t.time) for t in tracks]
+    ends = count * np.cumsum([0, *lengths])
+    order = [a + np.arange(n)[:, None] + n * np.arange(count) for a, n in zip(ends, lengths, strict=False)]
+    join = lambda name: np.concatenate([np.tile(getattr(t, name), (count, 1)) for t in tracks])  # noqa: E731
+    signals = {k: np.concatenate([np.tile(t.exogenous[k], count) for t in tracks]) for k in tracks[0].exogenous}
+    data = lambda name: np.concatenate([part.data(name) for part in parts])  # noqa: E731
+    nominal = lambda name: np.concatenate([part.motion.nominal(name) for part in parts])  # noqa: E731
+    ctx = Context(model, tracks[0].dt, join("qpos"), join("qvel"), join("ctrl"), signals, cache(data), cache(nominal))
+    out = Forces(np.zeros((ends[-1], model.nv)), np.zeros((ends[-1], model.nbody, 6)))
+    rows = np.concatenate([np.repeat(x, n, 0) for n in lengths])
+    for effect, theta in zip(plant.effects, plant.split(rows)[1], strict=True):
+        if overrides(effect, "force"):
+            ctx.memory = trace(effect, ctx, theta, order) if overrides(effect, "follow") else None
+            effect.force(ctx, theta, out)
+    cuts = np.cumsum(np.repeat(lengths, count))[:-1]
+    for part, qfrc, xfrc in zip(parts, np.split(out.qfrc, cuts), np.split(out.xfrc, cuts), strict=True):
+        part.force = part.force - qfrc - part.motion.carried(xfrc)
+
+
+class _Needed:
+    """What one parameter vector (size,) needs along one track.
+
+    Attributes:
+      force: (T, nv) generalised forces.
+    """
+
+    def __init__(self, plant: Plant, x: Array, motion: "_Motion") -> None:
+        self.plant, self.motion, self._thetas = plant, motion, plant.split(x)[1]
+        self._load: Array | None = None
+        rubbing = [(e, th) for e, th in zip(plant.effects, self._thetas, strict=True) if overrides(e, "friction")]
+        self.force = self._rubbed(rubbing) if rubbing else motion.bare
+        self._load = self.force
+
+    def _rubbed(self, rubbing: Sequence[tuple[Effect, Array]]) -> Array:
+        motion, t = self.motion, self.motion.track
+        count = len(t.time)
+        ctx = Context(self.plant.model, t.dt, t.qpos, t.qvel, t.ctrl, t.exogenous, self.data, motion.nominal)
+        force = np.zeros((count, 0))
+        for _ in range(_LOAD_PASSES):
+            level = np.tile(motion.friction, (count, 1))
+            for effect, theta in rubbing:
+                dofs, more = effect.friction(ctx, np.broadcast_to(theta, (count, len(theta))))
+                level[:, dofs] += more
+            force = motion.inverse(level)
+            if self._load is None:  # no law asked for the actuators' own load
+                break
+            self._load = force
+        return force
+
+    def data(self, name: str) -> Array:
+        """A derived field (T, ...); the actuators' own load is what was found so far."""
+        if name != "qfrc_actuator":
+            return self.motion.data(name)
+        if self._load is None:
+            self._load = self.motion.bare
+        return self._load
+
+    def actuation(self) -> Array:
+        """(T, nu) forces of the actuators, effects on these included."""
+        model, t = self.motion.model, self.motion.track
+        out = self.force[:, model.jnt_dofadr[model.actuator_trnid[:, 0]]] / model.actuator_gear[:, 0]
+        for effect, theta in zip(self.plant.effects, self._thetas, strict=True):
+            if overrides(effect, "demand"):
+                out = effect.demand(out, theta, t.exogenous, t.dt)
+        return out
 
 
 class _Motion:
-    """Inverse dynamics along a track, with the derived fields that effects may read."""
+    """Inverse dynamics of one model along a track, with the derived fields that effects may read."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, t: Track) -> None:
-        self.model, self._data, self._track = model, data, t
-        self.fields: dict[str, Array] = {}
-        self.load_read = False  # whether a law asked for the actuators' own load, which then must be made consistent
+    def __init__(self, plant: Plant, x: Array, t: Track) -> None:
+        self.model, self.track = copy.copy(plant.model), t
+        self._data, self._fields = mujoco.MjData(plant.model), dict[str, Array]()
+        fields = ModelFields(self.model, plant.model)
+        for (name, of), values in t.known.items():
+            write_field(fields, resolve(self.model, name, of), values[0])
+        plant.write(fields, x)
+        fields.commit()
+        self.friction = self.model.dof_frictionloss.copy()
 
-    def inverse(self, friction: Array | None) -> Array:
-        """(T, nv) generalised forces; `friction` (T, nv) overrides the dry friction sample by sample."""
-        m, d, t = self.model, self._data, self._track
-        out, bias, passive = (np.empty((len(t.time), m.nv)) for _ in range(3))
+    @cached_property
+    def _solved(self) -> tuple[Array, Array]:
+        """(T, nv) each: generalised forces without dry friction, and the friction that would hold each joint.
+
+        MuJoCo's friction of a joint is the force that would hold it, cut at `frictionloss`, and in inverse dynamics no
+        joint's depends on another's: one pass with no cut tells what is needed under any.
+        """
+        m, d, t = self.model, self._data, self.track
+        free, holding, bias, passive = (np.zeros((len(t.time), m.nv)) for _ in range(4))
         # Each look at a field of `MjData` makes a new view, which costs as much as the dynamics of a small machine.
-        qpos, qvel, qacc, level = d.qpos, d.qvel, d.qacc, m.dof_frictionloss
+        qpos, qvel, qacc = d.qpos, d.qvel, d.qacc
         needed, its_bias, its_passive = d.qfrc_inverse, d.qfrc_bias, d.qfrc_passive
+        m.dof_frictionloss[:] = _NO_CUT
         for k, state in enumerate(zip(t.qpos, t.qvel, t.qacc, strict=True)):
             qpos[:], qvel[:], qacc[:] = state
-            if friction is not None:
-                level[:] = friction[k]
             mujoco.mj_inverse(m, d)
-            out[k], bias[k], passive[k] = needed, its_bias, its_passive
-        self.fields |= {"qfrc_bias": bias, "qfrc_passive": passive}
-        return out
+            if d.nf:  # the model may have switched friction off
+                holding[k] = d.efc_force[d.ne : d.ne + m.nv]
+            free[k], bias[k], passive[k] = needed, its_bias, its_passive
+        m.dof_frictionloss[:] = self.friction
+        self._fields |= {"qfrc_bias": bias, "qfrc_passive": passive}
+        return free + holding, holding
+
+    def inverse(self, friction: Array) -> Array:
+        """(T, nv) generalised forces with dry friction (nv,) or (T, nv)."""
+        free, holding = self._solved
+        return free - np.clip(holding, -friction, friction)
+
+    @cached_property
+    def bare(self) -> Array:
+        """(T, nv) generalised forces without the effects' friction."""
+        return self.inverse(self.friction)
+
+    def nominal(self, name: str) -> Array:
+        """A model field (T, ...) as it was before any friction of effects."""
+        field = self.friction if name == "dof_frictionloss" else getattr(self.model, name)
+        return np.broadcast_to(field, (len(self.track.time), *np.shape(field)))
 
     def data(self, name: str) -> Array:
         """A derived field (T, ...) of positions and velocities, computed along the track when first asked for."""
-        if name == "qfrc_actuator":
-            self.load_read = True
-            if name not in self.fields:
-                self.fields[name] = self.inverse(None)
-        if name not in self.fields:
+        if name in ("qfrc_bias", "qfrc_passive"):
+            _ = self._solved
+        if name not in self._fields:
             batch = self._placed()
             values = batch.bind(name)
             batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
-            self.fields[name] = values.copy()
-        return self.fields[name]
+            self._fields[name] = values.copy()
+        return self._fields[name]
 
     def _placed(self) -> Batch:
-        batch = Batch(self.model, len(self._track.time))
-        batch.qpos[...], batch.qvel[...] = self._track.qpos, self._track.qvel
+        batch = Batch(self.model, len(self.track.time))
+        batch.qpos[...], batch.qvel[...] = self.track.qpos, self.track.qvel
         return batch
 
     def carried(self, wrenches: Array) -> Array:

@@ -102,22 +102,31 @@ def trace(effect: Effect, ctx: Context, theta: Array, tracks: Sequence[Index]) -
       effect: one with `follow`.
       ctx: N moments, in any order.
       theta: (N, k).
-      tracks: for each track, (T, B) the moments in order of time, B of them side by side.
+      tracks: for each track, (T, B) the moments in order of time, B of them side by side. All tracks go side by side,
+        whatever their lengths: it is the steps in Python that cost.
 
     Returns:
       the hidden state at every moment, (N, ...) each array of it.
     """
     out: Any = None
-    for order in tracks:
-        memory: Any = None
-        for k, rows in enumerate(order):
-            signals = {n: s[rows] for n, s in ctx.exogenous.items()}
-            nominal = lambda name, rows=rows: ctx.nominal(name)[rows]  # noqa: E731
-            now = Context(ctx.model, ctx.dt, ctx.q[rows], ctx.v[rows], ctx.ctrl[rows], signals, ctx.data, nominal)
-            memory = effect.follow(now, theta[rows], effect.rest(now, theta[rows]) if k == 0 else memory)
-            out = _room(memory, len(theta)) if out is None else out
-            _put(out, memory, rows)
+    memory: Any = None
+    longest_first = sorted(tracks, key=len, reverse=True)
+    for k in range(max(map(len, tracks), default=0)):
+        rows = np.concatenate([order[k] for order in longest_first if len(order) > k])
+        signals = {n: s[rows] for n, s in ctx.exogenous.items()}
+        nominal = lambda name, rows=rows: ctx.nominal(name)[rows]  # noqa: E731
+        now = Context(ctx.model, ctx.dt, ctx.q[rows], ctx.v[rows], ctx.ctrl[rows], signals, ctx.data, nominal)
+        before = effect.rest(now, theta[rows]) if k == 0 else _first(memory, len(rows))
+        memory = effect.follow(now, theta[rows], before)
+        out = _room(memory, len(theta)) if out is None else out
+        _put(out, memory, rows)
     return out
+
+
+def _first(memory: Any, count: int) -> Any:
+    if isinstance(memory, tuple | list):
+        return type(memory)(_first(part, count) for part in memory)
+    return memory[:count]
 
 
 def _room(like: Any, count: int) -> Any:

@@ -104,7 +104,7 @@ def test_inverse_problems_lead_hidden_states_along_the_log(plant: Plant) -> None
     log = replace(log, channels=log.channels | {"force:motor": Channel(log.controls["ctrl:motor"], "N m", 1e-3)})
     t = track(MODEL, log, estimate_states(MODEL, log), ["force:motor"], 1)
     error = [
-        np.std((actuator_forces(plant, x, t) - t.measured)[20:-20])
+        np.std((actuator_forces(plant, x[None], [t])[0][0] - t.measured)[20:-20])
         for x in (np.array([LEVEL, TRANSITION]), np.array([0.0, TRANSITION]))
     ]
     assert error[0] < 0.35 * error[1]
