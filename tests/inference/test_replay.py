@@ -1,5 +1,7 @@
 """`Passes`: what is replayed on a GPU is what the network computes; the same tests run on a processor, unreplayed."""
 
+from contextlib import nullcontext, suppress
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from problems import motion_windows, network
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.random import seeded
+from nfc_gym.inference.replay import tensor_cores
 
 DEVICES = [
     "cpu",
@@ -38,7 +41,7 @@ def direct(net: Network, window: Window, n: int, seed: int, **how: int) -> np.nd
     """(n, d) draws of psi by the network itself, with no `Passes` between."""
     device = next(net.parameters()).device
     row = lambda x: torch.as_tensor(np.asarray(x), dtype=torch.float32, device=device)[None]  # noqa: E731
-    with torch.no_grad():
+    with torch.no_grad(), tensor_cores() if device.type == "cuda" else nullcontext():
         given = net.encode(row(window.states), row(window.actions))
         with seeded(np.random.default_rng(seed), device):
             z = net.sample(n, given, len(net.blocks), **how)[0, :, : net.prior.size]
@@ -87,3 +90,12 @@ def test_draws_differ_from_turn_to_turn(device: str) -> None:
     given, rng = kept.to(device).given(windows[0]), np.random.default_rng(0)
     drawn = [given.sample(7, rng).psi for _ in range(4)]
     assert len({d.tobytes() for d in drawn}) == 4
+
+
+def test_tensor_cores_leave_no_trace() -> None:
+    before = torch.get_float32_matmul_precision()
+    with tensor_cores():
+        assert torch.get_float32_matmul_precision() == "high"
+    with suppress(RuntimeError), tensor_cores():
+        raise RuntimeError
+    assert torch.get_float32_matmul_precision() == before

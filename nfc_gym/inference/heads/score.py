@@ -36,10 +36,15 @@ class Block(nn.Module):
         nn.init.zeros_(self.modulate.weight)
         nn.init.zeros_(self.modulate.bias)
 
+    def modulation(self, condition: Tensor) -> Tensor:
+        """(..., 3 hidden) shift, scale and gate of a condition (..., hidden), the scale about 1."""
+        shift, scale, gate = self.modulate(condition).chunk(3, -1)
+        return torch.cat([shift, 1 + scale, gate], -1)
+
     def forward(self, h: Tensor, modulation: Tensor) -> Tensor:
-        """The shape of h; the modulation (three times as wide) is broadcast against it."""
+        """The shape of h; the modulation is broadcast against it."""
         shift, scale, gate = modulation.chunk(3, -1)
-        return torch.addcmul(h, gate, self.path(torch.addcmul(shift, self.norm(h), 1 + scale)))
+        return torch.addcmul(h, gate, self.path(torch.addcmul(shift, self.norm(h), scale)))
 
 
 class Score(Density):
@@ -83,7 +88,7 @@ class Score(Density):
         """What the window, the angle and the number of present blocks make of each layer; all three are broadcast."""
         flags = (torch.arange(len(self.sizes), device=phi.device) < blocks[..., None]).to(phi.dtype)
         c = nn.functional.silu(condition + self.time(time_features(phi)) + self.present(flags))
-        return (*(cast(Block, b).modulate(c) for b in self.blocks), self.affine(c))
+        return (*(cast(Block, b).modulation(c) for b in self.blocks), self.affine(c))
 
     def v(self, x: Tensor, here: Tensor | None, modulations: Sequence[Tensor]) -> Tensor:
         """v (..., d) at x; `here` is 1 for entries of blocks that are present, None where all are."""
