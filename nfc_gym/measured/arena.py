@@ -150,16 +150,23 @@ class Arena:
         return self._refit(plant, start, 10, self.current.jacobian, quick=self.fit_data.problem.costly)
 
     def _refit(self, plant: Plant, start: Array, rounds: int, known: Array, quick: bool = False) -> Judged:
-        """Fit and judge; `known` (S, m, j) is the Jacobian of the first j free parameters.
+        return self.judge(self._fit(plant, start, rounds, known, quick))
+
+    def _fit(self, plant: Plant, start: Array, rounds: int, known: Array, quick: bool = False) -> Fit:
+        """Fit; `known` (S, m, j) is the Jacobian of the first j free parameters.
 
         With few of them a full Jacobian costs little; with many, or for a quick look, they keep the one that they have
         (the chord method).
         """
         chord = known if quick or known.shape[-1] > _CHORD else None
-        return self.judge(fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord))
+        return fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord)
 
-    def enter_beside(self, leader: Judged, pick: Screened) -> Judged:
-        """Fit a screened candidate in a leading one's place, also from where the leader's fit took all the rest."""
+    def enter_beside(self, leader: Judged, pick: Screened, before: Judged | None = None) -> Judged:
+        """Fit a screened candidate in a leading one's place, also from where the leader's fit took all the rest.
+
+        Args:
+          before: an earlier fit of it, which this one goes on with if nothing else is better.
+        """
         self.say(f"refitting {pick.effect.id}, which does much the same")
         current = self.current
         plant = current.plant.with_effects([*current.plant.effects, pick.effect])
@@ -168,7 +175,9 @@ class Arena:
         starts = np.stack([np.concatenate([x, pick.theta]) for x in (leader.fitted.x[:width], moved, current.x)])
         values = loss(self.under.whiten(self.fit_data.problem.residual(plant, starts))).sum(-1)
         known = leader.fitted.jacobian[..., : current.jacobian.shape[-1]]
-        return self._refit(plant, starts[int(values.argmin())], 10, known, quick=self.fit_data.problem.costly)
+        begun = [(plant, starts[int(values.argmin())])]
+        begun += [(before.fitted.plant, before.fitted.x)] if before else []
+        return self.judge(min((self._fit(*b, 10, known) for b in begun), key=lambda f: float(f.losses.sum())))
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
         """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""

@@ -112,6 +112,8 @@ class Contest:
             return outcome, None
         best = self._simplest(believed)
         if mimics := self._mimics(best, judged):
+            again = {arena.label(j) for j in mimics}
+            judged = [j for j in judged if arena.label(j) not in again]
             judged = sorted([*judged, *mimics], key=lambda j: -j.total)
             outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in mimics])
             best = self._simplest(believed := [j for j in judged if self._believed(j)])
@@ -153,20 +155,23 @@ class Contest:
         return judged
 
     def _mimics(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
-        """Fits of what does nearly the same as the law about to be accepted, and was not asked in full.
+        """Fits, begun beside it, of what does nearly the same as the law about to be accepted.
 
-        A first look may lose the right one of two laws that straight lines cannot tell apart.
+        A first look may lose the right one of two laws that straight lines cannot tell apart; and where a law and psi
+        share a valley (a lump on a torso, and hips that were taken for heavier) it may have stopped half way.
         """
         arena, new = self.arena, self.arena.new(best)
         by_id = {s.effect.id: s for s in self.screened}
-        asked = {arena.label(j) for j in judged} | {e.id for e in new}
+        asked = {arena.label(j): j for j in judged}
         added = len(best.fitted.plant.effects) > len(arena.current.plant.effects)
         if len(new) != 1 or new[0].id not in by_id or not added:
             return []
         one = by_id[new[0].id]
-        near = [(likeness(one, s, self.screen.projected), s) for s in self.screened if s.effect.id not in asked]
-        near = sorted((pair for pair in near if pair[0] > _MIMIC), key=lambda pair: -pair[0])
-        return [arena.enter_beside(best, s) for _, s in near[:_MIMICS]]
+        others = [s for s in self.screened if s.effect is not new[0] and (self.rough or s.effect.id not in asked)]
+        near = [(likeness(one, s, self.screen.projected), s) for s in others]
+        near = sorted((pair for pair in near if pair[0] > _MIMIC), key=lambda pair: -pair[0])[:_MIMICS]
+        found = [(asked.get(s.effect.id), arena.enter_beside(best, s, asked.get(s.effect.id))) for _, s in near]
+        return [j for before, j in found if before is None or j.total > before.total]
 
     def _rivals(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
         """Where bodies touch, the leading candidates of other families that come near the law about to be accepted.
