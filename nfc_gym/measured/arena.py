@@ -161,13 +161,23 @@ class Arena:
         chord = known if quick or known.shape[-1] > _CHORD else None
         return fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord)
 
-    def enter_beside(self, leader: Judged, pick: Screened, before: Judged | None = None) -> Judged:
-        """Fit a screened candidate in a leading one's place, also from where the leader's fit took all the rest.
-
-        Args:
-          before: an earlier fit of it, which this one goes on with if nothing else is better.
-        """
+    def enter_beside(self, leader: Judged, pick: Screened) -> Judged:
+        """Fit a screened candidate in a leading one's place, also from where the leader's fit took all the rest."""
         self.say(f"refitting {pick.effect.id}, which does much the same")
+        return self.judge(self._beside(leader, pick, quick=self.fit_data.problem.costly))
+
+    def fitted_on(self, leader: Judged, other: Judged, pick: Screened) -> Judged:
+        """A candidate with a fit that goes on from where it stopped, or from where the leader's took all the rest.
+
+        Where a law and psi share a valley (a lump on a torso, and hips that were taken for heavier) it may have stopped
+        half way.
+        """
+        self.say(f"fitting {pick.effect.id} on")
+        none = leader.fitted.jacobian[..., :0]
+        found = [other.fitted, self._beside(leader, pick), self._fit(other.fitted.plant, other.fitted.x, 10, none)]
+        return replace(other, fitted=min(found, key=lambda f: float(f.losses.sum())))
+
+    def _beside(self, leader: Judged, pick: Screened, quick: bool = False) -> Fit:
         current = self.current
         plant = current.plant.with_effects([*current.plant.effects, pick.effect])
         limits, width = box(current.plant), len(current.x)
@@ -175,9 +185,7 @@ class Arena:
         starts = np.stack([np.concatenate([x, pick.theta]) for x in (leader.fitted.x[:width], moved, current.x)])
         values = loss(self.under.whiten(self.fit_data.problem.residual(plant, starts))).sum(-1)
         known = leader.fitted.jacobian[..., : current.jacobian.shape[-1]]
-        begun = [(plant, starts[int(values.argmin())])]
-        begun += [(before.fitted.plant, before.fitted.x)] if before else []
-        return self.judge(min((self._fit(*b, 10, known) for b in begun), key=lambda f: float(f.losses.sum())))
+        return self._fit(plant, starts[int(values.argmin())], 10, known, quick)
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
         """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""

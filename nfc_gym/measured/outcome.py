@@ -64,6 +64,11 @@ def report(
     laws = {e.id for e in extended.plant.effects if e.generic}
     claimed, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
     verdict = say.verdict(v, len(claimed), found.generic is not None or bool(proposed))
+    errors = say.errors(v)
+    weak, taken = [], say.taken_away(errors)
+    if verdict == "partly explained" and taken < say.CAUSE:
+        # It predicts, and stays in the model; that it is the cause of what is missing is not shown.
+        weak, claimed, verdict = [r | {"nearest": True} for r in claimed], [], "unexplained"
     left = verdict in ("unexplained", "partly explained")
     assert found.rest is not None
     parameters = say.parameter_rows(extended, nominal[1], sd)
@@ -76,10 +81,10 @@ def report(
         "independent_splits": dataset.independent_splits,
         "parameters": parameters,
         "effects": claimed,
-        "proposals": proposed,
+        "proposals": [*weak, *proposed],
         "verdict": verdict,
-        "unexplained": unexplained(v, found, extended.plant, proposed) if left else None,
-        "error": say.errors(v),
+        "unexplained": unexplained(v, found, extended.plant, proposed, weak, taken) if left else None,
+        "error": errors,
         "chi2": {stage: v.chi2(stage) for stage in v.residual}
         | {
             "null": float(v.null.mean()),

@@ -165,6 +165,7 @@ def _effect(effect: Row, effects: Sequence[Row]) -> Row:
     return {
         "id": effect.get("id"),
         "sentence": effect.get("sentence") or story.what(effect),
+        "nearest": bool(effect.get("nearest")),
         "share": share,
         "meter": charts.meter(share, 1.0, "extended"),
         "equivalents": story.rivals_of(effect, effects),

@@ -112,13 +112,11 @@ class Contest:
             return outcome, None
         best = self._simplest(believed)
         if mimics := self._mimics(best, judged):
-            again = {arena.label(j) for j in mimics}
-            judged = [j for j in judged if arena.label(j) not in again]
             judged = sorted([*judged, *mimics], key=lambda j: -j.total)
             outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in mimics])
             best = self._simplest(believed := [j for j in judged if self._believed(j)])
         if rivals := self._rivals(best, judged):
-            duel = self._at_half([best, *rivals])
+            duel = self._at_half([best, *(self._fitted_on(best, j) for j in rivals)])
             # Their families' other forms were judged at the whole step alone, and lost to these there.
             families = {arena.new(j)[0].family for j in duel}
             judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
@@ -155,23 +153,20 @@ class Contest:
         return judged
 
     def _mimics(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
-        """Fits, begun beside it, of what does nearly the same as the law about to be accepted.
+        """Fits of what does nearly the same as the law about to be accepted, and was not asked in full.
 
-        A first look may lose the right one of two laws that straight lines cannot tell apart; and where a law and psi
-        share a valley (a lump on a torso, and hips that were taken for heavier) it may have stopped half way.
+        A first look may lose the right one of two laws that straight lines cannot tell apart.
         """
         arena, new = self.arena, self.arena.new(best)
         by_id = {s.effect.id: s for s in self.screened}
-        asked = {arena.label(j): j for j in judged}
+        asked = {arena.label(j) for j in judged} | {e.id for e in new}
         added = len(best.fitted.plant.effects) > len(arena.current.plant.effects)
         if len(new) != 1 or new[0].id not in by_id or not added:
             return []
         one = by_id[new[0].id]
-        others = [s for s in self.screened if s.effect is not new[0] and (self.rough or s.effect.id not in asked)]
-        near = [(likeness(one, s, self.screen.projected), s) for s in others]
-        near = sorted((pair for pair in near if pair[0] > _MIMIC), key=lambda pair: -pair[0])[:_MIMICS]
-        found = [(asked.get(s.effect.id), arena.enter_beside(best, s, asked.get(s.effect.id))) for _, s in near]
-        return [j for before, j in found if before is None or j.total > before.total]
+        near = [(likeness(one, s, self.screen.projected), s) for s in self.screened if s.effect.id not in asked]
+        near = sorted((pair for pair in near if pair[0] > _MIMIC), key=lambda pair: -pair[0])
+        return [arena.enter_beside(best, s) for _, s in near[:_MIMICS]]
 
     def _rivals(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
         """Where bodies touch, the leading candidates of other families that come near the law about to be accepted.
@@ -189,6 +184,12 @@ class Contest:
             if not contains(laws[0], new[0]) and not contains(new[0], laws[0]):
                 near.setdefault(laws[0].family, j)
         return list(near.values())[:_DUELS]
+
+    def _fitted_on(self, best: Judged, rival: Judged) -> Judged:
+        """A rival that was screened, with the best fit that it can be given."""
+        label = self.arena.label(rival)
+        pick = next((s for s in self.screened if s.effect.id == label), None)
+        return rival if pick is None else self.arena.fitted_on(best, rival, pick)
 
     def _at_half(self, duel: Sequence[Judged]) -> list[Judged]:
         """Candidates with the gains that they have at half the physics step, best first.

@@ -160,7 +160,7 @@ def what(effect: dict[str, Any]) -> str:
 
 
 def added(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """What the extended model has beyond psi: effects that are claimed, and laws that are proposed."""
+    """What the extended model has beyond psi: effects that are claimed, and what is proposed without a cause."""
     return [*(report.get("effects") or []), *(report.get("proposals") or [])]
 
 
@@ -170,9 +170,12 @@ def headline(report: dict[str, Any]) -> str:
     word = report.get("verdict")
     left = (report.get("unexplained") or {}).get("coordinate")
     at = f", the largest share at {left}" if left else ""
-    if laws := report.get("proposals"):
-        heads = [what(e) for e in laws]
-        at += f". It looks like {listed([h[:1].lower() + h[1:] for h in heads], 3)}"
+    proposals = report.get("proposals") or []
+    if near := [what(e) for e in proposals if e.get("nearest")]:
+        share = percent((report.get("unexplained") or {}).get("nearest_share") or 0.0)
+        at += f". Nearest comes {listed(near, 3)}, which takes away {share} of that and is not believed to be the cause"
+    if laws := [what(e) for e in proposals if not e.get("nearest")]:
+        at += f". It looks like {listed([h[:1].lower() + h[1:] for h in laws], 3)}"
     if word == "nothing missing":
         return "Nothing is missing: once calibrated, the model predicts unseen motion as well as the sensors can tell."
     if word == "unexplained":
@@ -203,7 +206,8 @@ def error_sentence(report: dict[str, Any]) -> str:
         return ""
     steps = [(c.nominal, "with the model as given"), (c.calibrated, "once calibrated")]
     if new := added(report):
-        name = "missing effect" if report.get("effects") else "proposed law"
+        near = any(e.get("nearest") for e in new)
+        name = "missing effect" if report.get("effects") else "nearest effect" if near else "proposed law"
         steps.append((c.extended, f"with the {name}{'s' * (len(new) > 1)} added"))
     path = ", ".join(f"{quantity(v, c.unit)} {words}" for v, words in steps if v is not None)
     floor = f" The noise alone accounts for {quantity(c.floor, c.unit)}." if c.floor is not None else ""

@@ -16,7 +16,9 @@ from nfc_gym.physics.rollout import Plant
 _SPEEDS = ("law_power", "law_friction", "law_cross")
 
 
-def unexplained(v: Verified, found: Found, plant: Plant, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def unexplained(
+    v: Verified, found: Found, plant: Plant, rows: list[dict[str, Any]], weak: list[dict[str, Any]], taken: float
+) -> dict[str, Any]:
     """The report's `unexplained`, for a verdict of that name or `partly explained`.
 
     Args:
@@ -24,11 +26,14 @@ def unexplained(v: Verified, found: Found, plant: Plant, rows: list[dict[str, An
       found: what the search found.
       plant: the extended machine.
       rows: the report's rows of the proposed laws.
+      weak: and of effects that were found and take away too little to be the cause.
+      taken: share of the error beyond the noise that the extended model takes away.
     """
     laws = [e for e in plant.effects if isinstance(e, Law)]
-    nearest, share = _nearest(found)
-    out: dict[str, Any] = {"nearest": nearest, "nearest_share": share, "proposed": [r["id"] for r in rows]}
+    nearest, share = (" + ".join(r["id"] for r in weak), max(taken, 0.0)) if weak else _nearest(found)
+    out: dict[str, Any] = {"nearest": nearest, "nearest_share": share, "proposed": [r["id"] for r in [*weak, *rows]]}
     near = f"; the nearest named effect, {nearest}, explains {share:.0%}" if nearest else "; no named effect comes near"
+    near += ", too little to be the cause" if weak else ""
     assert found.rest is not None
     scanned = found.rest.scanned
     reason = found.rounds[-1].reason or "no effect of the library explains it"

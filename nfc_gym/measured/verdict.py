@@ -19,6 +19,11 @@ from nfc_gym.physics.effects.each import Each
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
+_SEEN, _NOTHING = (
+    0.8,
+    0.05,
+)  # errors of which noise makes more are not counted; and its variance so little exceeded is not
+CAUSE = 0.5  # of the error beyond the noise: what claims must take away of it to be causes where something remains
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,22 @@ def errors(v: Verified) -> dict[str, Any]:
         row["noise_floor"] = [_rms(floor, v.problem.mask & (of & (c.horizon == h))) for h in levels]
         groups[group] = row
     return {"horizons_s": levels, "groups": groups}
+
+
+def taken_away(errors: dict[str, Any]) -> float:
+    """Share of the squared error beyond the noise that the extended model takes away of what calibration leaves.
+
+    The geometric mean over all groups and horizons at which calibration leaves any; 1 where it nowhere does.
+    Chi-squared will not do: where sensors are far better than any model, it is the same great number before and after.
+    """
+    left = []
+    for row in errors["groups"].values():
+        for before, after, floor in zip(row["calibrated"], row["extended"], row["noise_floor"], strict=True):
+            if None in (before, after, floor) or floor >= _SEEN * before:
+                continue
+            rest, noise = (float(np.square(e / before)) for e in (after, floor))
+            left.append(np.log(max(rest - noise, _NOTHING * noise, 1e-12) / (1 - noise)))
+    return 1 - float(np.exp(np.mean(left))) if left else 1.0
 
 
 def _rms(values: Array, where: NDArray[np.bool_]) -> float | None:

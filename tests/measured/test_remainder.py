@@ -120,7 +120,7 @@ def test_even_without_a_law_the_worst_place_is_named() -> None:
     v = SimpleNamespace(problem=problem, white={"extended": np.tile([1.0, 3.0], (5, 1))})
     last = SimpleNamespace(ranking=[{"id": "lag:m", "generic": False, "share": 0.12}], reason="too small")
     found = SimpleNamespace(rounds=[last], rest=SimpleNamespace(dropped=[], scanned=None), generic=None)
-    left = unexplained(v, found, SimpleNamespace(effects=(), model=None), [])  # pyright: ignore[reportArgumentType]
+    left = unexplained(v, found, SimpleNamespace(effects=(), model=None), [], [], 0.0)  # pyright: ignore[reportArgumentType]
     assert left["where"] == "joint:b"
     assert left["coordinate"] == "joint:b (joint speed)"
     assert left["description"].startswith("largest share of the remaining misfit: 90%; too small; the nearest named")

@@ -89,6 +89,18 @@ def test_a_proposed_law_is_shown_apart_from_what_is_claimed() -> None:
     assert "proposed law" not in without
 
 
+def test_what_comes_nearest_is_no_claim() -> None:
+    report = example(1) | {"verdict": "unexplained"}
+    report["unexplained"] = {"coordinate": "joint:hinge:pos", "description": "", "nearest_share": 0.06}
+    near = report["effects"][0] | {"nearest": True}
+    text = read(render(report | {"effects": [], "proposals": [near]}, pictures())).text.replace("\xa0", " ")
+    assert "which takes away 6 % of that and is not believed to be the cause." in text
+    assert "with the nearest effect added" in text
+    assert "No effect is claimed." in text
+    assert "too little of what is missing to be believed the cause" in text
+    assert "a proposed law" not in text
+
+
 def test_maps_of_the_misfit() -> None:
     page = render(example(), pictures())
     text = read(page).text

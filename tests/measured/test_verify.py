@@ -11,7 +11,7 @@ from nfc_gym.core.files import require_writable
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
-from nfc_gym.measured.verdict import Models, verify
+from nfc_gym.measured.verdict import Models, taken_away, verify
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -37,6 +37,26 @@ def test_a_model_that_is_unstable_on_every_segment_is_said_so() -> None:
     bare = (plant, plant.null)
     with pytest.raises(InputError, match="unstable on every segment that verifies"), np.errstate(all="ignore"):
         verify(problem, Models(bare, bare, bare), 2, rng)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "share"),
+    [
+        ([5.0, 10.0], [5.0, 10.0], 0.0),
+        ([5.0, 10.0], [1.0, 1.0], 1.0),  # down to the noise
+        ([5.0, None], [3.0, 2.0], 1 - 8 / 24),
+        ([5.0, 7.0], [np.sqrt(13), 5.0], 0.5),
+        ([1.1, 5.0], [9.0, 3.0], 1 - 8 / 24),  # hardly beyond the noise before: not counted
+        ([1.1, 1.0], [9.0, 3.0], 1.0),
+        ([5.0, 5.0], [1e200, 1.0], -np.inf),
+    ],
+)
+def test_what_is_taken_away_is_counted_beyond_the_noise(
+    before: list[float | None], after: list[float], share: float
+) -> None:
+    row = {"calibrated": before, "extended": after, "noise_floor": [1.0, 1.0]}
+    with np.errstate(over="ignore"):
+        assert taken_away({"groups": {"angle": row}}) == pytest.approx(share, abs=0.01)
 
 
 def test_an_option_is_no_place_to_write_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
