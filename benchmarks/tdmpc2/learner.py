@@ -6,8 +6,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from nfc_gym.adaptation.ppo import Diverged
+from nfc_gym.inference.replay import tensor_cores
 
-from .networks import fast_products
 from .world_model import WorldModel
 
 PRIOR_EPS = 1e-5  # of Adam for the policy prior, as the authors have it
@@ -41,7 +41,7 @@ class Learner:
         )
         self.weights = torch.tensor([s.rho**t for t in range(s.horizon + 1)], device=model.device)
 
-    @fast_products()
+    @tensor_cores()  # as the authors compute them
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """One step on sequences, see `replay`; returns values to write down.
 

@@ -1,7 +1,5 @@
 """Layers of TD-MPC2: simplicial normalisation, normed layers, critics side by side, two-hot regression."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import pairwise
 
 import torch
@@ -9,17 +7,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 WEIGHTS = 0.02  # standard deviation of first weights
-
-
-@contextmanager
-def fast_products() -> Iterator[None]:
-    """Matrix products in TF32 where a GPU has it, as the authors compute them; other code keeps what it had."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 def symlog(x: Tensor) -> Tensor:

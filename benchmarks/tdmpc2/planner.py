@@ -5,7 +5,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from .networks import fast_products
+from nfc_gym.inference.replay import tensor_cores
+
 from .settings import Settings
 from .world_model import Imagined
 
@@ -53,7 +54,7 @@ class Planner:
         self.mean = torch.zeros(rows, settings.horizon, action, device=device)
 
     @torch.no_grad()
-    @fast_products()
+    @tensor_cores()  # as the authors compute them
     def plan(self, observation: Tensor, fresh: Tensor | None = None, explore: bool = False) -> Tensor:
         """Actions (n, a).
 
