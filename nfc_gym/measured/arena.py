@@ -150,34 +150,17 @@ class Arena:
         return self._refit(plant, start, 10, self.current.jacobian, quick=self.fit_data.problem.costly)
 
     def _refit(self, plant: Plant, start: Array, rounds: int, known: Array, quick: bool = False) -> Judged:
-        return self.judge(self._fit(plant, start, rounds, known, quick))
-
-    def _fit(self, plant: Plant, start: Array, rounds: int, known: Array, quick: bool = False) -> Fit:
-        """Fit; `known` (S, m, j) is the Jacobian of the first j free parameters.
+        """Fit and judge; `known` (S, m, j) is the Jacobian of the first j free parameters.
 
         With few of them a full Jacobian costs little; with many, or for a quick look, they keep the one that they have
         (the chord method).
         """
         chord = known if quick or known.shape[-1] > _CHORD else None
-        return fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord)
+        return self.judge(fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord))
 
     def enter_beside(self, leader: Judged, pick: Screened) -> Judged:
         """Fit a screened candidate in a leading one's place, also from where the leader's fit took all the rest."""
         self.say(f"refitting {pick.effect.id}, which does much the same")
-        return self.judge(self._beside(leader, pick, quick=self.fit_data.problem.costly))
-
-    def fitted_on(self, leader: Judged, other: Judged, pick: Screened) -> Judged:
-        """A candidate with a fit that goes on from where it stopped, or from where the leader's took all the rest.
-
-        Where a law and psi share a valley (a lump on a torso, and hips that were taken for heavier) it may have stopped
-        half way.
-        """
-        self.say(f"fitting {pick.effect.id} on")
-        none = leader.fitted.jacobian[..., :0]
-        found = [other.fitted, self._beside(leader, pick), self._fit(other.fitted.plant, other.fitted.x, 10, none)]
-        return replace(other, fitted=min(found, key=lambda f: float(f.losses.sum())))
-
-    def _beside(self, leader: Judged, pick: Screened, quick: bool = False) -> Fit:
         current = self.current
         plant = current.plant.with_effects([*current.plant.effects, pick.effect])
         limits, width = box(current.plant), len(current.x)
@@ -185,7 +168,7 @@ class Arena:
         starts = np.stack([np.concatenate([x, pick.theta]) for x in (leader.fitted.x[:width], moved, current.x)])
         values = loss(self.under.whiten(self.fit_data.problem.residual(plant, starts))).sum(-1)
         known = leader.fitted.jacobian[..., : current.jacobian.shape[-1]]
-        return self._fit(plant, starts[int(values.argmin())], 10, known, quick)
+        return self._refit(plant, starts[int(values.argmin())], 10, known, quick=self.fit_data.problem.costly)
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
         """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""

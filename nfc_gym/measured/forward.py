@@ -41,10 +41,9 @@ class ForwardProblem(InstantProblem):
     def evaluate(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
         """See `InstantProblem`."""
         commands = delivered(plant, x, tracks)
-        turn = max(1, 200_000 // sum(len(t.time) for t in tracks))
         parts = [
-            self._turn(plant, x[i : i + turn], tracks, [(u[i : i + turn], a[i : i + turn]) for u, a in commands])
-            for i in range(0, len(x), turn)
+            self._turn(plant, x[some], tracks, [(u[some], a[some]) for u, a in commands])
+            for some in self.turns(len(x), tracks)
         ]
         return [np.concatenate([p[i] for p in parts]) for i in range(len(tracks))]
 

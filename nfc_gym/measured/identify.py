@@ -72,7 +72,7 @@ def table(
         where little is left;
       `linear`: whether a column at that size was as long as proportion says; the size is corrected by it either way;
         None where it was not tried, as is done for what is accepted and for the effects that show best;
-      `claimed`: whether the effect is accepted.
+      `claimed`: whether the model has the effect.
     """
     taken, whole, twin = {e.id for e in lens.plant.effects}, lens.fitted(), lens.twin()
     again = None if twin is None else (twin, twin.fitted())

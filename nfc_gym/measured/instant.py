@@ -23,6 +23,7 @@ from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
+_AT_ONCE = 200_000  # samples of all tracks under all parameter vectors
 
 
 @dataclass(frozen=True)
@@ -130,6 +131,11 @@ class InstantProblem(Problem):
     def smoothed(self, values: Array) -> Array:
         """Moving average (T, C) over the samples that remain of the declared width."""
         return moving_average(values, max(1, self.smooth // self.stride))
+
+    def turns(self, count: int, tracks: Sequence[Track]) -> list[slice]:
+        """Parameter vectors that are evaluated together, so that memory stays bounded whatever their number."""
+        turn = max(1, _AT_ONCE // sum(len(t.time) for t in tracks))
+        return [slice(i, i + turn) for i in range(0, count, turn)]
 
     def along(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
         """`evaluate`, each track in its own condition."""

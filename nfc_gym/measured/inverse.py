@@ -52,8 +52,10 @@ class InverseProblem(InstantProblem):
         out: list[Array] = [np.zeros(0)] * len(tracks)
         for dt in dict.fromkeys(t.dt for t in tracks):
             of = [i for i, t in enumerate(tracks) if t.dt == dt]
-            for i, forces in zip(of, actuator_forces(plant, x, [tracks[i] for i in of]), strict=True):
-                out[i] = forces[..., self.actuators]
+            alike = [tracks[i] for i in of]
+            parts = [actuator_forces(plant, x[some], alike) for some in self.turns(len(x), alike)]
+            for i, forces in zip(of, zip(*parts, strict=True), strict=True):
+                out[i] = np.concatenate(forces)[..., self.actuators]
         return out
 
 
@@ -93,7 +95,7 @@ def _push(plant: Plant, x: Array, tracks: Sequence[Track], parts: Sequence["_Nee
     count, model = len(x), plant.model
     lengths = [len(t.time) for t in tracks]
     ends = count * np.cumsum([0, *lengths])
-    order = [a + np.arange(n)[:, None] + n * np.arange(count) for a, n in zip(ends, lengths, strict=False)]
+    order = [a + np.arange(n)[:, None] + n * np.arange(count) for a, n in zip(ends[:-1], lengths, strict=True)]
     join = lambda name: np.concatenate([np.tile(getattr(t, name), (count, 1)) for t in tracks])  # noqa: E731
     signals = {k: np.concatenate([np.tile(t.exogenous[k], count) for t in tracks]) for k in tracks[0].exogenous}
     data = lambda name: np.concatenate([part.data(name) for part in parts])  # noqa: E731
@@ -163,7 +165,7 @@ class _Motion:
 
     def __init__(self, plant: Plant, x: Array, t: Track) -> None:
         self.model, self.track = copy.copy(plant.model), t
-        self._data, self._fields = mujoco.MjData(plant.model), dict[str, Array]()
+        self._fields: dict[str, Array] = {}
         fields = ModelFields(self.model, plant.model)
         for (name, of), values in t.known.items():
             write_field(fields, resolve(self.model, name, of), values[0])
@@ -178,7 +180,8 @@ class _Motion:
         MuJoCo's friction of a joint is the force that would hold it, cut at `frictionloss`, and in inverse dynamics no
         joint's depends on another's: one pass with no cut tells what is needed under any.
         """
-        m, d, t = self.model, self._data, self.track
+        m, t = self.model, self.track
+        d = mujoco.MjData(m)
         free, holding, bias, passive = (np.zeros((len(t.time), m.nv)) for _ in range(4))
         # Each look at a field of `MjData` makes a new view, which costs as much as the dynamics of a small machine.
         qpos, qvel, qacc = d.qpos, d.qvel, d.qacc

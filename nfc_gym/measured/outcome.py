@@ -1,7 +1,8 @@
 """What a run gives out: the report, the summary over folds, and the files."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -61,15 +62,9 @@ def report(
     shares = say.excess_shares(v, verifying, extended, models.calibrated)
     sd = say.spread(extended, fitting, step)
     rows = say.effect_rows(extended, found.rounds, sd, shares)
-    laws = {e.id for e in extended.plant.effects if e.generic}
-    claimed, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
-    verdict = say.verdict(v, len(claimed), found.generic is not None or bool(proposed))
     errors = say.errors(v)
-    weak, taken = [], say.taken_away(errors)
-    if verdict == "partly explained" and taken < say.CAUSE:
-        # It predicts, and stays in the model; that it is the cause of what is missing is not shown.
-        weak, claimed, verdict = [r | {"nearest": True} for r in claimed], [], "unexplained"
-    left = verdict in ("unexplained", "partly explained")
+    judged = _judge(v, rows, {e.id for e in extended.plant.effects if e.generic}, found.generic is not None, errors)
+    left = judged.verdict in ("unexplained", "partly explained")
     assert found.rest is not None
     parameters = say.parameter_rows(extended, nominal[1], sd)
     splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
@@ -80,10 +75,10 @@ def report(
         "logs": splits,
         "independent_splits": dataset.independent_splits,
         "parameters": parameters,
-        "effects": claimed,
-        "proposals": [*weak, *proposed],
-        "verdict": verdict,
-        "unexplained": unexplained(v, found, extended.plant, proposed, weak, taken) if left else None,
+        "effects": judged.claimed,
+        "proposals": [*judged.weak, *judged.laws],
+        "verdict": judged.verdict,
+        "unexplained": unexplained(v, found, extended.plant, judged.laws, judged.weak, judged.taken) if left else None,
         "error": errors,
         "chi2": {stage: v.chi2(stage) for stage in v.residual}
         | {
@@ -100,6 +95,36 @@ def report(
         "seed": seed,
         "versions": {"nfc_gym": version("nfc_gym"), "mujoco": mujoco.__version__},
     }
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """The verdict, and what becomes of the rows of effects that were found.
+
+    Attributes:
+      claimed: causes.
+      weak: named effects that take away too little of what is missing to be the cause.
+      laws: proposed laws.
+      taken: share of the error beyond the noise that all of them take away together.
+    """
+
+    verdict: str
+    claimed: list[dict[str, Any]]
+    weak: list[dict[str, Any]]
+    laws: list[dict[str, Any]]
+    taken: float
+
+
+def _judge(
+    v: say.Verified, rows: Sequence[dict[str, Any]], laws: Container[str], generic: bool, errors: dict[str, Any]
+) -> _Judged:
+    """Divide what was found into causes and proposals; `laws` are the ids of those without a name."""
+    named, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
+    verdict, taken = say.verdict(v, len(named), generic or bool(proposed)), say.taken_away(errors)
+    if verdict == "partly explained" and taken < say.CAUSE:
+        # It predicts, and stays in the model; that it is the cause of what is missing is not shown.
+        return _Judged("unexplained", [], [r | {"nearest": True} for r in named], proposed, taken)
+    return _Judged(verdict, named, [], proposed, taken)
 
 
 def _noise(bench: Bench, fold: Fold) -> list[dict[str, Any]]:

@@ -116,7 +116,7 @@ class Contest:
             outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in mimics])
             best = self._simplest(believed := [j for j in judged if self._believed(j)])
         if rivals := self._rivals(best, judged):
-            duel = self._at_half([best, *(self._fitted_on(best, j) for j in rivals)])
+            duel = self._at_half([best, *rivals])
             # Their families' other forms were judged at the whole step alone, and lost to these there.
             families = {arena.new(j)[0].family for j in duel}
             judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
@@ -184,12 +184,6 @@ class Contest:
             if not contains(laws[0], new[0]) and not contains(new[0], laws[0]):
                 near.setdefault(laws[0].family, j)
         return list(near.values())[:_DUELS]
-
-    def _fitted_on(self, best: Judged, rival: Judged) -> Judged:
-        """A rival that was screened, with the best fit that it can be given."""
-        label = self.arena.label(rival)
-        pick = next((s for s in self.screened if s.effect.id == label), None)
-        return rival if pick is None else self.arena.fitted_on(best, rival, pick)
 
     def _at_half(self, duel: Sequence[Judged]) -> list[Judged]:
         """Candidates with the gains that they have at half the physics step, best first.

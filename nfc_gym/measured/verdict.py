@@ -19,10 +19,8 @@ from nfc_gym.physics.effects.each import Each
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-_SEEN, _NOTHING = (
-    0.8,
-    0.05,
-)  # errors of which noise makes more are not counted; and its variance so little exceeded is not
+_SEEN = 0.8  # of an error: where noise makes up more of it, the error is not counted
+_NOTHING = 0.05  # of the noise's variance: a squared error that exceeds it by less counts as taken away whole
 CAUSE = 0.5  # of the error beyond the noise: what claims must take away of it to be causes where something remains
 
 
@@ -120,7 +118,8 @@ def taken_away(errors: dict[str, Any]) -> float:
         for before, after, floor in zip(row["calibrated"], row["extended"], row["noise_floor"], strict=True):
             if None in (before, after, floor) or floor >= _SEEN * before:
                 continue
-            rest, noise = (float(np.square(e / before)) for e in (after, floor))
+            with np.errstate(over="ignore"):  # a model that runs away takes nothing away
+                rest, noise = (float(np.square(e / before)) for e in (after, floor))
             left.append(np.log(max(rest - noise, _NOTHING * noise, 1e-12) / (1 - noise)))
     return 1 - float(np.exp(np.mean(left))) if left else 1.0
 

@@ -6,11 +6,10 @@ import pytest
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.arena import Arena
-from nfc_gym.measured.contest import Judged, clusters
-from nfc_gym.measured.fit import fit, stand, uncertainty
+from nfc_gym.measured.contest import clusters
+from nfc_gym.measured.fit import fit, uncertainty
 from nfc_gym.measured.halved import artefacts, step_error
 from nfc_gym.measured.owned import Data
-from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.shooting import RolloutProblem, finer
@@ -19,7 +18,6 @@ from nfc_gym.physics.effects import build
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
-_NOTHING = (np.zeros(1), np.zeros(1), 0.0, 0.0)  # gained
 DT, SAMPLE, NOISE = 0.01, 0.01, {"pos": 0.001, "vel": 0.01}
 MODEL = """
 <mujoco>
@@ -80,18 +78,6 @@ def test_the_step_widens_the_interval_until_it_holds_the_truth(gain: float) -> N
     off = np.abs(fitted.x - gain / 0.5)
     assert 1.96 * sd < off < 1.96 * np.hypot(sd, step)
     assert step < off
-
-
-def test_a_rival_that_stopped_half_way_is_fitted_on() -> None:
-    contest = arena(0.6)
-    law, best = contest.current.plant.effects[0], contest.current
-    bare, problem = contest.without(law), contest.fit_data.problem
-    stuck = stand(problem, contest.under, best.plant, np.array([1.02]))
-    pick = Screened(law, 1.0, np.array([1.05]), np.zeros(0), np.zeros((0, 0)))
-    on = bare.fitted_on(Judged(best, *_NOTHING), Judged(stuck, *_NOTHING), pick)
-    assert on.fitted.x == pytest.approx(best.x, rel=1e-3)
-    done = bare.fitted_on(Judged(best, *_NOTHING), Judged(best, *_NOTHING), pick)
-    assert float(done.fitted.losses.sum()) <= float(best.losses.sum())
 
 
 def test_a_halved_problem_is_the_same_experiment_at_half_the_step() -> None:
