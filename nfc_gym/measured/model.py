@@ -48,12 +48,18 @@ def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
     """The compiled model.
 
     Raises:
-      InputError: it does not compile, in MuJoCo's own words, or holds a number that is not finite.
+      InputError: it does not compile, in MuJoCo's own words, or holds a number that is not finite or a name that is
+        no text.
     """
     try:
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as e:
         raise InputError(f"model {name}: does not compile: {_one_line(e)}") from None
+    try:
+        model.names.decode()
+    except UnicodeDecodeError as e:
+        start, end = model.names.rfind(b"\0", 0, e.start) + 1, model.names.find(b"\0", e.start)
+        raise InputError(f"model {name}: the name {model.names[start:end]!r} is not UTF-8; save the file so") from None
     for owner, before in ((model.opt, "option "), (model, "")):
         for field in dir(owner):
             value = getattr(owner, field) if not field.startswith("_") else None

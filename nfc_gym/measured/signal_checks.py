@@ -42,6 +42,7 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
         if channel.unit == "rad/s" and parsed.kind in ("sensor", "body"):
             yield from rate(name, channel)
         if model is not None and parsed.kind == "sensor":
+            yield from _components(name, parsed.object, channel, model)
             yield from gravity(name, parsed.object, channel, model)
     yield from _twins(log)
 
@@ -97,6 +98,16 @@ def _command(name: str, values: Array, model: mujoco.MjModel | None) -> Iterator
             yield Suspicion(
                 "warning", where, "saturated", message, "record gentler commands, which say more about the actuator"
             )
+
+
+def _components(name: str, sensor: str, channel: Channel, model: mujoco.MjModel) -> Iterator[Suspicion]:
+    """A sensor measured in some of its components, without a word on which."""
+    at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, sensor)
+    size, width = int(model.sensor_dim[at]) if at >= 0 else 0, int(np.prod(channel.values.shape[1:], dtype=int))
+    if at >= 0 and channel.axes is None and width != size:
+        message = f"{width} column{'s' * (width > 1)} where the sensor has {size} component{'s' * (size > 1)}"
+        advice = "name all in `columns`, or say in `axes` which components these are"
+        yield Suspicion("error", f"channels.{name}", "components", message, advice)
 
 
 def _any_channel(name: str, channel: Channel, mapping: Mapping) -> Iterator[Suspicion]:

@@ -56,7 +56,9 @@ def test_every_turn_draws_what_the_network_draws(device: str, config: dict[str, 
     kept = ours.to(device)
     for seed, window in enumerate(windows * 2):
         got = kept.given(window).sample(7, np.random.default_rng(seed)).psi
-        np.testing.assert_allclose(got, direct(kept.network, window, 7, seed), rtol=1e-4)
+        # TF32 has ten bits behind the point, and a GPU may choose other kernels for a product the next time.
+        rtol = 1e-4 if device == "cpu" else 1e-3
+        np.testing.assert_allclose(got, direct(kept.network, window, 7, seed), rtol=rtol)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -152,6 +152,13 @@ def test_a_model_that_does_not_compile(build: Build) -> None:
     assert "does not compile" in found or "not a model" in found
 
 
+def test_a_model_with_a_name_that_is_no_text(build: Build, tmp_path: Path) -> None:
+    path = build()
+    (tmp_path / "machine.xml").write_bytes((tmp_path / "machine.xml").read_bytes().replace(b'"bob"', b'"b\xa1b"'))
+    found = "\n".join(errors(path))
+    assert r"the name b'b\xa1b' is not UTF-8" in found
+
+
 def test_a_model_with_a_number_that_is_not_finite(build: Build) -> None:
     body = "<body name='a'><joint/><geom size='0.1' mass='{}'/></body>"
     found = "\n".join(errors(build(model=f"<mujoco><worldbody>{body.format('inf')}</worldbody></mujoco>")))
@@ -204,6 +211,13 @@ def test_gravity_of_one_is_in_g(build: Build, unit: str, wrong: bool) -> None:
     channel = f'"sensor:acc": {{column: az, unit: {unit}, axes: [z], noise: 0.1}}'
     found = errors(build(rest, ("segments:", f"  {channel}\nsegments:")))
     assert [("in g?" in line) for line in found] == [True] * wrong
+
+
+@pytest.mark.parametrize(("keys", "wrong"), [("", True), ("axes: [x, z], ", False)])
+def test_some_components_of_a_sensor_are_said_which(build: Build, keys: str, wrong: bool) -> None:
+    channel = f'"sensor:acc": {{columns: [q, v], unit: m/s^2, {keys}noise: 0.1}}'
+    found = errors(build(None, ("segments:", f"  {channel}\nsegments:")))
+    assert any("2 columns where the sensor has 3 components" in line for line in found) == wrong
 
 
 def test_a_constant_channel_in_one_log_of_many_is_a_doubt(build: Build, tmp_path: Path) -> None:
