@@ -9,6 +9,8 @@ from nfc_gym.measured.problem import Problem
 
 Array = NDArray[np.float64]
 _UNSTABLE = 30.0  # standard deviations that every number of an unstable block counts as
+_SEEN = 0.64  # of a squared error: where noise makes up more of it, the error is not counted
+_NOTHING = 0.05  # of the noise's variance: a squared error that exceeds it by less counts as taken away whole
 _TURN = 3.0  # standard deviations at which the loss turns from squared to linear
 
 
@@ -45,6 +47,19 @@ class Metric:
     def take(self, index: NDArray[np.intp]) -> "Metric":
         """The metric of some of the blocks."""
         return Metric(self.inverse_root[index], self.mask[index])
+
+
+def taken(before: Array, after: Array, noise: Array) -> float:
+    """Share of mean squared errors (k,) beyond the noise (k,) that one model takes away of what another leaves.
+
+    The geometric mean over those that the noise does not make up alone; 1 where it makes up all.
+    Chi-squared will not do: where sensors are far better than any model, it is the same great number before and after.
+    """
+    shows = noise < _SEEN * before
+    before, after, noise = before[shows], after[shows], noise[shows]
+    with np.errstate(over="ignore"):  # a model that runs away takes nothing away
+        left = np.maximum(after - noise, np.maximum(_NOTHING * noise, 1e-12 * before)) / (before - noise)
+        return 1 - float(np.exp(np.log(left).mean())) if shows.any() else 1.0
 
 
 def unexplained_variance(problem: Problem, residual: Array, sigma: Array) -> Array:

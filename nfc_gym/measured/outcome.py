@@ -63,7 +63,8 @@ def report(
     sd = say.spread(extended, fitting, step)
     rows = say.effect_rows(extended, found.rounds, sd, shares)
     errors = say.errors(v)
-    judged = _judge(v, rows, {e.id for e in extended.plant.effects if e.generic}, found.generic is not None, errors)
+    laws = {e.id for e in extended.plant.effects if e.generic}
+    judged = _judge(v, rows, laws, found.generic is not None, found.doubted, errors)
     left = judged.verdict in ("unexplained", "partly explained")
     assert found.rest is not None
     parameters = say.parameter_rows(extended, nominal[1], sd)
@@ -103,7 +104,8 @@ class _Judged:
 
     Attributes:
       claimed: causes.
-      weak: named effects that take away too little of what is missing to be the cause.
+      weak: named effects that are not shown to be the cause: they take away too little of what is missing, or others
+        would nearly as much.
       laws: proposed laws.
       taken: share of the error beyond the noise that all of them take away together.
     """
@@ -116,15 +118,23 @@ class _Judged:
 
 
 def _judge(
-    v: say.Verified, rows: Sequence[dict[str, Any]], laws: Container[str], generic: bool, errors: dict[str, Any]
+    v: say.Verified,
+    rows: Sequence[dict[str, Any]],
+    laws: Container[str],
+    generic: bool,
+    doubted: dict[str, list[str]],
+    errors: dict[str, Any],
 ) -> _Judged:
-    """Divide what was found into causes and proposals; `laws` are the ids of those without a name."""
+    """Divide what was found into causes and proposals; `laws` are the ids of those without a name (see `doubt`)."""
     named, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
     verdict, taken = say.verdict(v, len(named), generic or bool(proposed)), say.taken_away(errors)
-    if verdict == "partly explained" and taken < say.CAUSE:
-        # It predicts, and stays in the model; that it is the cause of what is missing is not shown.
-        return _Judged("unexplained", [], [r | {"nearest": True} for r in named], proposed, taken)
-    return _Judged(verdict, named, [], proposed, taken)
+    if verdict != "partly explained":
+        return _Judged(verdict, named, [], proposed, taken)
+    # What is weak predicts, and stays in the model; that it is the cause of what is missing is not shown.
+    weak = [r | {"nearest": True, "alike": doubted.get(r["id"], [])} for r in named]
+    weak = weak if taken < say.CAUSE else [r for r in weak if r["alike"]]
+    causes = [r for r in named if r["id"] not in {w["id"] for w in weak}]
+    return _Judged(verdict if causes else "unexplained", causes, weak, proposed, taken)
 
 
 def _noise(bench: Bench, fold: Fold) -> list[dict[str, Any]]:

@@ -166,6 +166,7 @@ def _effect(effect: Row, effects: Sequence[Row]) -> Row:
         "id": effect.get("id"),
         "sentence": effect.get("sentence") or story.what(effect),
         "nearest": bool(effect.get("nearest")),
+        "alike": effect.get("alike") or [],
         "share": share,
         "meter": charts.meter(share, 1.0, "extended"),
         "equivalents": story.rivals_of(effect, effects),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import Judged
+from nfc_gym.measured.doubt import doubted
 from nfc_gym.measured.fit import Fit, differs, fit
 from nfc_gym.measured.halved import artefacts
 from nfc_gym.measured.lookout import Lookout
@@ -83,6 +84,7 @@ class Found:
       generic: id of a generic alternative that beat every named effect, or None.
       nearest: id of the candidate that led the last round's screening, whatever it gained; None where there was none.
       dropped: named effects that a generic alternative alone outdid.
+      doubted: accepted effects that lead rivals by less than they leave over, with these (see `doubt`).
       rest: what the named effects left, and the laws that are proposed for it; None until it was looked for.
     """
 
@@ -93,6 +95,7 @@ class Found:
     generic: str | None
     nearest: str | None
     dropped: list[str] = field(default_factory=list)
+    doubted: dict[str, list[str]] = field(default_factory=dict)
     rest: Remainder | None = None
 
 
@@ -158,7 +161,8 @@ class Search:
             bare = fit(self.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6)
             arena = self.settle(bare.plant, bare.x, polished=True)
         nearest = screened[0].effect.id if screened else None
-        return Found(calibrated, arena.current, arena.extra, rounds, label, nearest, dropped)
+        doubts = doubted(arena, rounds, self.named) if arena.leftover > SILENT else {}
+        return Found(calibrated, arena.current, arena.extra, rounds, label, nearest, dropped, doubts)
 
     def _contest(self, arena: Arena, screen: Screen, begins: bool) -> tuple[list[Screened], Round, Judged | None]:
         """The contest of one round: its screening, what is reported of it, and what it accepted.

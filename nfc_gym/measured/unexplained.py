@@ -26,14 +26,16 @@ def unexplained(
       found: what the search found.
       plant: the extended machine.
       rows: the report's rows of the proposed laws.
-      weak: and of effects that were found and take away too little to be the cause.
+      weak: and of effects that were found and are not shown to be the cause.
       taken: share of the error beyond the noise that the extended model takes away.
     """
     laws = [e for e in plant.effects if isinstance(e, Law)]
     nearest, share = (" + ".join(r["id"] for r in weak), max(taken, 0.0)) if weak else _nearest(found)
     out: dict[str, Any] = {"nearest": nearest, "nearest_share": share, "proposed": [r["id"] for r in [*weak, *rows]]}
     near = f"; the nearest named effect, {nearest}, explains {share:.0%}" if nearest else "; no named effect comes near"
-    near += ", too little to be the cause" if weak else ""
+    if weak:
+        alike = list(dict.fromkeys(i for r in weak for i in r["alike"]))
+        near += f", but {', '.join(alike)} would explain nearly as much" if alike else ", too little to be the cause"
     assert found.rest is not None
     scanned = found.rest.scanned
     reason = found.rounds[-1].reason or "no effect of the library explains it"

@@ -11,7 +11,7 @@ from scipy.stats import t as student
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured.contest import bootstrap, clusters
 from nfc_gym.measured.fit import Fit, uncertainty
-from nfc_gym.measured.metric import metric
+from nfc_gym.measured.metric import metric, taken
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.rounds import Round
 from nfc_gym.physics.effects.conditions import Conditioned
@@ -19,8 +19,6 @@ from nfc_gym.physics.effects.each import Each
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-_SEEN = 0.8  # of an error: where noise makes up more of it, the error is not counted
-_NOTHING = 0.05  # of the noise's variance: a squared error that exceeds it by less counts as taken away whole
 CAUSE = 0.5  # of the error beyond the noise: what claims must take away of it to be causes where something remains
 
 
@@ -108,20 +106,12 @@ def errors(v: Verified) -> dict[str, Any]:
 
 
 def taken_away(errors: dict[str, Any]) -> float:
-    """Share of the squared error beyond the noise that the extended model takes away of what calibration leaves.
-
-    The geometric mean over all groups and horizons at which calibration leaves any; 1 where it nowhere does.
-    Chi-squared will not do: where sensors are far better than any model, it is the same great number before and after.
-    """
-    left = []
-    for row in errors["groups"].values():
-        for before, after, floor in zip(row["calibrated"], row["extended"], row["noise_floor"], strict=True):
-            if None in (before, after, floor) or floor >= _SEEN * before:
-                continue
-            with np.errstate(over="ignore"):  # a model that runs away takes nothing away
-                rest, noise = (float(np.square(e / before)) for e in (after, floor))
-            left.append(np.log(max(rest - noise, _NOTHING * noise, 1e-12) / (1 - noise)))
-    return 1 - float(np.exp(np.mean(left))) if left else 1.0
+    """Share of the error beyond the noise that the extended model takes away (see `taken`), of all `errors` groups."""
+    names = ("calibrated", "extended", "noise_floor")
+    rows = [row for r in errors["groups"].values() for row in zip(*(r[n] for n in names), strict=True)]
+    known = np.array([row for row in rows if None not in row], float).reshape(-1, 3)
+    with np.errstate(over="ignore"):
+        return taken(*(known**2).T)
 
 
 def _rms(values: Array, where: NDArray[np.bool_]) -> float | None:

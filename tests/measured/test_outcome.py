@@ -11,11 +11,12 @@ from nfc_gym.measured.outcome import _judge
 ROWS: list[dict[str, Any]] = [{"id": "wind:base"}, {"id": "law_power:base"}]
 
 
-def judged(chi2: float, after: float, rows: list[dict[str, Any]] = ROWS[:1]) -> Any:
+def judged(chi2: float, after: float, rows: list[dict[str, Any]] = ROWS[:1], **doubted: list[str]) -> Any:
     """Of models that leave `after` beyond a noise of 1, where calibration leaves 5, with this chi-squared."""
     row = {"calibrated": [5.0], "extended": [after], "noise_floor": [1.0]}
     v: Any = SimpleNamespace(null=np.ones(6), chi2=lambda stage: chi2)
-    return _judge(v, rows, {"law_power:base"}, False, {"groups": {"angle": row}})
+    doubts = {f"{family}:base": ids for family, ids in doubted.items()}
+    return _judge(v, rows, {"law_power:base"}, False, doubts, {"groups": {"angle": row}})
 
 
 @pytest.mark.parametrize(("after", "claimed"), [(np.sqrt(12.5), True), (np.sqrt(13.5), False)])
@@ -23,12 +24,21 @@ def test_a_cause_takes_away_half_of_what_is_missing(after: float, claimed: bool)
     out = judged(3.0, after)
     assert out.verdict == ("partly explained" if claimed else "unexplained")
     assert out.claimed == (ROWS[:1] if claimed else [])
-    assert out.weak == ([] if claimed else [{"id": "wind:base", "nearest": True}])
+    assert out.weak == ([] if claimed else [{"id": "wind:base", "nearest": True, "alike": []}])
 
 
 def test_where_nothing_remains_what_was_found_is_the_cause() -> None:
     out = judged(1.0, 4.9)
     assert (out.verdict, out.claimed, out.weak) == ("explained", ROWS[:1], [])
+
+
+def test_one_guess_among_several_is_no_cause() -> None:
+    alike = ["gain:rotor", "payload:base"]
+    out = judged(3.0, 1.5, [*ROWS[:1], {"id": "delay:rotor"}], wind=alike)
+    assert (out.verdict, out.claimed) == ("partly explained", [{"id": "delay:rotor"}])
+    assert out.weak == [{"id": "wind:base", "nearest": True, "alike": alike}]
+    assert judged(3.0, 1.5, wind=alike).verdict == "unexplained"
+    assert judged(1.0, 1.0, wind=alike).claimed == ROWS[:1]
 
 
 def test_a_law_in_words_is_a_proposal_either_way() -> None:

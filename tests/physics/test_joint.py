@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 from machines import make, run
 
+from nfc_gym.physics.effects import Scales
+from nfc_gym.physics.effects.joint import Cogging
+
 DT, MASS = 0.001, 2.0
 RAIL = f"""
 <mujoco><option timestep="{DT}" gravity="0 0 0" integrator="implicitfast"/><worldbody><body>
@@ -86,3 +89,19 @@ def test_groups_share_one_value() -> None:
     v = run(mujoco.MjModel.from_xml_string(text), effect, theta, 100, qvel=[1.0, 2.0]).qvel[0, 0]
     np.testing.assert_allclose(v[:, 1], 2 * v[:, 0])
     assert v[-1, 0] < 0.95
+
+
+@pytest.mark.parametrize(("travel", "least"), [(7.0, 0.9), (1.0, 6.3), (0.3, 21.0), (0.1, None), (None, 0.5)])
+def test_cogging_is_looked_for_where_a_joint_travels_as_far_as_it_repeats(
+    travel: float | None, least: float | None
+) -> None:
+    one = np.ones(1)
+    ends = {} if travel is None else {"low": np.array([0.2]), "high": np.array([0.2 + travel])}
+    found = Cogging.propose(mujoco.MjModel.from_xml_string(ROTOR), Scales(one, one, one[:0], one[:0], 0.01, **ends))
+    if least is None:
+        assert found == []
+        return
+    order = found[0].params[2]
+    assert order.low == pytest.approx(least, abs=0.1)
+    assert all(order.low < p <= order.high for p in order.probes)
+    assert order.probes[-1] == (12.0 if least < 12 else pytest.approx(1.5 * order.low))

@@ -170,7 +170,10 @@ def _rests(model: mujoco.MjModel, where: tuple[str, ...], scales: Scales) -> tup
 
 
 class Cogging(_OnJoint):
-    """Torque that repeats `order` times a turn: cosine cos(order q) + sine sin(order q)."""
+    """Torque that repeats `order` times a turn: cosine cos(order q) + sine sin(order q).
+
+    Proposed where the joint travels as far as its torque takes to repeat: what is seen of less is a spring.
+    """
 
     family = "cogging"
     summary = "Cogging torque"
@@ -195,5 +198,18 @@ class Cogging(_OnJoint):
         for name in hinges:
             force, _ = joint_scales(model, scales, (name,))
             size = {"probes": (0.1 * force,), "low": -2 * force, "high": 2 * force, "resolution": 2e-3 * force}
-            out.append(cls((name,), sized(cls.PARAMS, cosine=size, sine=size)))
+            order = cls.PARAMS[2]
+            least = max(order.low, 2 * np.pi / max(cls._travel(model, scales, name), 1e-9))
+            if least < order.high:
+                probes = tuple(p for p in order.probes if p > least) or (min(1.5 * least, order.high),)
+                shape = {"low": least, "probes": probes}
+                out.append(cls((name,), sized(cls.PARAMS, cosine=size, sine=size, order=shape)))
         return out
+
+    @staticmethod
+    def _travel(model: mujoco.MjModel, scales: Scales, name: str) -> float:
+        """How far a joint moves in the logs, rad; without end where that is unknown."""
+        if scales.low is None or scales.high is None:
+            return np.inf
+        at = int(model.jnt_qposadr[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)])
+        return float(scales.high[at] - scales.low[at])
