@@ -34,6 +34,7 @@ def unexplained(
     out: dict[str, Any] = {"nearest": nearest, "nearest_share": share, "proposed": [r["id"] for r in [*weak, *rows]]}
     near = f"; the nearest named effect, {nearest}, explains {share:.0%}" if nearest else "; no named effect comes near"
     if weak:
+        near += " together with that" if laws else ""
         alike = list(dict.fromkeys(i for r in weak for i in r["alike"]))
         near += f", but {', '.join(alike)} would explain nearly as much" if alike else ", too little to be the cause"
     assert found.rest is not None
