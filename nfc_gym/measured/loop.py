@@ -44,6 +44,7 @@ from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
 from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.untimed import untimed
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
@@ -99,7 +100,7 @@ def close_loop(
       InputError: the mapping, the model, the logs or `out` cannot be used; nothing is written then.
     """
     require_writable(out)
-    with one_blas_thread():
+    with one_blas_thread(), untimed():
         # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
         mujoco.set_mju_user_warning(lambda message: None)
         dataset = require(mapping)[0]

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.log import Log
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.measured.recent import Recent
 from nfc_gym.measured.segments import Cut, Layout, cut, lay, pick, refine, repeat
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import overrides
@@ -19,6 +21,7 @@ from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
 
 Array = NDArray[np.float64]
 _DRAWS = 16  # starts from which the noise where bodies touch is estimated
+_RECENT = 64_000_000  # bytes of residuals that a problem keeps
 
 
 def interpolate(grid: Array, step: Array, quaternion: bool) -> Array:
@@ -83,7 +86,7 @@ class RolloutProblem(Problem):
         self._place(where, None)
 
     def _place(self, where: Cut, measured: list[Array] | None) -> None:
-        kit = self._kit
+        kit, self._recent = self._kit, Recent(_RECENT)
         self._where, self.log_of = where, where.log
         self.time_of = np.array([kit.logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)])
         segments = lay(kit.model, kit.logs, kit.states, where, kit.layout, kit.servos, kit.linear)
@@ -194,8 +197,11 @@ class RolloutProblem(Problem):
         return np.where(traj.stable[..., None], residual, np.nan)
 
     def residual(self, plant: Plant, x: Array) -> Array:
-        """See `Problem`."""
-        return self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
+        """See `Problem`; read-only."""
+        question = plant.model, plant.space, plant.effects, x.shape, x.tobytes()
+        return self._recent(
+            question, lambda: self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
+        )
 
     def touches(self, plant: Plant, x: Array) -> bool:
         """Whether bodies touch in any roll-out at x (size,)."""
@@ -270,22 +276,24 @@ class RolloutProblem(Problem):
 
     def halved(self) -> "RolloutProblem":
         """The same segments at half the physics step, for plants that are `finer`."""
-        out = object.__new__(RolloutProblem)
-        out.__dict__.update(self.__dict__)
         layout = self._kit.layout
+        out = self.beginning(refine(self.segments))
         out._kit = replace(self._kit, layout=replace(layout, dt=layout.dt / 2))
         out._where = replace(self._where, step=self._where.step * 2)
-        out.segments = refine(self.segments)
+        return out
+
+    def beginning(self, segments: Segments) -> "RolloutProblem":
+        """The same measurements, predicted along other segments: other starts, other signals, another step."""
+        out = object.__new__(RolloutProblem)
+        out.__dict__.update(self.__dict__)
+        out.segments, out._recent = segments, Recent(_RECENT)
         return out
 
     def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
         """See `Problem`."""
-        out = object.__new__(RolloutProblem)
-        out.__dict__.update(self.__dict__)
-        w = self._where
+        out, w = self.beginning(pick(self.segments, index)), self._where
         out._where = Cut(w.log[index], w.start[index], w.samples[index], w.step[index])
         out.log_of, out.time_of = self.log_of[index], self.time_of[index]
-        out.segments = pick(self.segments, index)
         out._start_sd = [s[index] for s in self._start_sd]
         out._measured = [m[index] for m in self._measured]
         out._noise, out.mask = self._noise[index], self.mask[index]
@@ -312,15 +320,19 @@ class RolloutProblem(Problem):
 
     def redrawn(self, rng: np.random.Generator) -> "RolloutProblem":
         """The same measurements, begun at starts that are off by as much again as the measured ones may be."""
-        out = self.take(np.arange(len(self)))
         dq, dv = (rng.normal(size=sd.shape) * sd for sd in self._start_sd)
         starts = self.segments
-        out.segments = replace(starts, qpos=integrate(self._kit.model, starts.qpos, dq), qvel=starts.qvel + dv)
-        return out
+        return self.beginning(replace(starts, qpos=integrate(self._kit.model, starts.qpos, dq), qvel=starts.qvel + dv))
 
 
 def finer(plant: Plant) -> Plant:
     """The same plant with half the physics step."""
-    model = copy.copy(plant.model)
-    model.opt.timestep = plant.model.opt.timestep / 2
-    return Plant(model, plant.space, plant.effects, plant.nthread)
+    return Plant(_half(plant.model), plant.space, plant.effects, plant.nthread)
+
+
+@lru_cache(maxsize=8)
+def _half(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model at half its step; one and the same for who asks again, so that a residual is known again."""
+    model = copy.copy(model)
+    model.opt.timestep /= 2
+    return model
