@@ -322,15 +322,18 @@ def _settled(
     run: _Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = (), starts: int = STARTS
 ) -> _Settled:
     """Fit a model from where it stands and, where bodies touch, from other places (size,) too."""
-    plant, stage = start.plant, f"final {name}"
+    plant, stage, sigma = start.plant, f"final {name}", None
     if run.stages.get(stage) is None:
         run.say(f"fitting the {name} model on all {len(whole)} segments")
         fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
         tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
         ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
         run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "open": ended.open.tolist()})
+        sigma = ended.sigma
     x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "open"))
-    under = metric(whole, whole.covariance(plant, x if whole.rough else start.x), extra)
+    if sigma is None:
+        sigma = whole.covariance(plant, x if whole.rough else start.x)
+    under = metric(whole, sigma, extra)
     return _Settled(stand(whole, under, plant, x), under, unsure)
 
 
