@@ -31,10 +31,12 @@ class Hollows:
     Attributes:
       x: (size,) the likeliest.
       open: (size,) root mean square distance of the others from it: what the search for it leaves open.
+      sigma: (S, m, m) the noise that it expects itself, where hollows were compared by theirs.
     """
 
     x: Array
     open: Array
+    sigma: Array | None = None
 
 
 def hollows(
@@ -76,10 +78,13 @@ def hollows(
             apart.append(ends[-1])
         elif quiet == _SETTLED:
             break
-    if len(apart) > 1:  # each hollow is judged by the noise that it expects; within one all expect the same
-        apart.sort(key=lambda x: surprise(problem, extra, plant, x))
-    away = np.stack([x for x in ends if x is not apart[0]] or [apart[0]]) - apart[0]
-    return Hollows(apart[0], np.sqrt((away**2).mean(0)))
+    best, sigma, least = apart[0], None, np.inf
+    for x in apart if len(apart) > 1 else ():  # by the noise that each expects; within one hollow all expect the same
+        expected = problem.covariance(plant, x)
+        if (value := surprise(problem, expected, extra, plant, x)) < least:
+            best, sigma, least = x, expected, value
+    away = np.stack([x for x in ends if x is not best] or [best]) - best
+    return Hollows(best, np.sqrt((away**2).mean(0)), sigma)
 
 
 def _errors_between(found: Fit, limits: Box, a: Array, b: Array) -> float:
@@ -88,7 +93,6 @@ def _errors_between(found: Fit, limits: Box, a: Array, b: Array) -> float:
     return float(np.sqrt((moved**2).sum() / max(len(limits.scale), 1)))
 
 
-def surprise(problem: Problem, extra: Array, plant: Plant, x: Array) -> float:
-    """Of a model at x (size,) by the noise that it expects itself and slack (m,): `Metric.surprise` of all blocks."""
-    own = metric(problem, problem.covariance(plant, x), extra)
-    return float(own.surprise(problem.residual(plant, x[None])).sum())
+def surprise(problem: Problem, sigma: Array, extra: Array, plant: Plant, x: Array) -> float:
+    """Of a model at x (size,), by noise (S, m, m) and slack (m,): `Metric.surprise` of all blocks."""
+    return float(metric(problem, sigma, extra).surprise(problem.residual(plant, x[None])).sum())

@@ -131,7 +131,7 @@ def _rolled(problem: RolloutProblem, metric: Metric, current: Fit, sizes: dict[i
     part, under = problem.take(index), metric.take(index)
     seg = part.segments
     clock = np.broadcast_to(np.arange(-seg.history, steps, dtype=float), seg.ctrl.shape[:2])
-    part.segments = replace(seg, exogenous={**seg.exogenous, CLOCK: clock})
+    part = part.beginning(replace(seg, exogenous={**seg.exogenous, CLOCK: clock}))
     push = _Push(list(sizes), timed=True)
     plant = current.plant.with_effects([*current.plant.effects, push])
     edges = _edges(steps, blocks).astype(float)

@@ -44,6 +44,7 @@ from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
 from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.untimed import untimed
 
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
@@ -99,7 +100,7 @@ def close_loop(
       InputError: the mapping, the model, the logs or `out` cannot be used; nothing is written then.
     """
     require_writable(out)
-    with one_blas_thread():
+    with one_blas_thread(), untimed():
         # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
         mujoco.set_mju_user_warning(lambda message: None)
         dataset = require(mapping)[0]
@@ -321,15 +322,18 @@ def _settled(
     run: _Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = (), starts: int = STARTS
 ) -> _Settled:
     """Fit a model from where it stands and, where bodies touch, from other places (size,) too."""
-    plant, stage = start.plant, f"final {name}"
+    plant, stage, sigma = start.plant, f"final {name}", None
     if run.stages.get(stage) is None:
         run.say(f"fitting the {name} model on all {len(whole)} segments")
         fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
         tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
         ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
         run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "open": ended.open.tolist()})
+        sigma = ended.sigma
     x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "open"))
-    under = metric(whole, whole.covariance(plant, x if whole.rough else start.x), extra)
+    if sigma is None:
+        sigma = whole.covariance(plant, x if whole.rough else start.x)
+    under = metric(whole, sigma, extra)
     return _Settled(stand(whole, under, plant, x), under, unsure)
 
 

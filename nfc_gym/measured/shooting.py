@@ -3,14 +3,17 @@
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.log import Log
+from nfc_gym.measured.draws import across
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.measured.recent import Recent
 from nfc_gym.measured.segments import Cut, Layout, cut, lay, pick, refine, repeat
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import overrides
@@ -18,7 +21,8 @@ from nfc_gym.physics.rollout import Plant, Segments, Servo, Trajectory
 from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
 
 Array = NDArray[np.float64]
-_DRAWS = 16  # starts from which the noise where bodies touch is estimated
+_DRAWS = 24  # starts, at most, from which the noise where bodies touch is estimated; a step's error from two in three
+_RECENT = 64_000_000  # bytes of residuals that a problem keeps
 
 
 def interpolate(grid: Array, step: Array, quaternion: bool) -> Array:
@@ -83,7 +87,8 @@ class RolloutProblem(Problem):
         self._place(where, None)
 
     def _place(self, where: Cut, measured: list[Array] | None) -> None:
-        kit = self._kit
+        kit, self._recent = self._kit, Recent(_RECENT)
+        self._whole: RolloutProblem | None = None  # the same at twice the step, of a problem that was halved
         self._where, self.log_of = where, where.log
         self.time_of = np.array([kit.logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)])
         segments = lay(kit.model, kit.logs, kit.states, where, kit.layout, kit.servos, kit.linear)
@@ -194,8 +199,11 @@ class RolloutProblem(Problem):
         return np.where(traj.stable[..., None], residual, np.nan)
 
     def residual(self, plant: Plant, x: Array) -> Array:
-        """See `Problem`."""
-        return self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
+        """See `Problem`; read-only."""
+        question = plant.model, plant.space, plant.effects, x.shape, x.tobytes()
+        return self._recent(
+            question, lambda: self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
+        )
 
     def touches(self, plant: Plant, x: Array) -> bool:
         """Whether bodies touch in any roll-out at x (size,)."""
@@ -212,11 +220,10 @@ class RolloutProblem(Problem):
         sigma = np.zeros((size, width, width))
         sigma[:, np.arange(width), np.arange(width)] = np.where(self.mask, self._noise**2, 1.0)
         base = self.residual(plant, x[None])[0]
-        carried = self._carried(plant, x, base)
         if self.rough:
-            moved, discretised = self._drawn(plant, x, base)
-            carried = np.concatenate([carried, moved]) * np.sqrt(0.5)  # two estimates of one covariance: their mean
+            carried, discretised = self._drawn(plant, x, base)
         else:
+            carried = self._carried(plant, x, base)
             discretised = (self._halved(plant, x, self.segments) - base) / self.reach(plant)
         for column in (*carried, *discretised):
             column = np.where(np.isfinite(column), column, 0.0)
@@ -230,18 +237,32 @@ class RolloutProblem(Problem):
         return 1 - 0.5**order
 
     def _drawn(self, plant: Plant, x: Array, base: Array) -> tuple[Array, Array]:
-        """Columns (D, S, m) of start-state noise and of the discretisation's error, from starts drawn at random."""
-        rng = np.random.default_rng(len(self))
-        dq, dv = (np.concatenate([rng.normal(size=sd.shape) * sd for _ in range(_DRAWS)]) for sd in self._start_sd)
-        repeated = repeat(
-            self.segments,
-            _DRAWS,
-            integrate(self._kit.model, np.concatenate([self.segments.qpos] * _DRAWS), dq),
-            np.concatenate([self.segments.qvel] * _DRAWS) + dv,
-        )
-        coarse = self._again(plant, x, repeated, _DRAWS)
-        fine = self._halved(plant, x, repeated, _DRAWS)
-        return (coarse - base) / np.sqrt(_DRAWS), (fine - coarse) / self.reach(plant) / np.sqrt(_DRAWS)
+        """Columns (D, S, m) of start-state noise, (F, S, m) of the discretisation's error, from starts drawn at random.
+
+        Draws at right angles carry the linear part of the noise as exactly as a difference for each coordinate would.
+        """
+        sd = np.concatenate(self._start_sd, 1)
+        noisy = (sd > 0).any(0)
+        draws = np.zeros((1, *sd.shape))
+        if noisy.any():
+            found = across(np.random.default_rng(len(self)), len(self), int(noisy.sum()), _DRAWS)
+            draws = np.zeros((len(found), *sd.shape))
+            draws[..., noisy] = found * sd[:, noisy]
+        few = draws[: -(-2 * len(draws) // 3)]
+        here, reach = self._again(plant, x, self._begun(draws), len(draws)), self.reach(plant)
+        if self._whole is None:
+            error = (here[: len(few)] - self._halved(plant, x, self._begun(few), len(few))) / reach
+        else:  # a step twice as long tells the same in a quarter of the time
+            whole = self._whole
+            error = (whole._again(coarser(plant), x, whole._begun(few), len(few)) - here[: len(few)]) * (1 / reach - 1)
+        return (here - base) / np.sqrt(len(draws)), error / np.sqrt(len(few))
+
+    def _begun(self, draws: Array) -> Segments:
+        """Copies of the segments that begin off their starts by draws (D, S, 2 nv)."""
+        count, seg = len(draws), self.segments
+        dq, dv = np.split(draws.reshape(-1, draws.shape[-1]), 2, axis=1)
+        starts = integrate(self._kit.model, np.concatenate([seg.qpos] * count), dq)
+        return repeat(seg, count, starts, np.concatenate([seg.qvel] * count) + dv)
 
     def _carried(self, plant: Plant, x: Array, base: Array) -> Array:
         """(n, S, m) change of the residual for one standard deviation of each of n start coordinates."""
@@ -270,25 +291,29 @@ class RolloutProblem(Problem):
 
     def halved(self) -> "RolloutProblem":
         """The same segments at half the physics step, for plants that are `finer`."""
-        out = object.__new__(RolloutProblem)
-        out.__dict__.update(self.__dict__)
         layout = self._kit.layout
+        out = self.beginning(refine(self.segments))
         out._kit = replace(self._kit, layout=replace(layout, dt=layout.dt / 2))
         out._where = replace(self._where, step=self._where.step * 2)
-        out.segments = refine(self.segments)
+        out._whole = self
+        return out
+
+    def beginning(self, segments: Segments) -> "RolloutProblem":
+        """The same measurements, predicted along other segments: other starts, other signals, another step."""
+        out = object.__new__(RolloutProblem)
+        out.__dict__.update(self.__dict__)
+        out.segments, out._recent, out._whole = segments, Recent(_RECENT), None
         return out
 
     def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
         """See `Problem`."""
-        out = object.__new__(RolloutProblem)
-        out.__dict__.update(self.__dict__)
-        w = self._where
+        out, w = self.beginning(pick(self.segments, index)), self._where
         out._where = Cut(w.log[index], w.start[index], w.samples[index], w.step[index])
         out.log_of, out.time_of = self.log_of[index], self.time_of[index]
-        out.segments = pick(self.segments, index)
         out._start_sd = [s[index] for s in self._start_sd]
         out._measured = [m[index] for m in self._measured]
         out._noise, out.mask = self._noise[index], self.mask[index]
+        out._whole = None if self._whole is None else self._whole.take(index)
         return out
 
     def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "RolloutProblem":
@@ -312,15 +337,24 @@ class RolloutProblem(Problem):
 
     def redrawn(self, rng: np.random.Generator) -> "RolloutProblem":
         """The same measurements, begun at starts that are off by as much again as the measured ones may be."""
-        out = self.take(np.arange(len(self)))
         dq, dv = (rng.normal(size=sd.shape) * sd for sd in self._start_sd)
         starts = self.segments
-        out.segments = replace(starts, qpos=integrate(self._kit.model, starts.qpos, dq), qvel=starts.qvel + dv)
-        return out
+        return self.beginning(replace(starts, qpos=integrate(self._kit.model, starts.qpos, dq), qvel=starts.qvel + dv))
 
 
 def finer(plant: Plant) -> Plant:
     """The same plant with half the physics step."""
-    model = copy.copy(plant.model)
-    model.opt.timestep = plant.model.opt.timestep / 2
-    return Plant(model, plant.space, plant.effects, plant.nthread)
+    return Plant(_stepped(plant.model, 0.5), plant.space, plant.effects, plant.nthread)
+
+
+def coarser(plant: Plant) -> Plant:
+    """The same plant with twice the physics step."""
+    return Plant(_stepped(plant.model, 2.0), plant.space, plant.effects, plant.nthread)
+
+
+@lru_cache(maxsize=8)
+def _stepped(model: mujoco.MjModel, times: float) -> mujoco.MjModel:
+    """The model at so many times its step; one and the same for who asks again, so that a residual is known again."""
+    model = copy.copy(model)
+    model.opt.timestep *= times
+    return model

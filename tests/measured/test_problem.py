@@ -12,7 +12,7 @@ from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.segments import Layout
-from nfc_gym.measured.shooting import RolloutProblem, interpolate
+from nfc_gym.measured.shooting import RolloutProblem, finer, interpolate
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
@@ -172,6 +172,26 @@ def test_take_picks_blocks(plant: Plant) -> None:
     )
 
 
+def test_what_was_just_rolled_out_is_not_rolled_out_again(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    rolled: list[float] = []
+    shoot = Plant.shoot
+    monkeypatch.setattr(
+        Plant, "shoot", lambda self, x, *rest, **kw: rolled.append(x[0, 0]) or shoot(self, x, *rest, **kw)
+    )
+    problem, fine = rollouts(plant), rollouts(plant).halved()
+    one, other = np.array([[0.1]]), np.array([[0.2]])
+    first = problem.residual(plant, one)
+    problem.residual(plant, other)
+    assert (problem.residual(plant.with_effects([]), one) == first).all()
+    assert rolled == [0.1, 0.2]
+    twice = [fine.residual(finer(plant), one) for _ in range(2)]
+    assert len(rolled) == 3
+    assert (twice[0] != first).any()
+    moved = problem.redrawn(np.random.default_rng(0))  # other starts are another question
+    assert (moved.residual(plant, one) != first).any()
+    assert len(problem.take(np.array([3])).residual(plant, one)[0]) == 1
+
+
 def test_an_unstable_roll_out_has_no_residual(plant: Plant) -> None:
     problem = rollouts(plant, logs=1)
     residual = problem.residual(plant, np.array([[DAMPING], [-400.0]]))
@@ -321,3 +341,16 @@ def test_the_noise_of_impacts_is_drawn_from_starts() -> None:
     straight = chi2(problem, plant, plant.null)
     print(straight.mean(), np.median(straight.mean(1)), drawn.mean(), np.median(drawn.mean(1)), drawn.mean(1).max())
     assert 0.7 < drawn.mean() < 1.3 < straight.mean()
+
+
+def test_at_half_the_step_the_noise_of_impacts_is_told_by_the_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    logs, model = [bounce(0.0005, 2.1, rng) for _ in range(8)], bouncy(DT)
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    states = [estimate_states(model, log) for log in logs]
+    problem = RolloutProblem(model, logs, states, Layout(0.4, 0.0, (0.1, 0.2, 0.4), 0.4, DT)).halved()
+    steps: list[float] = []
+    shoot = Plant.shoot
+    monkeypatch.setattr(Plant, "shoot", lambda self, x, s, **kw: steps.append(s.dt) or shoot(self, x, s, **kw))
+    assert 0.7 < chi2(problem, finer(plant), plant.null).mean() < 1.3
+    assert set(steps) == {DT / 2, DT}  # and not a quarter

@@ -49,6 +49,24 @@ def test_without_effects_it_is_a_loop_of_mj_step(history: int) -> None:
     assert t.stable.all()
 
 
+def test_sensors_that_nobody_asks_for_are_not_computed_and_the_motion_is_the_same() -> None:
+    class Reading(Effect):
+        family = "reading"
+
+        def __init__(self) -> None:
+            super().__init__(("all",), [])
+
+        def force(self, ctx: Context, theta: np.ndarray, out: Forces) -> None:
+            ctx.data("sensordata")
+
+    segments = zoo_segments(MODEL, 1, size=3)
+    with_them, without = (plant_of(MODEL).shoot(NONE, segments, sensors=s) for s in (True, False))
+    np.testing.assert_array_equal(with_them.qpos, without.qpos)
+    np.testing.assert_array_equal(with_them.qvel, without.qvel)
+    with pytest.raises(LookupError, match="sensordata"):
+        plant_of(MODEL, Reading()).shoot(NONE, segments)
+
+
 def test_psi_is_what_a_model_edited_by_hand_does() -> None:
     space = ParameterSpace(
         MODEL,
