@@ -271,6 +271,14 @@ class Effect(ABC):
         """The inverse of `chart`."""
         return coordinates
 
+    def starts(self, theta: Array) -> Array:
+        """(r, k) other parameters that a fit may start from, along a valley of the chart that holds theta (k,).
+
+        Where psi can take up what one coordinate does, the logs hardly say where along it the truth lies, and a fit
+        from one end may never reach the other.
+        """
+        return np.zeros((0, len(self.params)))
+
     # ---- words ----------------------------------------------------------------------------------------------------
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
