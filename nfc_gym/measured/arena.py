@@ -279,6 +279,19 @@ class Arena:
         """Whether `other` is not significantly worse."""
         return not_worse(best, other, *self.blocks, self.rng)
 
+    def nearer(self, one: Judged, other: Judged) -> bool:
+        """Whether two candidates are one thing that two bodies could carry, hung by the first on the one nearer to it.
+
+        So it is where one family at two places predicts the same motion: all that lies between the predictions is less
+        than what a single parameter must gain, and no logs like these could tell the two apart.
+        """
+        laws = self.new(one), self.new(other)
+        if any(len(new) != 1 for new in laws) or laws[0][0].family != laws[1][0].family:
+            return False
+        apart = float(((one.fitted.white - other.fitted.white) ** 2).sum())
+        far = [new[0].outlying(j.fitted.x[_of(j.fitted, new[0])]) for new, j in zip(laws, (one, other), strict=True)]
+        return apart < self.cost(1) and far[0] < far[1]
+
     def plausible(self, j: Judged) -> bool:
         """Whether no parameter that a candidate adds ended at the edge of what is plausible.
 
@@ -337,6 +350,12 @@ class Arena:
 def _at_half(problem: Problem, under: Metric, coarse: Fit) -> Fit:
     """A fit gone on with at half its step, by the slopes of the whole one."""
     return fit(problem, under, finer(coarse.plant), coarse.x, _AT_HALF, known=coarse.jacobian)
+
+
+def _of(fitted: Fit, effect: Effect) -> NDArray[np.bool_]:
+    """(size,) which of a fit's parameters are an effect's."""
+    psi = np.zeros(len(fitted.plant.space), bool)
+    return np.concatenate([psi, *(np.full(len(e.params), e is effect) for e in fitted.plant.effects)])
 
 
 def _slopes_of_others(fitted: Fit, effect: Effect) -> Array:

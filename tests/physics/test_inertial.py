@@ -140,3 +140,5 @@ def test_a_lump_starts_with_the_same_moments_or_multiples_within_its_bounds() ->
     assert (found <= lump.high).all()
     assert found[:, 0].max() > 10 * theta[0]
     assert not len(lump.starts(lump.null)), "no mass has no moments"
+    assert lump.outlying(np.array([1.0, *middle])) == pytest.approx(0.0)
+    assert lump.outlying(theta) == pytest.approx(np.hypot(np.hypot(0.8, 0.2), 0.2))

@@ -279,6 +279,13 @@ class Effect(ABC):
         """
         return np.zeros((0, len(self.params)))
 
+    def outlying(self, theta: Array) -> float:
+        """How far from the middle of the part that bears it an effect sits, in sizes of that part; 0 if nowhere.
+
+        One lump may hang on either of two bodies that hardly move against each other: the nearer one carries it.
+        """
+        return 0.0
+
     # ---- words ----------------------------------------------------------------------------------------------------
 
     def say(self, theta: Array, sd: Array | None = None) -> str:

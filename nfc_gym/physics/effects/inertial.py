@@ -149,6 +149,11 @@ class Payload(_Inertial):
         possible = (masses > _NO_MASS) & (masses < self.high[0])
         return np.column_stack([masses[possible], places[possible]])
 
+    def outlying(self, theta: Array) -> float:
+        """Of the way from the middle of the body to the edge of where a lump may lie: bodies are as large as that."""
+        middle, reach = (self.high + self.low)[1:] / 2, (self.high - self.low)[1:] / 2
+        return float(np.linalg.norm((theta[1:] - middle) / reach))
+
     def bind(self, model: mujoco.MjModel) -> None:
         super().bind(model)
         self._refuse_simple(model)
