@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.box import box
 from nfc_gym.measured.contest import (
     Judged,
     Side,
@@ -27,6 +26,7 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
 from nfc_gym.measured.shooting import RolloutProblem, finer
+from nfc_gym.measured.starting import starts
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import Each, split
@@ -141,11 +141,7 @@ class Arena:
         self.say(f"refitting {' and '.join(s.effect.id for s in picks)}")
         current = self.current
         plant = current.plant.with_effects([*current.plant.effects, *(s.effect for s in picks)])
-        limits, thetas = box(current.plant), [s.theta for s in picks]
-        moved = limits.x(limits.at(current.x) + picks[0].shift, current.x)
-        starts = np.stack([np.concatenate([x, *thetas]) for x in (moved, current.x)])
-        white = self.under.whiten(self.fit_data.problem.residual(plant, starts))
-        start = starts[int(loss(white).sum(-1).argmin())]
+        start = self._nearest(plant, starts(self.fit_data.problem, self.under, current, plant, picks))
         # Who leads is fitted again in full; where roll-outs are costly a first look must do with the slopes at hand.
         return self._refit(plant, start, 10, self.current.jacobian, quick=self.fit_data.problem.costly)
 
@@ -163,12 +159,15 @@ class Arena:
         self.say(f"refitting {pick.effect.id}, which does much the same")
         current = self.current
         plant = current.plant.with_effects([*current.plant.effects, pick.effect])
-        limits, width = box(current.plant), len(current.x)
-        moved = limits.x(limits.at(current.x) + pick.shift, current.x)
-        starts = np.stack([np.concatenate([x, pick.theta]) for x in (leader.fitted.x[:width], moved, current.x)])
-        values = loss(self.under.whiten(self.fit_data.problem.residual(plant, starts))).sum(-1)
+        beside = np.concatenate([leader.fitted.x[: len(current.x)], pick.theta])
+        rows = np.vstack([beside, starts(self.fit_data.problem, self.under, current, plant, [pick])])
         known = leader.fitted.jacobian[..., : current.jacobian.shape[-1]]
-        return self._refit(plant, starts[int(values.argmin())], 10, known, quick=self.fit_data.problem.costly)
+        return self._refit(plant, self._nearest(plant, rows), 10, known, quick=self.fit_data.problem.costly)
+
+    def _nearest(self, plant: Plant, rows: Array) -> Array:
+        """Of several parameter vectors (r, n) the one that leaves least."""
+        white = self.under.whiten(self.fit_data.problem.residual(plant, rows))
+        return rows[int(loss(white).sum(-1).argmin())]
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
         """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""
@@ -280,6 +279,19 @@ class Arena:
         """Whether `other` is not significantly worse."""
         return not_worse(best, other, *self.blocks, self.rng)
 
+    def nearer(self, one: Judged, other: Judged) -> bool:
+        """Whether two candidates are one thing that two bodies could carry, hung by the first on the one nearer to it.
+
+        So it is where one family at two places predicts the same motion: all that lies between the predictions is less
+        than what a single parameter must gain, and no logs like these could tell the two apart.
+        """
+        laws = self.new(one), self.new(other)
+        if any(len(new) != 1 for new in laws) or laws[0][0].family != laws[1][0].family:
+            return False
+        apart = float(((one.fitted.white - other.fitted.white) ** 2).sum())
+        far = [new[0].outlying(j.fitted.x[_of(j.fitted, new[0])]) for new, j in zip(laws, (one, other), strict=True)]
+        return apart < self.cost(1) and far[0] < far[1]
+
     def plausible(self, j: Judged) -> bool:
         """Whether no parameter that a candidate adds ended at the edge of what is plausible.
 
@@ -338,6 +350,12 @@ class Arena:
 def _at_half(problem: Problem, under: Metric, coarse: Fit) -> Fit:
     """A fit gone on with at half its step, by the slopes of the whole one."""
     return fit(problem, under, finer(coarse.plant), coarse.x, _AT_HALF, known=coarse.jacobian)
+
+
+def _of(fitted: Fit, effect: Effect) -> NDArray[np.bool_]:
+    """(size,) which of a fit's parameters are an effect's."""
+    psi = np.zeros(len(fitted.plant.space), bool)
+    return np.concatenate([psi, *(np.full(len(e.params), e is effect) for e in fitted.plant.effects)])
 
 
 def _slopes_of_others(fitted: Fit, effect: Effect) -> Array:

@@ -10,7 +10,7 @@ from nfc_gym.measured.screen import Screen, Screened, likeness
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each, split
 
-_NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
+NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
 _SHARED = 0.8  # the same for the same law at a wider place
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
 _PAIRED = 3  # mechanisms that are tried in pairs
@@ -198,8 +198,10 @@ class Contest:
         """Ids of what explains the data as well as the law that is accepted."""
         arena, chosen = self.arena, self.arena.new(best)
         ids = [e.id for e in chosen]
-        rivals = [j for j in judged if j.total > _NEARLY * best.total and arena.label(j) not in ids]
+        rivals = [j for j in judged if j.total > NEARLY * best.total and arena.label(j) not in ids]
         rivals = [j for j in rivals if arena.ties(leading, j)]
+        # Nor is one thing that two bodies could carry, hung on the one farther away.
+        rivals = [j for j in rivals if not any(arena.nearer(k, j) for k in (best, *rivals))]
         # A law that has the chosen one, or another rival, as its special case is no further alternative.
         plainer = [chosen, *(arena.new(j) for j in rivals)]
         return [
@@ -286,14 +288,15 @@ class Contest:
         def enough(j: Judged) -> float:
             rival = arena.new(j)[0]
             wider = rival.family == winner.family and set(winner.where) < set(rival.where)
-            return _SHARED if wider else _NEARLY
+            return _SHARED if wider else NEARLY
 
         rivals = [j for j in believed if j.total > enough(j) * best.total and arena.ties(best, j)]
         for parts in self._plainer(winner) if added else []:
             plain = arena.enter(parts)
-            if self._believed(plain) and plain.total > _NEARLY * best.total and arena.ties(best, plain):
+            if self._believed(plain) and plain.total > NEARLY * best.total and arena.ties(best, plain):
                 rivals.append(plain)
-        return min(rivals, key=lambda j: (len(j.fitted.x), -len(arena.new(j)[0].where), -j.total))
+        chosen = min(rivals, key=lambda j: (len(j.fitted.x), -len(arena.new(j)[0].where), -j.total))
+        return next((j for j in rivals if arena.nearer(j, chosen)), chosen)
 
     def _plainer(self, law: Effect) -> list[list[Screened]]:
         """The sets of plainer laws that a law contains, screened at its place.

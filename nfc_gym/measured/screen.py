@@ -128,7 +128,7 @@ class Screen:
             at += len(probe)
             gain, theta, multiple = self._combine(effect, probe, columns)
             if gain > best.gain or best.columns.shape[1] == 0:
-                best = Screened(effect, gain, theta, self._shift(raw @ multiple), columns)
+                best = Screened(effect, gain, theta, _step(self.full_tangent, self.target + raw @ multiple), columns)
         return best
 
     def scout(self, found: Screened, rng: np.random.Generator, draws: int = 16) -> Screened:
@@ -172,12 +172,6 @@ class Screen:
         gain = float(self.current.losses.sum() - fitted.losses.sum())
         theta = fitted.x[self.current.plant.size :]
         return replace(found, gain=gain, theta=theta, shift=before.at(fitted.x[: self.current.plant.size]) - here)
-
-    def _shift(self, change: Array) -> Array:
-        """Step of the fitted parameters that answers a change of the residual; directions that hardly show stay put."""
-        if not self.full_tangent.shape[1]:
-            return np.zeros(0)
-        return np.asarray(np.linalg.lstsq(self.full_tangent, -(self.target + change), rcond=1e-3)[0], np.float64)
 
     def _combine(self, effect: Effect, probe: Array, columns: Array) -> tuple[float, Array, Array]:
         """Best multiples of the probes within the parameters' bounds, and what they gain."""
@@ -229,6 +223,20 @@ class Screen:
         mean = np.maximum(gains.mean(1), 1e-12)
         luckiest = float(np.quantile((gains / mean[:, None]).max(0), 0.99))
         return {s.effect.id: luckiest * float(m) for s, m in zip(kept, mean, strict=True)}
+
+
+def answer(current: Fit, white: Array) -> Array:
+    """(p, j) steps of a fitted model's scaled free parameters that answer best what is left of (p, S, m) residuals."""
+    weight = loss_weight(current.white)
+    tangent = (weight[..., None] * current.jacobian).reshape(-1, current.jacobian.shape[-1])
+    return _step(tangent, (weight * white).reshape(len(white), -1).T).T
+
+
+def _step(tangent: Array, target: Array) -> Array:
+    """Steps (j,) or (j, p) along (n, j) that take most from (n,) or (n, p); what hardly shows stays put."""
+    if not tangent.shape[1]:
+        return np.zeros((0, *target.shape[1:]))
+    return np.asarray(np.linalg.lstsq(tangent, -target, rcond=1e-3)[0], np.float64)
 
 
 def likeness(one: Screened, other: Screened, projected: Array) -> float:

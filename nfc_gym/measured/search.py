@@ -219,8 +219,11 @@ class Search:
         """A model in which another law took the place of an earlier one, if that is clearly better."""
         if sum(bool(r.exchanged) for r in rounds) >= self.options.swaps:
             return None
-        found = swapped(arena, self.lookout, self.named, self.options.worth, self.say)
-        if found is None:
+        swap = swapped(arena, self.lookout, self.named, self.options.worth, self.say)
+        if (found := swap.better) is None:
+            for r in rounds:
+                if len(r.accepted) == 1:
+                    r.equivalents += [i for i in swap.alike.get(r.accepted[0], []) if i not in r.equivalents]
             return None
         gone, come = (
             [e.id for e in one.plant.effects if e not in other.plant.effects]

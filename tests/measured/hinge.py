@@ -33,6 +33,7 @@ MODEL = """
 """
 FRICTION = 'frictionloss="0.2" solreffriction="0.01 1" solimpfriction="0.99 0.99 0.001 0.5 2"'
 LAGGING = 'damping="0.15"'
+SCALES = Scales(np.full(1, 0.5), np.full(1, 4.0), np.full(1, 1.0), np.full(1, 1.0), DT)
 
 
 def record(physics: str, seed: int) -> Log:
@@ -77,8 +78,7 @@ def arena(physics: str, effects: list[tuple[Effect, NDArray[np.float64]]]) -> Ar
 
 
 def pool() -> list[Effect]:
-    scales = Scales(np.full(1, 0.5), np.full(1, 4.0), np.full(1, 1.0), np.full(1, 1.0), DT)
-    return [e for kind in (Coulomb, DampingPoly, SpringOffset) for e in kind.propose(given(), scales)]
+    return [e for kind in (Coulomb, DampingPoly, SpringOffset) for e in kind.propose(given(), SCALES)]
 
 
 VISCOUS = ("damping_poly", "hinge", {"linear": 0.1, "quadratic": 0.0, "cubic": 0.0})

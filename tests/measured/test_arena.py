@@ -12,8 +12,12 @@ from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.measured.rounds import Contest
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.base import Param
+from nfc_gym.physics.effects.friction import Coulomb
+from nfc_gym.physics.effects.inertial import Payload
+from nfc_gym.physics.effects.places import sized
 
 
 class Curve(Problem):
@@ -150,3 +154,45 @@ def test_by_a_metric_of_its_own_a_model_is_refitted_and_pays_for_its_slack() -> 
     found = own.judge(bent).fitted
     assert found.x[1] == pytest.approx(5.0, abs=0.1)
     np.testing.assert_allclose(found.white, under.whiten(problem.residual(None, found.x[None]))[0], atol=1e-6)
+
+
+class Hung(Payload):
+    """A lump whose body is 0.2 m across, about a middle of its own."""
+
+    def __init__(self, body: str, middle: float) -> None:
+        place = {"low": middle - 0.5, "high": middle + 0.5}
+        super().__init__((body,), sized(Payload.PARAMS, x=place, y=place, z=place))
+
+
+@pytest.mark.parametrize(("apart", "one_thing"), [(0.9, True), (1.1, False)])
+def test_of_two_bodies_that_could_carry_one_lump_the_nearer_one_does(apart: float, one_thing: bool) -> None:
+    contest, _ = arena(0.0)
+    near, far, drag = Hung("trunk", 0.0), Hung("arm", 0.4), Coulomb(("joint",))
+
+    def hung(effect: Any, theta: list[float], off: float) -> Judged:
+        white = contest.current.white + off * np.eye(*contest.current.white.shape)
+        plant: Any = SimpleNamespace(effects=(effect,), space=())
+        return judged(Fit(plant, np.array(theta), white, np.zeros((*white.shape, 4))))
+
+    lump = [0.1, 0.05, 0.05, 0.05]
+    trunk, arm = hung(near, lump, 0.0), hung(far, lump, float(np.sqrt(apart * contest.cost(1) / 8)))
+    assert contest.nearer(trunk, arm) == one_thing
+    assert not contest.nearer(arm, trunk)
+    assert not contest.nearer(hung(drag, [0.1], 0.0), arm)
+
+
+def test_one_lump_on_either_of_two_bodies_is_one_equivalent() -> None:
+    shift, near, far = (
+        SimpleNamespace(id=i, family=i.partition(":")[0], where=(i[-1],), simpler=(), covers=())
+        for i in ("shift:a", "lump:a", "lump:b")
+    )
+    laws: list[Any] = [SimpleNamespace(law=law, total=total) for law, total in ((shift, 9.0), (near, 8.8), (far, 8.9))]
+    found: Any = SimpleNamespace(
+        new=lambda j: [j.law],
+        label=lambda j: j.law.id,
+        ties=lambda best, other: True,
+        nearer=lambda one, other: (one.law, other.law) == (near, far),
+    )
+    contest: Any = object.__new__(Contest)
+    contest.arena = found
+    assert contest._equivalents(laws, laws[0], laws[0]) == ["lump:a"]

@@ -1,12 +1,17 @@
 """An earlier law gives way to the one that does better beside the others."""
 
+from typing import Any
+
 import numpy as np
 import pytest
-from hinge import DRY, FRICTION, LAGGING, SPRING, VISCOUS, arena, pool
+from hinge import DRY, FRICTION, LAGGING, SCALES, SPRING, VISCOUS, arena, given, pool
 
 from nfc_gym.measured.lookout import Lookout
-from nfc_gym.measured.swap import swapped
+from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.search import Options, Search
+from nfc_gym.measured.swap import Swap, swapped
 from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects.joint import DampingPoly
 
 
 @pytest.mark.parametrize(
@@ -20,8 +25,34 @@ def test_the_wrong_law_beside_a_right_one_is_exchanged(physics: str, first: tupl
     said: list[str] = []
     found = swapped(contest, lookout, pool(), 0.02, said.append)
     if right is None:
-        assert found is None
+        assert found.better is None
+        assert not found.alike
         return
-    assert found is not None
-    assert {e.id for e in found.plant.effects} == {right, "spring_offset:hinge"}
+    assert found.better is not None
+    assert {e.id for e in found.better.plant.effects} == {right, "spring_offset:hinge"}
     assert said == [f"{right} in place of {first[0]}:hinge: together they explain more"]
+
+
+class Twin(DampingPoly):
+    """Damping by another name."""
+
+    family = "twin"
+
+
+def test_what_does_as_well_in_an_earlier_laws_place_is_its_equivalent() -> None:
+    contest = arena(LAGGING, [build(*VISCOUS), build(*SPRING)])
+    lookout = Lookout(contest.fit_data.problem, np.random.default_rng(0), lambda text: None)
+    twins = Twin.propose(given(), SCALES)
+    found = swapped(contest, lookout, [*pool(), *twins], 0.02, lambda text: None)
+    assert found.better is None
+    assert found.alike == {"damping_poly:hinge": ["twin:hinge"]}
+
+
+def test_equivalents_in_the_last_model_join_those_of_the_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A law that did worse while another was missing may do as well beside it."""
+    search: Any = object.__new__(Search)
+    search.options, search.lookout, search.named, search.say = Options(), None, [], None
+    rounds = [Round(["a:x"], 0.5, equivalents=["b:x"]), Round(["d:x"], 0.1), Round([], 0.0)]
+    monkeypatch.setattr("nfc_gym.measured.search.swapped", lambda *_: Swap(alike={"a:x": ["b:x", "c:x"]}))
+    assert search._exchange(None, rounds) is None
+    assert [r.equivalents for r in rounds] == [["b:x", "c:x"], [], []]

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from machines import make, run
 
-from nfc_gym.physics.effects.inertial import principal
+from nfc_gym.physics.effects.inertial import Payload, principal
+from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.state import rotate
 
@@ -123,3 +124,21 @@ def test_principal_is_continuous() -> None:
     quats = [principal(np.diag([1.0, 1.2, 2.0]) + e * np.ones((3, 3)))[1] for e in (0.0, 1e-6, 1e-3)]
     assert 1 - quats[1][0] < 1e-9
     assert 1 - quats[2][0] < 1e-3
+
+
+def test_a_lump_starts_with_the_same_moments_or_multiples_within_its_bounds() -> None:
+    """About the middle of its body: a body that gives up mass for the lump keeps its own centre."""
+    place = {axis: {"low": c - 0.5, "high": c + 0.5} for axis, c in zip("xyz", (0.1, 0.0, -0.2), strict=True)}
+    lump = Payload(("b",), sized(Payload.PARAMS, mass={"high": 2.0}, **place))
+    theta = np.array([0.03, 0.5, 0.1, -0.3])
+    found = lump.starts(theta)
+    middle = np.array([0.1, 0.0, -0.2])
+    growth = found[:, :1] * (found[:, 1:] - middle) / (theta[0] * (theta[1:] - middle))
+    np.testing.assert_allclose(growth, growth[:, :1] @ np.ones((1, 3)))
+    assert set(growth[:, 0].round(6)) == {1.0, 2.0, 4.0}
+    assert (found >= lump.low).all()
+    assert (found <= lump.high).all()
+    assert found[:, 0].max() > 10 * theta[0]
+    assert not len(lump.starts(lump.null)), "no mass has no moments"
+    assert lump.outlying(np.array([1.0, *middle])) == pytest.approx(0.0)
+    assert lump.outlying(theta) == pytest.approx(np.hypot(np.hypot(0.8, 0.2), 0.2))

@@ -271,6 +271,21 @@ class Effect(ABC):
         """The inverse of `chart`."""
         return coordinates
 
+    def starts(self, theta: Array) -> Array:
+        """(r, k) other parameters that a fit may start from, along a valley of the chart that holds theta (k,).
+
+        Where psi can take up what one coordinate does, the logs hardly say where along it the truth lies, and a fit
+        from one end may never reach the other.
+        """
+        return np.zeros((0, len(self.params)))
+
+    def outlying(self, theta: Array) -> float:
+        """How far from the middle of the part that bears it an effect sits, in sizes of that part; 0 if nowhere.
+
+        One lump may hang on either of two bodies that hardly move against each other: the nearer one carries it.
+        """
+        return 0.0
+
     # ---- words ----------------------------------------------------------------------------------------------------
 
     def say(self, theta: Array, sd: Array | None = None) -> str:

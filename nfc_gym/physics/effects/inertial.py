@@ -16,6 +16,8 @@ from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.state import quat_multiply, rotate_back
 
 _NO_MASS = 1e-9  # kg: a lighter lump has no place
+_REACHES = (0.8, 0.4, 0.2, 0.1, 0.05)  # of the way to the edge of where a lump may lie: where fits start
+_GROWTH = (1.0, 2.0, 4.0)  # of the moments: what a straight line says of them is too little where bodies touch
 _SWEEPS = 6  # cyclic Jacobi on 3 x 3 converges quadratically; six sweeps reach the last bit
 
 
@@ -130,6 +132,23 @@ class Payload(_Inertial):
     def unchart(self, coordinates: Array) -> Array:
         mass = coordinates[..., :1]
         return np.concatenate([mass, coordinates[..., 1:] / np.where(np.abs(mass) > _NO_MASS, mass, _NO_MASS)], -1)
+
+    def starts(self, theta: Array) -> Array:
+        """The same moments about the middle of the body with other masses: lighter and farther out, heavier and nearer.
+
+        A body whose own mass is free takes up what a lump weighs, and the motion then shows little but its moments.
+        """
+        middle, reach = (self.high + self.low)[1:] / 2, (self.high - self.low)[1:] / 2
+        moments = np.outer(_GROWTH, theta[0] * (theta[1:] - middle))
+        masses = (np.abs(moments) / reach).max(-1)[:, None] / np.array(_REACHES)
+        places = middle + moments[:, None] / np.maximum(masses, _NO_MASS)[..., None]
+        possible = (masses > _NO_MASS) & (masses < self.high[0])
+        return np.column_stack([masses[possible], places[possible]])
+
+    def outlying(self, theta: Array) -> float:
+        """Of the way from the middle of the body to the edge of where a lump may lie: bodies are as large as that."""
+        middle, reach = (self.high + self.low)[1:] / 2, (self.high - self.low)[1:] / 2
+        return float(np.linalg.norm((theta[1:] - middle) / reach))
 
     def bind(self, model: mujoco.MjModel) -> None:
         super().bind(model)
