@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from nfc_gym.measured.arena import Arena, contains
 from nfc_gym.measured.contest import Judged, mechanism, shortlist
 from nfc_gym.measured.fit import Fit, fit
-from nfc_gym.measured.screen import Screen, Screened, likeness
+from nfc_gym.measured.screen import Screen, Screened, mimics
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each, split
 
@@ -21,7 +21,6 @@ _SHARP = 0.1  # nats a number beyond the noise, below which the metric of the mo
 _FAR = 0.5  # of the best first gain: who gains less is beaten for good, and ranked by it
 _FAINT = 0.02  # nats a number beyond the noise, below which two laws have nothing to mend together
 _HOPE = 0.25  # of the gain that a law must reach: what screening must promise for a refit to be worth its time
-_MIMIC, _MIMICS = 0.95, 2  # cosine from which a law does much the same as the best one; how many such are refitted
 _RIVAL, _DUELS = 0.5, 2  # of the best gain: who comes so near meets the best again at half the step; how many do
 _BY_PSI = 0.1  # of a candidate's gain, beyond which its psi alone becomes the model to beat
 _ALIKE = 3  # families that may explain the data alike for one of them to be claimed
@@ -164,9 +163,8 @@ class Contest:
         if len(new) != 1 or new[0].id not in by_id or not added:
             return []
         one = by_id[new[0].id]
-        near = [(likeness(one, s, self.screen.projected), s) for s in self.screened if s.effect.id not in asked]
-        near = sorted((pair for pair in near if pair[0] > _MIMIC), key=lambda pair: -pair[0])
-        return [arena.enter_beside(best, s) for _, s in near[:_MIMICS]]
+        others = [s for s in self.screened if s.effect.id not in asked]
+        return [arena.enter_beside(best, s) for s in mimics(one, others, self.screen.projected)]
 
     def _rivals(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
         """Where bodies touch, the leading candidates of other families that come near the law about to be accepted.

@@ -21,6 +21,7 @@ from nfc_gym.physics.effects.base import Effect, overrides
 Array = NDArray[np.float64]
 _FAR = 4.0  # probing sizes beyond which a secant is not believed
 _SHARES = (0.125, 0.25, 0.5, 1.0)  # of a realistic size that a scout tries with all else as it is
+_MIMIC, _MIMICS = 0.95, 2  # cosine from which a law does much the same as another one; how many such are refitted
 _SCOUT = 0.7  # spread of a scout's draws, in scaled parameters
 
 
@@ -246,6 +247,12 @@ def likeness(one: Screened, other: Screened, projected: Array) -> float:
     basis = _span(one.columns)
     does = basis @ (basis.T @ projected)
     return float(np.linalg.norm(_span(other.columns).T @ does) / max(float(np.linalg.norm(does)), 1e-12))
+
+
+def mimics(one: Screened, others: Sequence[Screened], projected: Array) -> list[Screened]:
+    """The few of other candidates that do nearly the same as one about a projected residual (n,), likest first."""
+    near = [(likeness(one, s, projected), s) for s in others]
+    return [s for cosine, s in sorted(near, key=lambda pair: -pair[0])[:_MIMICS] if cosine > _MIMIC]
 
 
 def _bounded(columns: Array, target: Array, free: Array, low: Array, high: Array) -> Array:

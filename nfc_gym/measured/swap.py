@@ -14,7 +14,7 @@ from nfc_gym.measured.contest import shortlist
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.rounds import NEARLY
-from nfc_gym.measured.screen import Screen
+from nfc_gym.measured.screen import Screen, mimics
 from nfc_gym.physics.effects.base import Effect
 
 _RIVALS = 3  # refitted in place of each law
@@ -49,7 +49,11 @@ def swapped(arena: Arena, lookout: Lookout, pool: Sequence[Effect], worth: float
         kept = without.judge(arena.current)
         screen = Screen(without.fit_data.problem, without.under, without.current)
         others = [e for e in pool if e.id != effect.id]
-        for pick in shortlist(lookout.closer(screen, lookout.screen(screen, others)), _RIVALS):
+        found = lookout.closer(screen, lookout.screen(screen, others))
+        picks = shortlist(found, _RIVALS)
+        # Many places of one family may look better than the one where it does what the law does.
+        picks += mimics(screen.try_one(effect), [s for s in found if not any(s is p for p in picks)], screen.projected)
+        for pick in picks:
             rival = without.enter([pick])
             if not (without.worth(rival, worth) and without.plausible(rival) and without.told_apart(rival)):
                 continue

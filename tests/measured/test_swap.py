@@ -39,7 +39,12 @@ class Twin(DampingPoly):
     family = "twin"
 
 
-def test_what_does_as_well_in_an_earlier_laws_place_is_its_equivalent() -> None:
+@pytest.mark.parametrize("leads", [True, False], ids=["leads the screening", "does what the law does"])
+def test_what_does_as_well_in_an_earlier_laws_place_is_its_equivalent(
+    leads: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not leads:
+        monkeypatch.setattr("nfc_gym.measured.swap.shortlist", lambda *_: [])
     contest = arena(LAGGING, [build(*VISCOUS), build(*SPRING)])
     lookout = Lookout(contest.fit_data.problem, np.random.default_rng(0), lambda text: None)
     twins = Twin.propose(given(), SCALES)
