@@ -79,7 +79,7 @@ def report(
         "effects": judged.claimed,
         "proposals": [*judged.weak, *judged.laws],
         "verdict": judged.verdict,
-        "unexplained": unexplained(v, found, extended.plant, judged.laws, judged.weak, judged.taken) if left else None,
+        "unexplained": unexplained(v, found, extended.plant, judged.laws, judged.weak, judged.share) if left else None,
         "error": errors,
         "chi2": {stage: v.chi2(stage) for stage in v.residual}
         | {
@@ -115,6 +115,11 @@ class _Judged:
     weak: list[dict[str, Any]]
     laws: list[dict[str, Any]]
     taken: float
+
+    @property
+    def share(self) -> float:
+        """What the weak ones explain: all that is taken away, but beside causes what comes back without them."""
+        return max((r["share_of_excess"] for r in self.weak), default=0.0) if self.claimed else self.taken
 
 
 def _judge(

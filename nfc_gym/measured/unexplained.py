@@ -27,7 +27,7 @@ def unexplained(
       plant: the extended machine.
       rows: the report's rows of the proposed laws.
       weak: and of effects that were found and are not shown to be the cause.
-      taken: share of the error beyond the noise that the extended model takes away.
+      taken: share of the error that these explain.
     """
     laws = [e for e in plant.effects if isinstance(e, Law)]
     nearest, share = (" + ".join(r["id"] for r in weak), max(taken, 0.0)) if weak else _nearest(found)

@@ -8,7 +8,7 @@ import pytest
 
 from nfc_gym.measured.outcome import _judge
 
-ROWS: list[dict[str, Any]] = [{"id": "wind:base"}, {"id": "law_power:base"}]
+ROWS: list[dict[str, Any]] = [{"id": "wind:base", "share_of_excess": 0.1}, {"id": "law_power:base"}]
 
 
 def judged(chi2: float, after: float, rows: list[dict[str, Any]] = ROWS[:1], **doubted: list[str]) -> Any:
@@ -24,7 +24,7 @@ def test_a_cause_takes_away_half_of_what_is_missing(after: float, claimed: bool)
     out = judged(3.0, after)
     assert out.verdict == ("partly explained" if claimed else "unexplained")
     assert out.claimed == (ROWS[:1] if claimed else [])
-    assert out.weak == ([] if claimed else [{"id": "wind:base", "nearest": True, "alike": []}])
+    assert out.weak == ([] if claimed else [ROWS[0] | {"nearest": True, "alike": []}])
 
 
 def test_where_nothing_remains_what_was_found_is_the_cause() -> None:
@@ -36,8 +36,10 @@ def test_one_guess_among_several_is_no_cause() -> None:
     alike = ["gain:rotor", "payload:base"]
     out = judged(3.0, 1.5, [*ROWS[:1], {"id": "delay:rotor"}], wind=alike)
     assert (out.verdict, out.claimed) == ("partly explained", [{"id": "delay:rotor"}])
-    assert out.weak == [{"id": "wind:base", "nearest": True, "alike": alike}]
-    assert judged(3.0, 1.5, wind=alike).verdict == "unexplained"
+    assert out.weak == [ROWS[0] | {"nearest": True, "alike": alike}]
+    assert out.share == 0.1  # beside a cause: what comes back when it alone is taken out
+    alone = judged(3.0, 1.5, wind=alike)
+    assert (alone.verdict, alone.share) == ("unexplained", alone.taken)
     assert judged(1.0, 1.0, wind=alike).claimed == ROWS[:1]
 
 
