@@ -22,6 +22,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from posteriors.methods import METHODS, cell_name
 from posteriors.paper import ROBOTS, TERRAINS
 from posteriors.sets import HALF, JUDGE, TRAIN, environment, stored
 
@@ -35,13 +36,17 @@ WINDOWS = {
     "HumanoidRough": 40_000,
 }  # fmt: skip
 # Methods that one process trains after the other, since a process takes its time to start; and the stage that they
-# belong to: all environments have their first before any has its second. Further inputs come after all of that.
-GROUPS = ((("sde-tcn", "mdn-tcn"), 0), (("sde-nn", "sde-rff"), 0), (("mdn-rff", "sde-fks"), 0), (("flow-tcn",), 1))
+# belong to: all environments have their first before any has its second. Further inputs come after all of that, and
+# sbi's peers, which have to be asked for, see the first inputs alone.
+GROUPS = (
+    (("sde-tcn", "mdn-tcn"), 0), (("sde-nn", "sde-rff"), 0), (("mdn-rff", "sde-fks"), 0), (("flow-tcn",), 1),
+    (("sbi-npe",), 1), (("sbi-npse",), 1),
+)  # fmt: skip
 RESIDUALS = 1  # the stage of the residual heads
 # What every process is told as it was told here.
 PASSED = (
     "out", "judges", "samples", "budget", "batch", "rate", "draws", "epochs", "effects", "residual-windows", "few",
-    "ceiling-windows", "jobs",
+    "ceiling-windows", "jobs", "peer-judges",
 )  # fmt: skip
 _CEILINGS_AFTER = 2  # environments that are simulated before the first ceiling is computed
 
@@ -170,12 +175,18 @@ def cells(args: argparse.Namespace, i: int, place: str) -> list[Job]:
     jobs = []
     for k, inputs in enumerate(args.inputs):
         for g, (group, stage) in enumerate(GROUPS):
-            methods = [m for m in group if m in args.methods]
+            methods = [m for m in group if m in args.methods and not (k and METHODS[m].peer)]
+            methods = [m for m in methods if not all(kept(args, place, m, inputs, seed) for seed in args.seeds)]
             more = ["axle"] if place == "JackalFlat" and "sde-tcn" in methods else []
             flags = ["--inputs", inputs, "--methods", *methods, "--extras", *more, "plots"]
             if methods:
                 jobs.append(Job((2 * k + stage, i, g), place, f"{methods[0]}_{inputs}", flags))
     return jobs
+
+
+def kept(args: argparse.Namespace, place: str, method: str, inputs: str, seed: int) -> bool:
+    """Whether that cell is there already."""
+    return (args.out / "cells" / f"{cell_name(place, method, inputs, seed)}.json").is_file()
 
 
 def main() -> None:
@@ -215,7 +226,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--windows", nargs="+", default=[f"{k}={v}" for k, v in WINDOWS.items()], metavar="NAME=COUNT")
     parser.add_argument("--residuals", nargs="*", default=[], metavar="NAME", help="environments with residual heads")
     parser.add_argument("--residual-windows", type=int, default=20_480)
-    parser.add_argument("--methods", nargs="+", default=[m for group, _ in GROUPS for m in group])
+    methods = [m for group, _ in GROUPS for m in group]
+    parser.add_argument("--methods", nargs="+", choices=methods, default=[m for m in methods if not METHODS[m].peer])
     parser.add_argument("--inputs", nargs="+", default=["summaries", "window"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--effects", type=float, default=0.0)
@@ -224,6 +236,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=0, help="processes that simulate; 0 takes all cores")
     parser.add_argument("--stop", type=float, default=0, help="begin nothing new after these seconds")
     parser.add_argument("--judges", type=int, default=2000)
+    parser.add_argument("--peer-judges", type=int, default=200, help="of those, for NPSE, whose densities take long")
     parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--budget", type=float, default=60, help="seconds of training a cell")
     parser.add_argument("--epochs", type=int, default=200, help="at most")

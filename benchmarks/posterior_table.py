@@ -37,7 +37,7 @@ from posteriors.ceilings import ceiling_of
 from posteriors.fit import Plan, fit
 from posteriors.judge import judge, latency
 from posteriors.keep import Kept, write_text
-from posteriors.methods import INPUTS, METHODS, possible
+from posteriors.methods import INPUTS, METHODS, cell_name, possible
 from posteriors.paper import ROBOTS, TERRAINS
 from posteriors.sets import Sets, environment, prior_of
 
@@ -108,7 +108,7 @@ def robot_on(run: Run, robot: str, terrain: str) -> None:
             for method in args.methods:
                 if not run.over and not possible(METHODS[method], inputs):
                     run.kept.once(
-                        f"{robot}{terrain}_{method}_{inputs}_{seed}",
+                        cell_name(robot + terrain, method, inputs, seed),
                         lambda m=method, i=inputs, s=seed: cell(run, env, m, i, s, sets),
                         trained_on=args.windows, effects=args.effects,
                     )  # fmt: skip
@@ -124,7 +124,7 @@ def robot_on(run: Run, robot: str, terrain: str) -> None:
 
 def cell(run: Run, env: str, method: str, inputs: str, seed: int, sets: Sets) -> dict[str, Any]:
     """Train and judge one method; a peer that is not installed says so instead, and is tried again."""
-    prior, folder = prior_of(env), run.folder(f"{env[8:-3]}_{method}_{inputs}_{seed}")
+    prior, folder = prior_of(env), run.folder(cell_name(env[8:-3], method, inputs, seed))
     spoken = Spoken()
     spoken.message(f"{env}: {METHODS[method].name}, {inputs}, seed {seed}")
     try:

@@ -11,7 +11,7 @@ from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Spoken
 from nfc_gym.inference.train import TrainConfig
 from posteriors import cases, plots, residuals
-from posteriors.methods import OURS
+from posteriors.methods import OURS, cell_name
 from posteriors.sets import HALF, Sets, environment, prior_of
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def _axle(run: Run, robot: str, terrain: str, sets: Sets) -> None:
     if (robot, terrain) != ("Jackal", "Flat"):
         return
     for inputs in run.args.inputs:
-        file = run.folder(f"{robot}{terrain}_{OURS}_{inputs}_{run.args.seeds[0]}") / "posterior.safetensors"
+        file = run.folder(cell_name(robot + terrain, OURS, inputs, run.args.seeds[0])) / "posterior.safetensors"
         if inputs != "map" and file.is_file():
             network = _opened(file, run)
             run.kept.once(f"{robot}{terrain}_{inputs}_axle", lambda n=network: cases.axle(

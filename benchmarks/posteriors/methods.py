@@ -53,6 +53,11 @@ def network_config(method: Method, inputs: str, small: bool = False, draws: int 
     return NetworkConfig(encoder=method.encoder, density=density, draws=draws, **INPUTS[inputs], **size)
 
 
+def cell_name(place: str, method: str, inputs: str, seed: int) -> str:
+    """Of the result of one method in one environment, such as JackalFlat."""
+    return f"{place}_{method}_{inputs}_{seed}"
+
+
 def possible(method: Method, inputs: str) -> str:
     """Why a method cannot have an input; empty if it can."""
     if inputs == "map" and method.encoder.startswith("qmc"):
