@@ -11,6 +11,7 @@ What the processes say is in DIR/logs. `--gpus cpu` trains on the processor.
 """
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -185,8 +186,9 @@ def cells(args: argparse.Namespace, i: int, place: str) -> list[Job]:
 
 
 def kept(args: argparse.Namespace, place: str, method: str, inputs: str, seed: int) -> bool:
-    """Whether that cell is there already."""
-    return (args.out / "cells" / f"{cell_name(place, method, inputs, seed)}.json").is_file()
+    """Whether that cell is there already; one whose library was missing is tried again."""
+    file = args.out / "cells" / f"{cell_name(place, method, inputs, seed)}.json"
+    return file.is_file() and "missing" not in json.loads(file.read_text())
 
 
 def main() -> None:
