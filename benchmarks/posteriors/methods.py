@@ -35,7 +35,8 @@ METHODS = {
 }
 OURS = "sde-tcn"
 BASELINES = ("mdn-rff", "mdn-tcn", "sde-nn", "sde-rff", "sde-fks")  # the paper's five
-PEERS = ("flow-tcn", "sbi-npe", "sbi-npse")  # stronger ones, which the paper has not
+FLOW = ("flow-tcn",)  # a density that the paper has not, on our encoder and with our training
+SBI = ("sbi-npe", "sbi-npse")  # of the kept library, on our encoder
 
 # What every method of a row is given: what is added to the window of states and actions.
 INPUTS: dict[str, dict[str, bool]] = {

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posteriors import paper
-from posteriors.methods import BASELINES, INPUTS, METHODS, OURS, PEERS
+from posteriors.methods import BASELINES, FLOW, INPUTS, METHODS, OURS, SBI
 from posteriors.metrics import mean
 
 Results = dict[str, dict[str, Any]]
@@ -51,7 +51,7 @@ def table(results: Results) -> str:
     for place in places:
         ceiling = results.get(f"{place}_ceiling")
         parts.append(_place(place, {k[1:]: v for k, v in every.items() if k[0] == place}, ceiling))
-    parts += [_compared(every, places), _paper(every, places), *_others(results)]
+    parts += [_compared(every, places, results), _paper(every, places), *_others(results)]
     return "\n".join(p for p in parts if p)
 
 
@@ -108,31 +108,49 @@ def _group(one: dict[str, Any], group: str, ceiling: dict[str, Any] | None) -> s
     return shown(gained) + (f" ({gained[0] / most:.2f})" if most > 1e-3 else "")
 
 
-def _compared(every: dict[tuple[str, str, str, int], dict[str, Any]], places: list[str]) -> str:
-    rows = []
+def _compared(every: dict[tuple[str, str, str, int], dict[str, Any]], places: list[str], results: Results) -> str:
+    rows, ahead_of_sbi = [], []
     for place in places:
+        ceiling = results.get(f"{place}_ceiling")
         for inputs in INPUTS:
             best = {m: _gains(every, place, m, inputs) for m in METHODS}
             ours = best[OURS]
             if not len(ours):
                 continue
-            row = [place, _NAMES[inputs], shown(mean(ours))]
-            for rivals in (BASELINES, PEERS):
+            row = [place, _NAMES[inputs], shown(mean(ours)), *_shares(every, place, inputs, ceiling)]
+            for rivals in (BASELINES, SBI, FLOW):
                 there = {m: best[m] for m in rivals if len(best[m])}
                 if not there:
-                    row += ["-", "-"]
+                    row.append("-")
                     continue
                 name, top = max(there.items(), key=lambda kv: kv[1].mean())
                 ahead = mean(ours[: len(top)] - top)
-                row += [METHODS[name].name, f"{ahead.value:+.3f} ± {ahead.error:.3f}"]
+                row.append(f"{METHODS[name].name}: {ahead.value:+.3f} ± {ahead.error:.3f}")
+                ahead_of_sbi += [ahead.value] if rivals is SBI else []
             rows.append(row)
     if not rows:
         return ""
-    head = ["", "inputs", "SDE + TCN", "best of the paper's five", "ahead by", "best of the stronger peers", "ahead by"]
-    return "## Ours against the others\n\n" + lines(head, rows) + (
+    head = ["", "inputs", "SDE + TCN", "share of the ceiling", "90 % intervals hold",
+            "ahead of the best of the paper's five", "of the better of sbi's", "of the spline flow"]  # fmt: skip
+    text = "## Ours against the others\n\n" + lines(head, rows) + (
         "\nGain a parameter, nats; differences are taken window by window, on the windows that both were judged on, "
         "after a mean over seeds. Their errors are over windows: training again would give another difference.\n"
     )  # fmt: skip
+    return text + (
+        f"\nAhead of the better of sbi's by {shown(mean(np.array(ahead_of_sbi)))} in the mean over environments.\n"
+        if ahead_of_sbi
+        else ""
+    )
+
+
+def _shares(every: dict, place: str, inputs: str, ceiling: dict[str, Any] | None) -> list[str]:
+    """Share of the ceiling that ours gain, and of the truths that their 90 % intervals hold: means over seeds."""
+    ours = [v for k, v in every.items() if k[:3] == (place, OURS, inputs) and "gains" in v]
+    gain, held = (
+        np.mean([v[0] for v in of])
+        for of in zip(*((o["gain_without_effect"], o["coverage"]["0.9"]) for o in ours), strict=True)
+    )
+    return ["-" if ceiling is None else f"{gain / ceiling['joint'][0]:.2f}", f"{held:.3f}"]
 
 
 def _gains(every: dict, place: str, method: str, inputs: str) -> NDArray[np.float64]:

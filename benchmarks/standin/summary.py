@@ -11,6 +11,7 @@ from .row import Estimate, Row, clean
 from .score import share_within
 
 BINS = ((0.0, 1.3), (1.3, 3.0), (3.0, 10.0), (10.0, math.inf))  # of X / X_null
+SETTLED = ("explained", "nothing missing")  # verdicts
 _Z = 1.959964  # of a 95 % interval
 
 
@@ -166,8 +167,10 @@ def _parameters(out: Summary, rows: Sequence[Row]) -> None:
             goal="0.85 to 0.99", holds=share >= 0.85 and (share <= 0.99 or few), interval=wilson(covered, len(found)),
         )  # fmt: skip
     out.share("effects' parameters within 5 %", *share_within(found, 0.05), right)
-    psi = [e for r in rows if r.outcome == "right" for e in r.psi]
-    out.share("psi in its 95 % interval", sum(e.covered for e in psi), len(psi), _right(rows))
+    for what, settled in (("nothing is missing any more", True), ("something is, so that they need not be", False)):
+        part = [r for r in _right(rows) if (r.verdict in SETTLED) == settled]
+        psi = [e for r in part for e in r.psi]
+        out.share(f"psi in its 95 % interval, where {what}", sum(e.covered for e in psi), len(psi), part)
     misses = [r for r in rows if r.foretold is not None]
     foretold = sum(bool(r.foretold) for r in misses)
     out.share("misses that the identifiability table foretold", foretold, len(misses), misses, least=0.9)

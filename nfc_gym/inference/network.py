@@ -74,7 +74,7 @@ class Network(Learner):
             self.density = self._density(width)
             size = self.density.width(None)
             self.terrain = Terrain(width, size, config.hidden) if config.delta_e else None
-            self.map_scales = nn.ModuleList([Standard(1), Standard(1)] if config.delta_e else [])
+            self.map_scale = Standard(1) if config.delta_e else None
             self.base = LinearBase(self.encoder.fixed_size, size) if config.linear else None
             self.structure = Structure(width, len(config.families), config.hidden) if config.families else None
 
@@ -101,9 +101,9 @@ class Network(Learner):
             self.delta_scale.fit(batch["delta_s"])
             flat = batch["delta_s"]
             self.varies.copy_(flat.std(0, correction=0) > TINY * (1 + flat.mean(0).abs()))
-        if self.terrain is not None:
-            for scale, name in zip(self.map_scales, ("map", "delta_e"), strict=True):
-                cast(Standard, scale).fit(batch[name][..., None])
+        if self.terrain is not None and self.map_scale is not None:
+            self.map_scale.fit(batch["map"][..., None])
+            self.terrain.waves.fit(batch["delta_e"])
         if self.base is not None:
             parts = zip(batch["states"].split(_CHUNK), batch["actions"].split(_CHUNK), strict=True)
             with seeded(0):
@@ -144,8 +144,8 @@ class Network(Learner):
         states = self.place(states)
         features = self.project(self.encoder(states, actions, elevation))
         seen = None
-        if self.terrain is not None and elevation is not None:
-            seen = self.map_scales[0](elevation[..., None])[..., 0].clamp(-10, 10)
+        if self.map_scale is not None and elevation is not None:
+            seen = self.map_scale(elevation[..., None])[..., 0].clamp(-10, 10)
         if self.base is None:
             return Encoded(features, states.new_zeros(len(states), self.density.width(None)), seen)
         with torch.autocast(states.device.type, enabled=False):  # a narrow posterior's mean needs all its digits
@@ -161,8 +161,7 @@ class Network(Learner):
         assert self.terrain is not None  # the caller has asked whether delta_e is inferred
         assert given.elevation is not None
         y, m = self.terrain.sample(n, given.features, given.elevation, cast(Score, self.density), **how)
-        x = y if self.base is None else self.base.colour(y, given.mean)
-        return x, cast(Standard, self.map_scales[1]).inverse(m[..., None])[..., 0]
+        return (y if self.base is None else self.base.colour(y, given.mean)), m
 
     def log_prob(self, x: Tensor, given: Encoded, blocks: int | None = None, **how: Any) -> Tensor:
         """(B, n) log density at x (B, n, width of the first `blocks` blocks)."""
@@ -189,7 +188,7 @@ class Network(Learner):
         y = x if self.base is None else self.base.whiten(x, given.mean)
         out = {"density": self.density.loss(y[:, None], given.features).mean()}
         if self.terrain is not None and given.elevation is not None:
-            m = self.map_scales[1](batch["delta_e"][..., None])[..., 0]
+            m = self.terrain.waves(batch["delta_e"])
             score = cast(Score, self.density)
             out["terrain"] = self.terrain.loss(y, m, given.features, given.elevation, score).mean()
         if self.structure is not None:

@@ -256,6 +256,11 @@ def notices(report: dict[str, Any]) -> list[str]:
     blind = [p.get("name") for p in parameters if p.get("identifiable") is False]
     if blind:
         out.append(f"These motions do not show {listed(blind)}: the estimate is hardly more than what was declared.")
+    if parameters and report.get("verdict") in ("unexplained", "partly explained"):
+        out.append(
+            "The parameters' intervals hold only if nothing is missing, and something is: the parameters take up "
+            "what they can of it, and the true values may lie far outside."
+        )
     guessed = [n.get("channel") for n in report.get("noise") or [] if n.get("estimated")]
     if guessed:
         out.append(

@@ -242,7 +242,13 @@ def test_warnings_name_what_they_are_about() -> None:
     assert "told from stribeck:hinge with" in said  # the lag is claimed beside it, hence no rival
     for words in ("joint:hinge:vel was not declared", "joint speed gets worse"):
         assert words in said
+    assert "true values may lie far outside" not in said  # nothing is missing any more
     assert story.notices(example(0) | {"parameters": [], "noise": []}) == []
+
+
+@pytest.mark.parametrize("verdict", ["unexplained", "partly explained"])
+def test_what_is_missing_makes_the_parameters_intervals_conditional(verdict: str) -> None:
+    assert "true values may lie far outside" in " ".join(story.notices(example() | {"verdict": verdict}))
 
 
 def test_misfit_is_in_noise_widths_with_the_worst_first() -> None:
