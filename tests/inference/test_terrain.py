@@ -12,6 +12,7 @@ from nfc_gym.inference.config import NetworkConfig
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.heads.score import Score
 from nfc_gym.inference.heads.terrain import Terrain
+from nfc_gym.inference.heads.waves import LEAST, Waves
 from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 
 
@@ -32,6 +33,37 @@ def test_untrained_it_is_the_prior_of_both() -> None:
     assert (y.shape, m.shape) == ((6, 4), (6, 128, 128))
     assert float(m.mean()) == pytest.approx(0, abs=0.02)
     assert float(m.std()) == pytest.approx(1, abs=0.02)
+
+
+def hills(n: int) -> torch.Tensor:
+    """Maps (n, 128, 128) whose power falls by four orders, about a slope that all of them have."""
+    k = torch.arange(128)
+    strength = 1 / (1 + k[:, None] ** 2 + k[None] ** 2)
+    rough = Waves(128).inverse(strength * torch.randn(n, 128, 128, generator=torch.Generator().manual_seed(0)))
+    return rough + torch.linspace(-1, 1, 128)
+
+
+def test_waves_are_white_and_come_back() -> None:
+    maps, waves = hills(400), Waves(128)
+    waves.fit(maps)
+    white = waves(maps)
+    torch.testing.assert_close(waves.inverse(white), maps, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(white.mean(0), torch.zeros(128, 128), atol=1e-3, rtol=0)
+    strong = waves.spread > 1.01 * LEAST * waves.spread.mean()
+    torch.testing.assert_close(white.std(0, correction=0)[strong], torch.ones(int(strong.sum())), atol=1e-3, rtol=0)
+    assert float(waves.colour(white).square().mean()) == pytest.approx(1, rel=0.05)  # of unit size as a map too
+
+
+def test_untrained_its_maps_have_the_training_sets_mean_and_spectrum() -> None:
+    maps, score, terrain = hills(400), Score((1,), 4, 16, 1), Terrain(4, 1, 16)
+    terrain.waves.fit(maps)
+    with torch.no_grad():
+        drawn = terrain.sample(100, torch.randn(1, 4), torch.randn(1, 128, 128), score, steps=3)[1]
+    torch.testing.assert_close(drawn.mean((0, 1)), maps.mean((0, 1)), atol=0.1, rtol=0)  # the slope
+    bare = Waves(128)
+    for low, high in ((1, 2), (2, 4), (4, 16), (16, 64), (64, 128)):
+        power = [bare(m - m.mean(0))[:, low:high, low:high].square().mean() for m in (drawn, maps)]
+        assert float(power[0] / power[1]) == pytest.approx(1, abs=0.3)
 
 
 def test_each_block_sees_the_others_noise() -> None:
