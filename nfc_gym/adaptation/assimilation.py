@@ -116,6 +116,7 @@ class Segments:
       first, last: (n, s) `proprio` where they start and end.
       actions: (n, span, a).
       maps: the ground underfoot, and others that it may as well be; none is a plane.
+      hidden: the starts are made of `proprio` alone (`start.observed`).
     """
 
     starts: Array
@@ -123,6 +124,7 @@ class Segments:
     last: Array
     actions: Array
     maps: list[Heightfield] = field(default_factory=list)
+    hidden: bool = False
 
 
 @dataclass
@@ -206,10 +208,11 @@ class Assimilation:
             raise InputError(f"assimilation: {len(trajectory)} control steps; want at least {2 * SPAN}")
         at = SPAN * np.unique(np.linspace(0, count - 1, min(count, SEGMENTS)).round().astype(int))
         first = trajectory.states[at]
-        starts = trajectory.estimate[at] if trajectory.estimate.size else observed(self.machine, first)
+        hidden = not trajectory.estimate.size
+        starts = observed(self.machine, first) if hidden else trajectory.estimate[at]
         actions = np.stack([trajectory.actions[at + k] for k in range(SPAN)], 1)
         last, maps = trajectory.states[at + SPAN], self._grounds(trajectory)
-        return Segments(starts, first, last, np.clip(actions, -1, 1), maps)
+        return Segments(starts, first, last, np.clip(actions, -1, 1), maps, hidden)
 
     def _grounds(self, trajectory: Trajectory) -> list[Heightfield]:
         """See `Segments.maps`: the likeliest is the first."""
@@ -292,7 +295,8 @@ class Assimilation:
         actions = np.tile(segments.actions, (m, 1, 1))
         if rng is not None:
             moving = machine.model.nq + machine.model.nv
-            noisy = disturbed(machine, starts[:, :moving], rng.standard_normal((m * n, 2 * machine.model.nv)))
+            eps = rng.standard_normal((m * n, 2 * machine.model.nv))
+            noisy = disturbed(machine, starts[:, :moving], eps, segments.hidden)
             starts = np.concatenate([noisy, starts[:, moving:]], 1)
             actions = np.clip(actions + self.motor * rng.standard_normal(actions.shape), -1, 1)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -125,10 +125,11 @@ class Replay:
             given.
         """
         states, actions = checked(self, states, actions)
+        hidden = start is None
         starts = observed(self.machine, states[:, 0]) if start is None else self._given(len(states), start)
         which, per = self._which(len(states), which), max(1, _TURN // self.draws)
         parts = [
-            self._scored(states[i : i + per], actions[i : i + per], starts[i : i + per], which[i : i + per])
+            self._scored(states[i : i + per], actions[i : i + per], starts[i : i + per], which[i : i + per], hidden)
             for i in range(0, len(states), per)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, self.horizon))
@@ -150,9 +151,11 @@ class Replay:
             raise InputError(f"replay: start must be finite, of shape {(n, width)}, got {start.shape}")
         return start
 
-    def _scored(self, states: Array, actions: Array, starts: Array, which: NDArray[np.intp]) -> Array:
+    def _scored(
+        self, states: Array, actions: Array, starts: Array, which: NDArray[np.intp], hidden: bool
+    ) -> Array:  # fmt: skip
         """(n, H) X of each control step; infinite from where replays come apart."""
-        sims, held = self._begin(states, starts, which), np.ones(len(states), bool)
+        sims, held = self._begin(states, starts, which, hidden), np.ones(len(states), bool)
         out = np.empty((len(states), self.horizon))
         with np.errstate(over="ignore", invalid="ignore"):
             for t in range(self.horizon):
@@ -192,7 +195,7 @@ class Replay:
         view.qvel[...] += moved[:, nv:]
         view.now = sims.robot.derive(view)
 
-    def _begin(self, states: Array, starts: Array, which: NDArray[np.intp]) -> Simulations:
+    def _begin(self, states: Array, starts: Array, which: NDArray[np.intp], hidden: bool) -> Simulations:
         """n windows times draws simulations at their starts."""
         machine, n, nq = self.machine, len(states), self.machine.model.nq
         mujoco.set_mju_user_warning(lambda message: None)  # replays that come apart are nan
@@ -205,7 +208,7 @@ class Replay:
             sims.begin(np.arange(sims.n), {"psi": np.tile(self.psi, (n, 1))} | on)
         sims.batch.reset(np.arange(sims.n), sims.rest)
         view = sims.view
-        rows = disturbed(machine, np.repeat(starts, self.draws, 0), np.tile(self.start, (n, 1)))
+        rows = disturbed(machine, np.repeat(starts, self.draws, 0), np.tile(self.start, (n, 1)), hidden)
         view.qpos[...], view.qvel[...] = rows[:, :nq], rows[:, nq:]
         view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
         if isinstance(sims.robot, Quadcopter):

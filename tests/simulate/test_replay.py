@@ -73,6 +73,17 @@ def test_start_noise_has_the_sizes_that_it_says(machine: Machine) -> None:
     np.testing.assert_allclose(out[:, nq:].std(0), velocity, rtol=0.06)
 
 
+@pytest.mark.parametrize("robot", ["Jackal", "Quadcopter"])
+def test_what_no_sensor_tells_of_a_start_is_off_by_as_much_as_it_says(robot: str) -> None:
+    machine = Machine(f"nfc_gym/{robot}Flat-v0")
+    window = trials(machine, np.tile(machine.space.nominal, (200, 1)), 3, noise=0.0)
+    nq, nv = machine.model.nq, machine.model.nv
+    away = (start.observed(machine, window["states"][:, 0]) - window["start"][:, 1 : 1 + nq + nv])[:, nq + 6 :]
+    claimed = start.spreads(machine, hidden=True)[1][6:]
+    assert (claimed > 2 * start.spreads(machine)[1][6:]).all()
+    np.testing.assert_allclose(np.sqrt((away**2).mean(0)), claimed, rtol=0.3)
+
+
 def test_nominal_windows_score_about_one_and_faults_higher(machine: Machine, replay: Replay) -> None:
     nominal, slippery = machine.space.nominal, machine.space.nominal.copy()
     slippery[[i for i, n in enumerate(machine.space.names) if n.endswith("friction")]] *= 0.3
