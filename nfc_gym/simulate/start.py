@@ -82,4 +82,17 @@ def disturbed(machine: Machine, start: Array, eps: Array, hidden: bool = False) 
     qpos, qvel = start[:, : model.nq].copy(), start[:, model.nq :] + eps[:, model.nv :] * velocity
     for row, moved in zip(qpos, eps[:, : model.nv] * position, strict=True):
         mujoco.mj_integratePos(model, row, moved, 1.0)
+    if hidden and issubclass(machine.kind, Jackal) and not machine.rough:
+        qpos[:, 2] = _standing(machine, qpos[:, 3:7])
     return np.concatenate([qpos, qvel], 1)
+
+
+def _standing(machine: Machine, quat: Array) -> Array:
+    """(n,) m, heights at which the lowest wheel stands on the plane.
+
+    Heights are measured to 2 cm; dropped from as much, or pushed out of the ground, a replay bounces for half a second.
+    """
+    model = machine.model
+    wheels = model.body_pos[model.jnt_bodyid[model.actuator_trnid[:, 0]]]
+    above = np.stack([to_world(axes(quat), np.broadcast_to(w, (len(quat), 3)))[:, 2] for w in wheels])
+    return machine.settings.robot(model).home[2] + wheels[:, 2].min() - above.min(0)

@@ -84,6 +84,17 @@ def test_what_no_sensor_tells_of_a_start_is_off_by_as_much_as_it_says(robot: str
     np.testing.assert_allclose(np.sqrt((away**2).mean(0)), claimed, rtol=0.3)
 
 
+def test_a_jackal_whose_height_is_guessed_stands_on_its_wheels(machine: Machine) -> None:
+    window = trials(machine, np.tile(machine.space.nominal, (200, 1)), 3, noise=0.0)
+    nq, nv = machine.model.nq, machine.model.nv
+    true, eps = window["start"][:, 1 : 1 + nq + nv], np.random.default_rng(0).standard_normal((200, 2 * nv))
+    eps[:, 3:6] = 0.0  # the angles as they are
+    out = start.disturbed(machine, true, eps, hidden=True)
+    assert np.std(true[:, 2]) > 0.002
+    assert np.std(out[:, 2] - true[:, 2]) < 0.0025
+    assert np.std(start.disturbed(machine, true, eps)[:, 2] - true[:, 2]) > 0.015  # as measured
+
+
 def test_nominal_windows_score_about_one_and_faults_higher(machine: Machine, replay: Replay) -> None:
     nominal, slippery = machine.space.nominal, machine.space.nominal.copy()
     slippery[[i for i, n in enumerate(machine.space.names) if n.endswith("friction")]] *= 0.3
