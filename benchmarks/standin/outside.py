@@ -7,7 +7,7 @@ import numpy as np
 
 from nfc_gym.measured.hidden import Array, Hidden
 
-from .faults import OnJoint
+from .faults import ComShift, OnJoint
 from .pushes import OnBody
 
 
@@ -19,6 +19,9 @@ class Both(Hidden):
     def __init__(self, parts: Sequence[Hidden]) -> None:
         super().__init__(text=" and ".join(p.text for p in parts))
         self.parts = tuple(parts)
+        for push in (p for p in parts if isinstance(p, OnBody)):
+            shifts = [p for p in parts if isinstance(p, ComShift) and p.where == push.where]
+            push.shift = sum((np.array([p.parameters[a] for a in "xyz"]) for p in shifts), np.zeros(3))
 
     def shape(self, spec: mujoco.MjSpec) -> None:
         for p in self.parts:

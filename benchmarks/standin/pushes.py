@@ -16,13 +16,19 @@ def velocity_of(data: mujoco.MjData, model: mujoco.MjModel, body: int) -> tuple[
 
 
 class OnBody(Hidden):
-    """What pushes one body at its centre of mass."""
+    """What pushes one body where its centre of mass is, or was before something else shifted it."""
+
+    shift = np.zeros(3)  # m, along the body's axes
 
     def begin(self, model: mujoco.MjModel) -> None:
         self.model, self.body = model, model.body(self.where[0]).id
 
     def push(self, data: mujoco.MjData) -> None:
-        data.xfrc_applied[self.body, :3] += self.pull(data, *velocity_of(data, self.model, self.body))
+        velocity, rate = velocity_of(data, self.model, self.body)
+        lever = -data.xmat[self.body].reshape(3, 3) @ self.shift
+        force = self.pull(data, velocity + np.cross(rate, lever), rate)
+        data.xfrc_applied[self.body, :3] += force
+        data.xfrc_applied[self.body, 3:] += np.cross(lever, force)
 
     def pull(self, data: mujoco.MjData, velocity: Array, rate: Array) -> Array:
         """Force in the world, N."""

@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured.fit import Fit
+from nfc_gym.physics.effects.air import hull, hull_mark
 from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.inertial import Moved
+from nfc_gym.physics.effects.places import body_ids
 from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.rollout import Plant
@@ -53,6 +56,9 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array) -> tuple[str, list[Ef
     """
     spec = spec.copy()
     model = spec.compile()
+    hulls = {
+        b: hull(model, b) for e in plant.effects if isinstance(e, Moved) for b in body_ids(model, e.where).tolist()
+    }
     fields = ModelFields(model, copy.copy(model))
     psi, thetas = plant.split(x)
     plant.space.write(fields, psi)
@@ -63,6 +69,10 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array) -> tuple[str, list[Ef
     fields.commit()
     spec.copy_back(model)
     outside = [e for e, theta in pairs if not _carried(e, theta, spec)]
+    for body, at in hulls.items():  # what is not in the model finds them here, as it found them in the nominal one
+        mark = hull_mark(model.body(body).name)
+        numeric = next((n for n in spec.numerics if n.name == mark), None) or spec.add_numeric(name=mark, size=3)
+        numeric.data = at
     try:
         spec.compile()
     except ValueError:

@@ -3,13 +3,16 @@
 import mujoco
 import numpy as np
 import pytest
-from machines import make, run
+from machines import make, plant_of, run
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.measured.export import corrected
+from nfc_gym.physics.effects.air import hull
 from nfc_gym.physics.effects.base import Scales
 from nfc_gym.physics.effects.load import Wind
 from nfc_gym.physics.effects.places import base_bodies, joint_places
 from nfc_gym.physics.effects.rotor import RotorDrag
+from nfc_gym.physics.rollout import Segments
 
 DT, MASS = 0.001, 2.0
 FLYER = f"""
@@ -167,3 +170,45 @@ def test_a_carried_body_has_the_velocity_of_its_own_centre_of_mass() -> None:
         dragged = run(text, effect, theta, 1, qvel=speed).qvel
         free = run(text, None, [], 1, qvel=speed).qvel
         assert np.allclose(dragged, free, atol=1e-12) == same
+
+
+@pytest.mark.parametrize("family", ["external_force", "wind", "drag_linear"])
+def test_a_lump_does_not_move_the_hull(family: str) -> None:
+    """Against MuJoCo with the lump as a body of its own, the force acting on the one that carries it."""
+    start, at, lump = np.array([1.0, 0.5, 0, 0, 0, 3.0]), (0.1, 0.3, 0.0), 0.5
+    reference = mujoco.MjSpec.from_string(FLYER % 0)
+    carried = reference.body("b").add_body(pos=at)
+    carried.explicitinertial, carried.ipos, carried.mass, carried.inertia = True, [0, 0, 0], lump, np.full(3, 1e-9)
+    model = reference.compile()
+    data = mujoco.MjData(model)
+    data.qvel[:] = start
+    mujoco.mj_forward(model, data)
+    push, drag = np.array([2.0, 0.0, 0.0]), 0.0 if family == "external_force" else 3.0
+    push = push * (family != "drag_linear")
+    for _ in range(200):
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, 1, velocity, 0)
+        data.xfrc_applied[1, :3] = push - drag * velocity[3:]
+        mujoco.mj_step(model, data)
+    values = {"external_force": {"x": 2.0, "y": 0.0, "z": 0.0}, "drag_linear": dict.fromkeys("xyz", 3.0)}
+    values["wind"] = {"push_x": 2.0, "push_y": 0.0, "push_z": 0.0, "drag": 3.0}
+    riding = make("payload", "b", {"mass": lump, **dict(zip("xyz", at, strict=True))})
+    nominal, (effect, theta) = mujoco.MjModel.from_xml_string(FLYER % 0), make(family, "b", values[family])
+    segments = Segments(DT, 0, np.array([nominal.qpos0]), start[None], np.zeros((1, 200, 1)), {})
+    found = plant_of(nominal, effect, riding[0]).shoot(np.concatenate([theta, riding[1]])[None], segments)
+    np.testing.assert_allclose(found.qvel[0, 0, -1], data.qvel, atol=2e-3)
+
+
+def test_a_model_whose_centre_of_mass_was_moved_says_where_its_hull_is() -> None:
+    spec = mujoco.MjSpec.from_string(FLYER % 0)
+    nominal = spec.compile()
+    effect, theta = make("com_shift", "b", XYZ | {"y": 0.1})
+    plant = plant_of(nominal, effect)
+    text, outside = corrected(spec, plant, theta)
+    moved = mujoco.MjModel.from_xml_string(text)
+    assert not outside
+    assert moved.body("b").ipos == pytest.approx([0.05, 0.1, 0.0])
+    assert hull(moved, 1) == pytest.approx([0.05, 0.0, 0.0])
+    assert hull(nominal, 1) == pytest.approx([0.05, 0.0, 0.0])
+    again, _ = corrected(mujoco.MjSpec.from_string(text), plant, theta)
+    assert hull(mujoco.MjModel.from_xml_string(again), 1) == pytest.approx([0.05, 0.0, 0.0])

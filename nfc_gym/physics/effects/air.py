@@ -1,7 +1,8 @@
 """Air: drag of a body, wind, and what a rotor feels when it is carried through the air.
 
-The motion of a body is that of its centre of mass: from the current state where the body has a free joint, else from
-MuJoCo's derived fields, which are one substep behind.
+Air acts on a body where the model has its centre of mass. A lump that rides on it, or a centre of mass that lies
+elsewhere, does not move its hull: the force then turns the body as well. Its motion there comes from the current state
+where the body has a free joint, else from MuJoCo's derived fields, which are one substep behind.
 """
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
@@ -22,8 +23,20 @@ _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 Parts = Sequence[Any]  # components (...) of a vector
 
 
+def hull_mark(name: str) -> str:
+    """Name of the numbers (3,) by which a model whose centre of mass was moved says where the body's hull is."""
+    return f"hull:{name}"
+
+
+def hull(model: mujoco.MjModel, body: int) -> Array:
+    """(3,) place in the body's frame where air acts on it."""
+    mark = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, hull_mark(model.body(body).name))
+    at = int(model.numeric_adr[mark]) if mark >= 0 else 0
+    return np.array(model.numeric_data[at : at + 3] if mark >= 0 else model.body_ipos[body])
+
+
 class BodyMotion:
-    """How a body's centre of mass moves.
+    """How a body's hull moves, and what pushes it there.
 
     Args:
       model: the nominal model.
@@ -31,7 +44,7 @@ class BodyMotion:
     """
 
     def __init__(self, model: mujoco.MjModel, body: int) -> None:
-        self.body, self.root = body, int(model.body_rootid[body])
+        self.body, self.root, self.hull = body, int(model.body_rootid[body]), hull(model, body)
         joint = int(model.body_jntadr[body])
         self.free = joint >= 0 and int(model.jnt_type[joint]) == _FREE
         if self.free:
@@ -59,13 +72,27 @@ class BodyMotion:
     def _of_joint(self, ctx: Context) -> tuple[Parts, Parts]:
         """The joint's velocity in the world, and what turning about it adds, along the body's axes."""
         x, y, z, *turning = components(ctx.v[..., self.rates])
-        return (x, y, z), cross_parts(turning, components(ctx.nominal("body_ipos")[..., self.body, :]))
+        return (x, y, z), cross_parts(turning, self.hull.tolist())
 
     def _derived(self, ctx: Context) -> Parts:
         spatial = ctx.data("cvel")[..., self.body, :]
         arm = ctx.data("xipos")[..., self.body, :] - ctx.data("subtree_com")[..., self.root, :]
+        if (lever := self._lever(ctx)) is not None:
+            arm = arm + lever
         a, b, c, *linear = components(spatial)
         return _total(linear, cross_parts((a, b, c), components(arm)))
+
+    def push(self, ctx: Context, force: Array, out: Forces) -> None:
+        """Add a force (..., 3), in the world, that acts on the hull."""
+        wrench = out.xfrc[..., self.body, :]
+        wrench[..., :3] += force
+        if (lever := self._lever(ctx)) is not None:
+            wrench[..., 3:] += joined(cross_parts(components(lever), components(force)))
+
+    def _lever(self, ctx: Context) -> Array | None:
+        """(..., 3) way from the centre of mass to the hull, in the world; None where they are one."""
+        away = self.hull - ctx.nominal("body_ipos")[..., self.body, :]
+        return joined(rotate_parts(self.quat(ctx), components(away))) if away.any() else None
 
 
 def _total(a: Parts, b: Parts) -> Parts:
@@ -98,7 +125,7 @@ def body_scales(model: mujoco.MjModel, scales: Scales, body: int) -> tuple[float
 
 
 class DragLinear(Effect):
-    """Drag proportional to speed along each of the body's axes: F = -(x vx, y vy, z vz), at the centre of mass."""
+    """Drag proportional to speed along each of the body's axes: F = -(x vx, y vy, z vz), on the hull."""
 
     family = "drag_linear"
     summary = "Linear air drag along the body's axes"
@@ -114,8 +141,7 @@ class DragLinear(Effect):
             quat = motion.quat(ctx)
             x, y, z = motion.own_velocity(ctx, quat)
             scale = -root(x * x + y * y + z * z) if self.power == 2 else -1.0
-            push = out.xfrc[..., motion.body, :3]
-            push += joined(rotate_parts(quat, (scale * a * x, scale * b * y, scale * c * z)))
+            motion.push(ctx, joined(rotate_parts(quat, (scale * a * x, scale * b * y, scale * c * z))), out)
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -130,7 +156,7 @@ class DragLinear(Effect):
 
 
 class DragQuadratic(DragLinear):
-    """Drag proportional to speed squared: F = -|v| (x vx, y vy, z vz) in the body's axes, at the centre of mass."""
+    """Drag proportional to speed squared: F = -|v| (x vx, y vy, z vz) in the body's axes, on the hull."""
 
     family = "drag_quadratic"
     summary = "Quadratic air drag along the body's axes"

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.air import body_scales, translating
+from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
 from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Forces, Param, Scales
 from nfc_gym.physics.effects.places import body_ids, sized
 
@@ -17,7 +17,7 @@ class Gust(Effect):
     """Force push (1 - cos(2 pi (t - start) / length)) / 2 on a body for start < t < start + length, else none.
 
     The one-minus-cosine gust of airworthiness practice (14 CFR 25.341(a), MIL-F-8785C 3.7.2) as the force at its peak,
-    in the world at the centre of mass; t is the time since the log or the episode began. Its impulse is
+    in the world on the hull; t is the time since the log or the episode began. Its impulse is
     push * length / 2.
     """
 
@@ -35,16 +35,15 @@ class Gust(Effect):
         return (TIME,)
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.bodies = body_ids(model, self.where).tolist()
+        self.motions = [BodyMotion(model, b) for b in body_ids(model, self.where).tolist()]
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         if TIME not in ctx.exogenous:
             raise InputError(f"{self.family} reads the signal {TIME!r}, which these segments do not carry")
         share = (ctx.exogenous[TIME] - theta[..., 3]) / theta[..., 4]
         strength = (1 - np.cos(2 * np.pi * np.minimum(np.maximum(share, 0.0), 1.0))) / 2
-        for body in self.bodies:
-            push = out.xfrc[..., body, :3]
-            push += theta[..., :3] * strength[..., None]
+        for motion in self.motions:
+            motion.push(ctx, theta[..., :3] * strength[..., None], out)
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
         peak, along = float(np.linalg.norm(theta[:3])), ", ".join(f"{p:.3g}" for p in theta[:3])

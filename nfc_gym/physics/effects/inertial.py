@@ -84,7 +84,7 @@ def _complete(model: mujoco.MjModel) -> list[str]:
     return [n for n, b in zip(names, body_ids(model, names), strict=True) if not model.body_simple[b]]
 
 
-class _Inertial(Effect):
+class Moved(Effect):
     """What the three share: named bodies, and a spec that takes the edited inertia as an explicit one."""
 
     def bind(self, model: mujoco.MjModel) -> None:
@@ -113,7 +113,7 @@ class _Inertial(Effect):
         return True
 
 
-class Payload(_Inertial):
+class Payload(Moved):
     """A point mass fixed to a body at (x, y, z) of the body's frame, m."""
 
     family = "payload"
@@ -193,7 +193,7 @@ def add_point_mass(fields: ModelFields, body: int, mass: Array, place: Array) ->
     masses[..., body] = old + mass
 
 
-class ComShift(_Inertial):
+class ComShift(Moved):
     """Centre of mass moved by (x, y, z) along the body's axes, m; mass and inertia about it stay."""
 
     family = "com_shift"
@@ -218,7 +218,7 @@ class ComShift(_Inertial):
         return out
 
 
-class Inertia(_Inertial):
+class Inertia(Moved):
     """Principal moments of inertia times (x, y, z), in the order of the model's inertial frame; the mass stays."""
 
     family = "inertia"

@@ -23,7 +23,7 @@ from nfc_gym.physics.state import components, joined, rotate, vector_to_quat
 
 
 class ExternalForce(Effect):
-    """A constant force: (x, y, z) in the world at a body's centre of mass, or one number along a joint (a preload)."""
+    """A constant force: (x, y, z) in the world on a body's hull, or one number along a joint (a preload)."""
 
     family = "external_force"
     summary = "Constant external force"
@@ -41,14 +41,13 @@ class ExternalForce(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.dofs = index(joint_dofs(model, self.where)) if self.on_joint else slice(0)
-        self.bodies = [] if self.on_joint else body_ids(model, self.where).tolist()
+        self.motions = [] if self.on_joint else [BodyMotion(model, b) for b in body_ids(model, self.where).tolist()]
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         if self.on_joint:
             out.qfrc[..., self.dofs] += theta
-        for body in self.bodies:
-            push = out.xfrc[..., body, :3]
-            push += theta
+        for motion in self.motions:
+            motion.push(ctx, theta, out)
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -76,7 +75,7 @@ def _ends(model: mujoco.MjModel) -> list[str]:
 
 
 class Wind(Effect):
-    """Steady wind on a body: F = push - drag v, in the world, at the centre of mass.
+    """Steady wind on a body: F = push - drag v, in the world, on the hull.
 
     It is drag relative to air that moves at push / drag, written so that the force is linear in all four parameters: a
     body that moves with the wind feels nothing, a body at rest feels `push`.
@@ -96,8 +95,7 @@ class Wind(Effect):
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         *push, drag = components(theta)
         velocity = self.motion.velocity(ctx, self.motion.quat(ctx))
-        felt = out.xfrc[..., self.motion.body, :3]
-        felt += joined([p - drag * v for p, v in zip(push, velocity, strict=True)])
+        self.motion.push(ctx, joined([p - drag * v for p, v in zip(push, velocity, strict=True)]), out)
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
         if theta[3] <= 0:

@@ -90,7 +90,7 @@ class RotorDrag(_Rotor):
         plane = [v - axial * a for v, a in zip(velocity, self.axis, strict=True)]
         gain = lift * sum(p * p for p in plane) - inflow * axial
         pull = [thrust * (gain * a - drag * p) for a, p in zip(self.axis, plane, strict=True)]
-        out.xfrc[..., self.motion.body, :3] += joined(rotate_parts(quat, pull))
+        self.motion.push(ctx, joined(rotate_parts(quat, pull)), out)
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -117,7 +117,7 @@ class GroundEffect(_Rotor):
         height = np.maximum(ctx.data("xipos")[..., self.motion.body, 2], 1e-3)
         added = np.minimum(theta[..., 0] / (16 * height * height), 0.5) * self.thrust(ctx)
         push = rotate_parts(self.motion.quat(ctx), [added * a for a in self.axis])
-        out.xfrc[..., self.motion.body, :3] += joined(push)
+        self.motion.push(ctx, joined(push), out)
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
