@@ -12,7 +12,7 @@ from nfc_gym.core.errors import NfcError
 from .falco import Falco
 from .judge import Episodes, Uniform
 from .players import control_rate, play
-from .world import World
+from .world import ERRORS, OTHERS, World
 
 if TYPE_CHECKING:
     from .learning import Budget, Learned
@@ -33,7 +33,7 @@ class Job:
       world: the true world.
       seed: of learning and of the episodes that judge it.
       nominal: the pretrained policy: a file, or an id whose policy comes with the package.
-      posterior: checkpoint of a posterior of the same environment; None infers by `Assimilation`, on Flat.
+      posterior: checkpoint of a posterior of the same environment; None infers by `Assimilation`.
       detector: an anomaly detector or its file; None where there is none.
       budget: what it may use.
       task: of Jackal and Quadcopter; None is the first.
@@ -126,16 +126,16 @@ def randomised(job: Job) -> "Learned":
 
 
 def inference(job: Job) -> Any:
-    """The posterior of the job; without one, replays of what was executed, which need to know the ground."""
+    """The posterior of the job; without one, replays of what was executed."""
     from nfc_gym.adaptation.assimilation import Assimilation
     from nfc_gym.core.posterior import load_source
 
     if job.posterior is not None:
         return load_source(job.posterior)
-    if job.world.ground == "Rough":
-        raise NotThere(f"needs a posterior on rough ground: --posteriors DIR with {job.world.place}.safetensors")
-    environment, threads = f"nfc_gym/{job.world.place}-v0", job.budget.threads
-    return Assimilation(environment, reach=REACH, seed=job.seed, nthread=threads)
+    known = {"map_error": ERRORS.get(job.world.robot, OTHERS)} if job.world.ground == "Rough" else {}
+    return Assimilation(
+        f"nfc_gym/{job.world.place}-v0", reach=REACH, effects=True, seed=job.seed, nthread=job.budget.threads, **known
+    )
 
 
 def nfc(**config: Any) -> Make:

@@ -44,8 +44,7 @@ class AdaptConfig:
       steps: control steps of all of them together, after each anomaly.
       episode: control steps of an episode in them; None is the environment's own.
       hallucinate: train pi_h too, which leans the draws in the policy's favour.
-      parts: of the fidelity, those that are used where the belief speaks of them; ("psi",) is the paper's "w/o delta
-        fidelity".
+      parts: of the belief, those that are used where it speaks of them; ("psi",) is the paper's "w/o delta fidelity".
       beta: how far, in standard deviations of the belief, pi_h = 1 leads.
       seed: of everything.
     """
@@ -55,7 +54,7 @@ class AdaptConfig:
     steps: int = 500_000
     episode: int | None = None
     hallucinate: bool = True
-    parts: Sequence[str] = ("psi", "delta_s", "delta_e")
+    parts: Sequence[str] = ("psi", "delta_s", "delta_e", "effects")
     beta: float = 1.0
     seed: int = 0
 

@@ -9,10 +9,12 @@ Garcia-Fernandez et al. 2015). The noise of a segment's end is the sensors', wha
 makes of it, found by replays of one psi, and what the regression leaves.
 
 What the replays under the posterior's psi still miss, a control step, is delta_s: its mean over the segments, and how
-sure that mean is.
+sure that mean is. With `effects`, sizes of what the model may lack (`structure`) are inferred along with psi: where a
+delay is missing, masses need not make up for it.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,27 +22,39 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from nfc_gym.adaptation.perceived import perceived_ground
+from nfc_gym.adaptation.structure import Structure, kept, structure_of
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.posterior import Sampler
 from nfc_gym.envs.simulations import Simulations
+from nfc_gym.physics.effects import Effect
 from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.recorded import place
 from nfc_gym.simulate.replay import told
+from nfc_gym.simulate.residuals import Given, Residuals
 from nfc_gym.simulate.roll import step
 from nfc_gym.simulate.start import disturbed, observed
 from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
-SPAN = 5  # control steps of a segment: long enough to show psi, short enough for motion to be nearly linear in it
+SPAN = 10  # control steps of a segment: long enough to show psi, short enough for motion to be nearly linear in it
 SEGMENTS = 40  # of a trajectory at most, evenly spread
 DRAWS = 64  # replays a segment, and of the noise
-ROUNDS = 4
+ROUNDS = 8
+EARLIER = 15  # control steps before a segment, whose commands delays and lags still remember
 GROUNDS = 8  # that a perceived ground may as well be, by which its noise counts
 _EVEN = 1e-4  # m: noise of a map below which it is left out
-_NEAR = 4.0  # of the covariance, by which the next draws are wider than what the regression alone would believe
+# Of the covariance that the regression alone would believe, at which the next draws lie around its mean. Wider ones are
+# bent by what is not linear, which then counts as noise: of fifty unknowns little was left to learn.
+_NEAR = 0.4
+_STEPS = np.array([1.0, 0.5, 0.2, 0.05, 0.0])  # of the way to where the linear model leads, of which the best is gone
+_SPARSER = 10  # times that a round asks which effects are there
+_LEAST = 0.02  # variance of the prior of an effect that is not
+_QUIET = 0.05  # of the variance that is assumed of ends, at least
+_LOST = 1e3  # of the sensors' noise, by which a replay that came apart counts as off
 _SHRUNK = 0.1  # of a covariance of few draws, towards its diagonal
+_PRESENT = 0.1  # of an effect's scale, below which it is left out of the worlds that a belief stands for
 _EDGE = 1e-4  # how near to its box's bounds psi is drawn, as a share of the box
 
 
@@ -64,6 +78,72 @@ class Box:
         return ndtri(np.clip((psi - self.low) / (self.high - self.low), _EDGE, 1 - _EDGE))
 
 
+@dataclass(frozen=True)
+class Linear:
+    """The robot as linear in z around where draws were taken: what is missed is offset - slope z.
+
+    Attributes:
+      slope: (n, k, d).
+      offset: (n, k), at z = 0.
+      left: (n, k) variance that the regression leaves.
+      scatter: (d, d) inverse of the draws' scatter matrix.
+    """
+
+    slope: Array
+    offset: Array
+    left: Array
+    scatter: Array
+
+    def posterior(self, noise: Array, prior: Array) -> tuple[Array, Array]:
+        """Mean and covariance of z ~ N(0, diag(prior)) given that nothing is missed, by noise (n, k, k)."""
+        n, k, d = self.slope.shape
+        white: Any = np.linalg.inv(np.linalg.cholesky(noise))
+        slope, offset = (white @ self.slope).reshape(n * k, d), (white @ self.offset[..., None]).reshape(-1)
+        unit = np.sqrt(prior)
+        # The slope of k ends is off by independent errors, which would add up to a precision that is not there.
+        spurious = (white**2 @ self.left[..., None]).sum()
+        excess = unit[:, None] * spurious * self.scatter * unit
+        mean, covariance = linear_posterior(slope * unit, offset, np.ones(n * k), excess)
+        return unit * mean, unit[:, None] * covariance * unit
+
+
+def regressed(z: Array, off: Array) -> Linear:
+    """Of what replays under draws (m, d) miss, (m, n, k), on the draws; those that come apart are left out.
+
+    Raises:
+      InputError: too few are left.
+    """
+    fine = np.isfinite(off).all((1, 2))
+    if fine.sum() < z.shape[1] + 4:
+        raise InputError("assimilation: most replays come apart: the trajectory does not fit this robot")
+    z, off = z[fine], off[fine]
+    centre, (m, n, k) = z.mean(0), off.shape
+    design = np.concatenate([z - centre, np.ones((m, 1))], 1)
+    y = off.reshape(m, -1)
+    found: Any = np.linalg.lstsq(design, y, rcond=None)[0]
+    left = ((y - design @ found) ** 2).sum(0) / max(1, m - design.shape[1])
+    slope = -found[:-1].T
+    scatter: Any = np.linalg.inv((z - centre).T @ (z - centre))
+    return Linear(slope.reshape(n, k, -1), (found[-1] + slope @ centre).reshape(n, k), left.reshape(n, k), scatter)
+
+
+def _as_seen(noise: Array, off: Array) -> Array:
+    """Noise (n, k, k) of segments, scaled entry by entry to what the best replays miss, (n, k).
+
+    What nothing in the model explains says nothing of the model's parameters, and counts as noise; and where starts are
+    known better than was assumed, there is less of it.
+    """
+    squared = (np.where(np.isfinite(off), off, _LOST) ** 2).mean(0) / np.diagonal(noise, axis1=1, axis2=2).mean(0)
+    share = np.sqrt(np.maximum(squared, _QUIET))
+    return share[:, None] * noise * share
+
+
+def _cost(z: Array, prior: Array, off: Array, noise: Array) -> Array:
+    """(m,) twice the negative logarithm of prior times likelihood of z (m, d) that miss by (m, n, k)."""
+    each: Any = np.linalg.solve(noise, np.where(np.isfinite(off), off, _LOST)[..., None])[..., 0]
+    return (z * z / prior).sum(1) + (np.where(np.isfinite(off), off, _LOST) * each).sum((1, 2))
+
+
 def linear_posterior(slope: Array, offset: Array, noise: Array, excess: Any = 0.0) -> tuple[Array, Array]:
     """Mean (d,) and covariance (d, d) of z ~ N(0, I) given offset = slope z + N(0, diag(noise)).
 
@@ -84,13 +164,14 @@ def linear_posterior(slope: Array, offset: Array, noise: Array, excess: Any = 0.
 
 @dataclass(frozen=True)
 class Assimilated:
-    """A belief about psi and delta_s.
+    """A belief about psi, delta_s, and the sizes of effects that the model lacks.
 
     Attributes:
       box: psi's.
-      mean, covariance: of z, (d,) and (d, d).
+      mean, covariance: of z, (d + k,) and (d + k, d + k): psi's coordinates, then those of the structure.
       delta: (s,) mean of delta_s, a control step; None says nothing of it.
       spread: (s,) standard deviation of that mean.
+      structure: of k sizes.
     """
 
     box: Box
@@ -98,10 +179,18 @@ class Assimilated:
     covariance: Array
     delta: Array | None = None
     spread: Array | None = None
+    structure: Structure = field(default_factory=Structure)
+
+    def effects(self, n: int, rng: np.random.Generator) -> list[tuple[Effect, Array]]:
+        """Effects at work and their sizes (n, k) in n worlds; what is as good as absent is left out."""
+        z = rng.multivariate_normal(self.mean, self.covariance, n, method="cholesky")
+        found = kept(self.structure, self.structure.values(z[:, len(self.box.low) :]), _PRESENT)
+        return [(self.structure.effects[i], theta) for i, theta in found.items()]
 
     def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
         """See `Sampler`."""
-        psi = self.box.psi(rng.multivariate_normal(self.mean, self.covariance, n, method="cholesky"))
+        z = rng.multivariate_normal(self.mean, self.covariance, n, method="cholesky")
+        psi = self.box.psi(z[:, : len(self.box.low)])
         if self.delta is None or self.spread is None:
             return Fidelity(psi)
         return Fidelity(psi, self.delta + self.spread * rng.standard_normal((n, len(self.delta))))
@@ -115,6 +204,7 @@ class Segments:
       starts: (n, nq + nv), or with the actuators' states behind them (n, nq + nv + na).
       first, last: (n, s) `proprio` where they start and end.
       actions: (n, span, a).
+      earlier: (n, EARLIER, a) the actions before; the first one of the trajectory stands for what came before it.
       maps: the ground underfoot, and others that it may as well be; none is a plane.
       hidden: the starts are made of `proprio` alone (`start.observed`).
     """
@@ -123,6 +213,7 @@ class Segments:
     first: Array
     last: Array
     actions: Array
+    earlier: Array
     maps: list[Heightfield] = field(default_factory=list)
     hidden: bool = False
 
@@ -138,6 +229,7 @@ class Assimilation:
       map_error: m, how far the heights of a perceived ground may be off (standard deviation); as much as its maps
         disagree with each other is taken at least. An error that all maps share shows in none of them.
       delta_s: whether to infer residual dynamics too.
+      effects: whether to infer the sizes of effects that the model may lack too.
       motor: standard deviation of the motors' noise, a share of the actions' range.
       seed: of all draws.
       nthread: threads.
@@ -148,11 +240,13 @@ class Assimilation:
     ground: Heightfield | None = None
     map_error: float = 0.0
     delta_s: bool = True
+    effects: bool = False
     motor: float = MOTOR
     seed: int = 0
     nthread: int = 1
     machine: Machine = field(init=False)
     box: Box = field(init=False)
+    structure: Structure = field(init=False)
 
     def __post_init__(self) -> None:
         self.machine = machine = Machine(self.environment)
@@ -160,6 +254,7 @@ class Assimilation:
             raise InputError(f"assimilation: {self.environment} is a plane and has no `ground`")
         if not 0 <= self.map_error < 1:
             raise InputError(f"assimilation: map_error is {self.map_error!r}, want metres from 0 up to 1")
+        self.structure = structure_of(machine) if self.effects else Structure()
         space = machine.space
         beyond = self.reach * (space.high - space.low)
         # What cannot be negative stays as positive as the prior has it, or at a fiftieth of nominal.
@@ -178,15 +273,20 @@ class Assimilation:
         segments, rng = self.segments(trajectory), np.random.default_rng(self.seed)
         seen = told(self.machine)
         scale = self.machine.noise[seen]
-        d = len(self.machine.space)
-        mean, covariance = np.zeros(d), np.eye(d)
-        near = covariance  # where the robot is taken to be linear in psi
-        noise = self._noise(segments, self.box.psi(mean), rng, seen, scale)
+        d = len(self.machine.space) + len(self.structure)
+        mean, covariance, prior = np.zeros(d), np.eye(d), np.ones(d)
+        noise = self._noise(segments, mean, rng, seen, scale) + np.eye(int(seen.sum()))
+        each = _as_seen(noise, self._misses(segments, mean[None], seen, scale)[0])
         for _ in range(ROUNDS):
-            z = rng.multivariate_normal(mean, near, max(DRAWS, 4 * d), method="cholesky")
-            ends = self._ends(segments, self.box.psi(z), None)
-            mean, covariance, near = self._round(segments, z, ends, seen, scale, noise)
-        belief = Assimilated(self.box, mean, covariance)
+            z = rng.multivariate_normal(mean, _NEAR * covariance, max(DRAWS, 2 * d), method="cholesky")
+            linear = regressed(z, self._misses(segments, z, seen, scale))
+            each = each + linear.left[..., None] * np.eye(noise.shape[-1])
+            wanted, covariance, prior = self._believed(linear, each, prior)
+            tried = mean + _STEPS[:, None] * (wanted - mean)
+            off = self._misses(segments, tried, seen, scale)
+            best = int(np.argmin(_cost(tried, prior, off, each)))
+            mean, each = tried[best], _as_seen(noise, off[best])
+        belief = Assimilated(self.box, mean, covariance, structure=self.structure)
         return self._with_residual(belief, segments, rng) if self.delta_s else belief
 
     def updated(self, trajectory: Trajectory, belief: Sampler) -> "Assimilation":
@@ -210,9 +310,11 @@ class Assimilation:
         first = trajectory.states[at]
         hidden = not trajectory.estimate.size
         starts = observed(self.machine, first) if hidden else trajectory.estimate[at]
-        actions = np.stack([trajectory.actions[at + k] for k in range(SPAN)], 1)
+        given = np.clip(trajectory.actions, -1, 1)
+        actions = given[at[:, None] + np.arange(SPAN)]
+        earlier = given[np.maximum(at[:, None] + np.arange(-EARLIER, 0), 0)]
         last, maps = trajectory.states[at + SPAN], self._grounds(trajectory)
-        return Segments(starts, first, last, np.clip(actions, -1, 1), maps, hidden)
+        return Segments(starts, first, last, actions, earlier, maps, hidden)
 
     def _grounds(self, trajectory: Trajectory) -> list[Heightfield]:
         """See `Segments.maps`: the likeliest is the first."""
@@ -228,43 +330,37 @@ class Assimilation:
         others = [found.heights + off * rng.standard_normal(found.heights.shape) for _ in range(GROUNDS - 1)]
         return [found, *(Heightfield(heights, found.resolution, found.origin) for heights in others)]
 
-    def _round(
-        self, segments: Segments, z: Array, ends: Array, seen: NDArray[np.bool_], scale: Array, noise: Array
-    ) -> tuple[Array, Array, Array]:
-        """Regress ends (m, n, s) on z (m, d), and apply Bayes' rule: mean, covariance, and that of the next draws."""
-        off = self.machine.difference(segments.last[None], ends)[..., seen] / scale  # (m, n, k)
-        fine = np.isfinite(off).all((1, 2))
-        if fine.sum() < z.shape[1] + 4:
-            raise InputError("assimilation: most replays come apart: the trajectory does not fit this robot")
-        centre = z[fine].mean(0)
-        design = np.concatenate([z[fine] - centre, np.ones((fine.sum(), 1))], 1)
-        y = off[fine].reshape(fine.sum(), -1)
-        found: Any = np.linalg.lstsq(design, y, rcond=None)[0]
-        left = ((y - design @ found) ** 2).sum(0) / max(1, fine.sum() - design.shape[1])
-        slope = -found[:-1].T
-        offset, (n, k, _) = found[-1] + slope @ centre, noise.shape
-        each = noise + np.eye(k) + left.reshape(n, k)[..., None] * np.eye(k)
-        white: Any = np.linalg.inv(np.linalg.cholesky(each))
-        slope, offset = (
-            (white @ slope.reshape(n, k, -1)).reshape(n * k, -1),
-            (white @ offset.reshape(n, k, 1)).reshape(-1),
-        )
-        one = np.ones(n * k)
-        # The slope of k ends is off by independent errors, which would add up to a precision that is not there.
-        spurious = (white**2 @ left.reshape(n, k, 1)).sum()
-        excess = spurious * np.linalg.inv((z[fine] - centre).T @ (z[fine] - centre))
-        mean, covariance = linear_posterior(slope, offset, one, excess)
-        near = _NEAR * linear_posterior(slope, offset, one)[1]
-        return mean, covariance, near
+    def _believed(self, linear: Linear, noise: Array, prior: Array) -> tuple[Array, Array, Array]:
+        """Mean and covariance by a linear model, and the prior's variances that the structure then deserves.
+
+        Of many effects few are there: the prior variance of an effect's sizes is what they are believed to be, over and
+        over (automatic relevance determination: MacKay 1994, Tipping 2001), so that an effect which psi or another one
+        makes needless vanishes and takes its share of the doubt about psi with it.
+        """
+        d, prior = len(self.machine.space), prior.copy()
+        mean, covariance = linear.posterior(noise, prior)
+        for _ in range(_SPARSER):
+            at = d
+            for sizes in self.structure.sizes:
+                own = slice(at, at + len(sizes))
+                prior[own] = np.clip((mean[own] ** 2 + np.diag(covariance)[own]).mean(), _LEAST, 1.0)
+                at += len(sizes)
+            mean, covariance = linear.posterior(noise, prior)
+        return mean, covariance, prior
+
+    def _misses(self, segments: Segments, z: Array, seen: NDArray[np.bool_], scale: Array) -> Array:
+        """(m, n, k) by how much the ends that were seen are off replays under z (m, d), in sensors' noise."""
+        ends = self._ends(segments, z, None)
+        return self.machine.difference(segments.last[None], ends)[..., seen] / scale
 
     def _noise(
-        self, segments: Segments, psi: Array, rng: np.random.Generator, seen: NDArray[np.bool_], scale: Array
+        self, segments: Segments, z: Array, rng: np.random.Generator, seen: NDArray[np.bool_], scale: Array
     ) -> Array:
         """(n, k, k) covariance of a segment's end by the noise of start, motors and map, in units of the sensors'.
 
         One bump tilts, lifts and slows a robot at once: entries taken as independent would count it several times.
         """
-        ends = self._ends(segments, np.tile(psi, (DRAWS, 1)), rng)
+        ends = self._ends(segments, np.tile(z, (DRAWS, 1)), rng)
         off = self.machine.difference(ends, np.broadcast_to(segments.last, ends.shape))[..., seen] / scale
         off = off[np.isfinite(off).all((1, 2))]
         if len(off) < DRAWS // 4:
@@ -275,22 +371,26 @@ class Assimilation:
 
     def _with_residual(self, belief: Assimilated, segments: Segments, rng: np.random.Generator) -> Assimilated:
         """What replays under the belief miss, a control step."""
-        ends = self._ends(segments, self.box.psi(rng.multivariate_normal(belief.mean, belief.covariance, DRAWS)), None)
+        ends = self._ends(segments, rng.multivariate_normal(belief.mean, belief.covariance, DRAWS), None)
         missed = self.machine.difference(segments.last[None], ends) / SPAN
         missed = np.nanmean(np.where(np.isfinite(missed), missed, np.nan), 0) * told(self.machine)
         spread = missed.std(0, ddof=1) / np.sqrt(len(missed))
-        return Assimilated(belief.box, belief.mean, belief.covariance, missed.mean(0), spread)
+        return replace(belief, delta=missed.mean(0), spread=spread)
 
-    def _ends(self, segments: Segments, psi: Array, rng: np.random.Generator | None) -> Array:
-        """(m, n, s) `proprio` at the ends of n segments under m psi; with `rng`, starts and motors are noisy."""
-        m, n, machine = len(psi), len(segments.starts), self.machine
+    def _ends(self, segments: Segments, z: Array, rng: np.random.Generator | None) -> Array:
+        """(m, n, s) `proprio` at the ends of n segments under m draws; with `rng`, starts and motors are noisy."""
+        m, n, machine = len(z), len(segments.starts), self.machine
+        psi, given = (
+            self.box.psi(z[:, : len(machine.space)]),
+            self.structure.given(np.repeat(z[:, len(machine.space) :], n, 0)),
+        )
         sims = machine.simulations(m * n, self.nthread, segments.maps)
-        given: dict[str, Any] = {"psi": np.repeat(psi, n, 0)}
+        options: dict[str, Any] = {"psi": np.repeat(psi, n, 0)}
         if machine.rough:
             # The noise of the map counts with that of start and motors.
             many = np.arange(m * n) // n % len(segments.maps)
-            given["terrain_id"] = np.zeros(m * n, int) if rng is None else many
-        sims.begin(np.arange(m * n), given)
+            options["terrain_id"] = np.zeros(m * n, int) if rng is None else many
+        sims.begin(np.arange(m * n), options)
         starts, first = np.tile(segments.starts, (m, 1)), np.tile(segments.first, (m, 1))
         actions = np.tile(segments.actions, (m, 1, 1))
         if rng is not None:
@@ -300,20 +400,38 @@ class Assimilation:
             starts = np.concatenate([noisy, starts[:, moving:]], 1)
             actions = np.clip(actions + self.motor * rng.standard_normal(actions.shape), -1, 1)
         with np.errstate(over="ignore", invalid="ignore"):
-            return replayed(machine, sims, starts, first, actions).reshape(m, n, -1)
+            earlier = np.tile(segments.earlier, (m, 1, 1))
+            return replayed(machine, sims, starts, first, actions, given, earlier).reshape(m, n, -1)
 
 
-def replayed(machine: Machine, sims: Simulations, starts: Array, first: Array, actions: Array) -> Array:
-    """(n, s) `proprio` after the actions (n, span, a), from `Segments.starts`; nan where simulations come apart."""
+def replayed(
+    machine: Machine, sims: Simulations, starts: Array, first: Array, actions: Array, given: Sequence[Given] = (),
+    earlier: Array | None = None,
+) -> Array:  # fmt: skip
+    """(n, s) `proprio` after the actions (n, span, a), from `Segments.starts`; nan where simulations come apart.
+
+    Args:
+      machine, sims: n simulations, in which an episode has begun.
+      starts, first, actions, earlier: as `Segments` has them.
+      given: effects at work in them.
+    """
     sims.batch.reset(np.arange(sims.n), sims.rest)
+    residuals = Residuals(sims, given)
     robot, view = sims.robot, sims.view
     view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
     place(machine, sims, starts, first)
     sims.batch.forward()
     view.now = robot.derive(view)
+    for action in () if earlier is None else earlier.transpose(1, 0, 2):
+        residuals.recall(robot.actuate(action, view), machine.kind.frame_skip)
     for action in actions.transpose(1, 0, 2):
         view.ctrl[...] = robot.actuate(action, view)
-        step(sims, np.ones(sims.n, bool), machine.kind.frame_skip)
+        residuals.command(view.ctrl)
+        step(sims, ~residuals.between, machine.kind.frame_skip)
+        for _ in range(machine.kind.frame_skip if residuals.parts else 0):
+            residuals.act()
+            step(sims, residuals.between, 1)
+        residuals.rest()
         view.task.update(robot.advance(view, action))
         view.before, view.now = view.now, robot.derive(view)
     return np.concatenate(robot.proprio(view), -1)

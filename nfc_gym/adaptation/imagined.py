@@ -12,7 +12,13 @@ from nfc_gym.adaptation.worlds import VectorStaggered, vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import PARTS, Fidelity
 from nfc_gym.core.posterior import Sampler
-from nfc_gym.wrappers import VectorHallucinate, VectorRandomizePsi, VectorResidualDynamics, VectorResidualTerrain
+from nfc_gym.wrappers import (
+    VectorApplyEffects,
+    VectorHallucinate,
+    VectorRandomizePsi,
+    VectorResidualDynamics,
+    VectorResidualTerrain,
+)
 
 
 @dataclass(frozen=True)
@@ -33,15 +39,18 @@ class Parts:
         return Fidelity(**{part: getattr(drawn, part) for part in self.parts})
 
 
+EFFECTS = "effects"  # what a belief may have besides the parts of a fidelity: `effects(n, rng)`
+
+
 def spoken(posterior: Sampler, wanted: Sequence[str]) -> tuple[str, ...]:
-    """Of the parts that are wanted those that a posterior speaks of.
+    """Of the parts of a fidelity that are wanted those that a posterior speaks of.
 
     Raises:
       InputError: of none.
     """
-    wrong = [p for p in wanted if p not in PARTS]
+    wrong = [p for p in wanted if p not in (*PARTS, EFFECTS)]
     if wrong:
-        raise InputError(f"adapt: a fidelity has no part {wrong[0]!r}; it has: {', '.join(PARTS)}")
+        raise InputError(f"adapt: no part {wrong[0]!r} of a belief; there are: {', '.join((*PARTS, EFFECTS))}")
     given = posterior.sample(2, np.random.default_rng(0)).given
     found = tuple(p for p in wanted if p in given)
     if not found:
@@ -60,7 +69,7 @@ def imagined(
       belief: a posterior given what was observed.
       n: simulations.
       hallucinate: widen the action by pi_h; else each episode draws from the belief itself.
-      parts: of the fidelity, those that are used where the belief speaks of them.
+      parts: of the belief, those that are used where it speaks of them: of a fidelity, and `effects`.
       beta: see `Hallucinate`.
       episode: control steps.
       threads: of the physics.
@@ -73,6 +82,11 @@ def imagined(
     if "delta_e" in found and envs.unwrapped.rough:  # type: ignore[attr-defined]
         envs = VectorResidualTerrain(envs, Parts(belief, ("delta_e",)))
     moving = tuple(p for p in found if p != "delta_e")
+    drawn = getattr(belief, EFFECTS, None)
+    acting = drawn(n, np.random.default_rng(seed)) if EFFECTS in parts and drawn is not None else []
+    if acting:  # each simulation has sizes of its own
+        values = [v for _, v in acting]
+        envs = VectorApplyEffects(envs, [(e, v.mean(0)) for e, v in acting], values=values)
     if hallucinate and moving:
         envs = VectorHallucinate(envs, Parts(belief, moving), beta=beta)
     else:

@@ -147,7 +147,7 @@ class Residuals:
 
     Args:
       sims: whose psi is written already.
-      given: effects; their model edits are made here.
+      given: effects; their model edits are made here. Those of the same rows act one after another.
     """
 
     def __init__(self, sims: Simulations, given: Sequence[Given]) -> None:
@@ -160,18 +160,29 @@ class Residuals:
                 each.effect.model(fields, each.theta)
                 fields.commit()
         self.time = sims.batch.bind("time")
+        together: dict[tuple[int, int], list[Given]] = {}
         for each in given:
-            part = Part(sims, each.rows)
-            acting = Acting(model, [each.effect], [each.theta], _as_fields(part), part, dt)
+            together.setdefault((each.rows.start, each.rows.stop), []).append(each)
+        for alike in together.values():
+            part = Part(sims, alike[0].rows)
+            acting = Acting(model, [e.effect for e in alike], [e.theta for e in alike], _as_fields(part), part, dt)
             if acting.commanding or acting.acts:
                 acting.restart()
                 self.parts.append((part, acting, bool(acting.pushing)))
-                self.between[each.rows] = True
+                self.between[alike[0].rows] = True
         self.wanted: list[Array] = []
 
     def command(self, ctrl: Array) -> None:
         """What the robot commands in the coming control step, (n, nu)."""
         self.wanted = [ctrl[part.rows].copy() for part, _, _ in self.parts]
+
+    def recall(self, ctrl: Array, steps: int) -> None:
+        """Commands (n, nu) that were given before the simulation begins, for so many physics steps."""
+        self.command(ctrl)
+        for (part, acting, _), wanted in zip(self.parts, self.wanted, strict=True):
+            signals = {TIME: self.time[part.rows].reshape(-1)}
+            for _ in range(steps if acting.commanding else 0):
+                acting.command(wanted, signals)
 
     def act(self) -> None:
         """Before each physics step."""

@@ -40,7 +40,11 @@ def test_psi_in_the_box_and_its_coordinates_are_inverse() -> None:
 
 def driven(psi: dict[str, float], steps: int = 100) -> Trajectory:
     """A rover with some psi, commanded at random."""
-    env: Any = gym.make("nfc_gym/JackalFlat-v0", context=["psi"])
+    return driven_in(gym.make("nfc_gym/JackalFlat-v0", context=["psi"]), psi, steps)
+
+
+def driven_in(env: Any, psi: dict[str, float], steps: int) -> Trajectory:
+    """The same in an environment."""
     observation, _ = env.reset(seed=0, options={"psi": psi})
     rng, action, data = np.random.default_rng(1), np.zeros(2), env.unwrapped.data
     states, estimate, actions = [observation["proprio"]], [np.concatenate([data.qpos, data.qvel])], []
@@ -74,9 +78,9 @@ def test_a_heavy_rover_with_a_lost_axle_is_found_out() -> None:
 
 def test_a_trajectory_of_another_robot_is_refused() -> None:
     with pytest.raises(InputError, match="not of nfc_gym/AntFlat-v0"):
-        Assimilation("nfc_gym/AntFlat-v0").infer(driven({}, 10))
-    with pytest.raises(InputError, match="at least 10"):
-        Assimilation("nfc_gym/JackalFlat-v0").infer(driven({}, 7))
+        Assimilation("nfc_gym/AntFlat-v0").infer(driven({}, 20))
+    with pytest.raises(InputError, match="at least 20"):
+        Assimilation("nfc_gym/JackalFlat-v0").infer(driven({}, 17))
     with pytest.raises(InputError, match="is a plane and has no `ground`"):
         Assimilation("nfc_gym/JackalFlat-v0", ground=Heightfield(np.zeros((256, 256))))
     with pytest.raises(InputError, match="map_error is -1"):
