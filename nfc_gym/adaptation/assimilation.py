@@ -39,6 +39,7 @@ from nfc_gym.terrain import Heightfield
 
 Array = NDArray[np.float64]
 SPAN = 10  # control steps of a segment: long enough to show psi, short enough for motion to be nearly linear in it
+SHORT = 5  # of a robot that fell at once
 SEGMENTS = 40  # of a trajectory at most, evenly spread
 DRAWS = 64  # replays a segment, and of the noise
 ROUNDS = 8
@@ -297,7 +298,8 @@ class Assimilation:
 
     def segments(self, trajectory: Trajectory) -> Segments:
         """Up to `SEGMENTS` parts of a trajectory, evenly spread."""
-        count = len(trajectory) // SPAN
+        span = SPAN if len(trajectory) >= 2 * SPAN else SHORT
+        count = len(trajectory) // span
         kind = self.machine.kind
         if trajectory.states.shape[1:] != (kind.proprio_size,) or trajectory.actions.shape[1:] != (kind.action_size,):
             raise InputError(
@@ -305,15 +307,15 @@ class Assimilation:
                 f"{self.environment}: want widths {kind.proprio_size} and {kind.action_size}"
             )
         if count < 2:
-            raise InputError(f"assimilation: {len(trajectory)} control steps; want at least {2 * SPAN}")
-        at = SPAN * np.unique(np.linspace(0, count - 1, min(count, SEGMENTS)).round().astype(int))
+            raise InputError(f"assimilation: {len(trajectory)} control steps; want at least {2 * SHORT}")
+        at = span * np.unique(np.linspace(0, count - 1, min(count, SEGMENTS)).round().astype(int))
         first = trajectory.states[at]
         hidden = not trajectory.estimate.size
         starts = observed(self.machine, first) if hidden else trajectory.estimate[at]
         given = np.clip(trajectory.actions, -1, 1)
-        actions = given[at[:, None] + np.arange(SPAN)]
+        actions = given[at[:, None] + np.arange(span)]
         earlier = given[np.maximum(at[:, None] + np.arange(-EARLIER, 0), 0)]
-        last, maps = trajectory.states[at + SPAN], self._grounds(trajectory)
+        last, maps = trajectory.states[at + span], self._grounds(trajectory)
         return Segments(starts, first, last, actions, earlier, maps, hidden)
 
     def _grounds(self, trajectory: Trajectory) -> list[Heightfield]:
@@ -372,7 +374,7 @@ class Assimilation:
     def _with_residual(self, belief: Assimilated, segments: Segments, rng: np.random.Generator) -> Assimilated:
         """What replays under the belief miss, a control step."""
         ends = self._ends(segments, rng.multivariate_normal(belief.mean, belief.covariance, DRAWS), None)
-        missed = self.machine.difference(segments.last[None], ends) / SPAN
+        missed = self.machine.difference(segments.last[None], ends) / segments.actions.shape[1]
         missed = np.nanmean(np.where(np.isfinite(missed), missed, np.nan), 0) * told(self.machine)
         spread = missed.std(0, ddof=1) / np.sqrt(len(missed))
         return replace(belief, delta=missed.mean(0), spread=spread)

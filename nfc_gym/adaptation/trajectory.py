@@ -150,6 +150,9 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
       detector: scores transitions (`nfc_gym.wrappers.Detector`).
       threshold: from which score on one is anomalous.
       seed: of the episode.
+
+    An episode that ends by itself, its goal not reached, before the detector has scored anything is anomalous: who
+    falls at once was never found to be normal.
     """
     observation, _ = world.reset(seed=seed)
     detector.reset()
@@ -170,6 +173,8 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
         estimate.append(_estimate(world))
         reached |= bool(info.get("success", False))
         observation, over = after, bool(ended or truncated)
+    if ended and not reached and not np.any(scores):
+        scores[-1] = threshold
     elevation = np.asarray(observation.get("elevation", np.zeros((0, 0))), float)
     return Trajectory(
         np.array(states), np.array(actions), np.array(rewards), np.array(scores), threshold, np.array(estimate),

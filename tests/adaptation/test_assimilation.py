@@ -79,8 +79,8 @@ def test_a_heavy_rover_with_a_lost_axle_is_found_out() -> None:
 def test_a_trajectory_of_another_robot_is_refused() -> None:
     with pytest.raises(InputError, match="not of nfc_gym/AntFlat-v0"):
         Assimilation("nfc_gym/AntFlat-v0").infer(driven({}, 20))
-    with pytest.raises(InputError, match="at least 20"):
-        Assimilation("nfc_gym/JackalFlat-v0").infer(driven({}, 17))
+    with pytest.raises(InputError, match="at least 10"):
+        Assimilation("nfc_gym/JackalFlat-v0").infer(driven({}, 7))
     with pytest.raises(InputError, match="is a plane and has no `ground`"):
         Assimilation("nfc_gym/JackalFlat-v0", ground=Heightfield(np.zeros((256, 256))))
     with pytest.raises(InputError, match="map_error is -1"):
