@@ -53,7 +53,6 @@ def test_what_is_missing_is_said_and_not_counted(tmp_path: Path) -> None:
 
     plain = job(tmp_path)
     assert "--world-models DIR with JackalFlat" in run("tdmpc2", plain, 2)["missing"]
-    rough = job(tmp_path, world=World("JackalRough", "axle", 0))
     assert "Jackal" in run("falco", job(tmp_path, world=World("AntFlat", "psi", 0)), 2)["missing"]
 
 
