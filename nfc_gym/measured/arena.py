@@ -202,8 +202,6 @@ class Arena:
 
     def enter_both(self, one: Judged, other: Judged) -> Judged:
         """Fit what two candidates add together, from where their own fits ended."""
-        self.say(f"refitting {self.label(one)} and {self.label(other)} together")
-        current = self.current
         effects, thetas = [], []
         for j in (one, other):
             added = {id(e) for e in self.new(j)}
@@ -211,6 +209,12 @@ class Arena:
                 if id(e) in added:
                     effects.append(e)
                     thetas.append(theta)
+        return self.enter_at(effects, thetas)
+
+    def enter_at(self, effects: Sequence[Effect], thetas: Sequence[Array]) -> Judged:
+        """Fit laws together with everything fitted so far, from values (k,) of theirs."""
+        self.say(f"refitting {' and '.join(e.id for e in effects)} together")
+        current = self.current
         plant = current.plant.with_effects([*current.plant.effects, *effects])
         return self._refit(plant, np.concatenate([current.x, *thetas]), 10, current.jacobian)
 

@@ -1,11 +1,12 @@
 """One round of the search: refit the shortlist, judge it on the selection logs, and decide which law is accepted."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
 
 from nfc_gym.measured.arena import Arena, contains
 from nfc_gym.measured.contest import Judged, mechanism, shortlist
 from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.pairing import promising
 from nfc_gym.measured.screen import Screen, Screened, mimics
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each, split
@@ -13,7 +14,7 @@ from nfc_gym.physics.effects.each import Each, split
 NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
 _SHARED = 0.8  # the same for the same law at a wider place
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
-_PAIRED = 3  # mechanisms that are tried in pairs
+_PAIRED = 3  # pairs of mechanisms that are tried
 _TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
 _LEFT = 0.1  # nats a number beyond the noise, below which a second law beside one that is believed has nothing to mend
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
@@ -34,9 +35,10 @@ class Round:
       accepted: ids of the laws that it added.
       share: of the misfit on the selection logs that they explain.
       ranking: its candidates.
-      equivalents: ids of what explains the data as well.
+      equivalents: ids of what explains the data as well as the law that it added.
       reason: why nothing was accepted.
       exchanged: id of the earlier law whose place the accepted one took.
+      alike: of several laws that it added at once, by id: what explains the data as well in the place of each.
     """
 
     accepted: list[str]
@@ -45,12 +47,24 @@ class Round:
     equivalents: list[str] = field(default_factory=list)
     reason: str = ""
     exchanged: str = ""
+    alike: dict[str, list[str]] = field(default_factory=dict)
+
+    def rivals(self, law: str) -> list[str]:
+        """Ids of what explains the data as well as a law that it added; the list itself, to add to."""
+        return self.equivalents if len(self.accepted) == 1 else self.alike.setdefault(law, [])
 
 
 def ranked(ranking: list[dict], news: list[dict]) -> list[dict]:
     """A ranking in which some rows lead that were judged anew."""
     ids = {row["id"] for row in news}
     return news + [row for row in ranking if row["id"] not in ids]
+
+
+def known_as(law: Effect, fitted: Fit, pool: Container[str]) -> list[str]:
+    """Ids, of those in a pool, of effects that are a fitted model's law by another name."""
+    thetas = dict(zip(map(id, fitted.plant.effects), fitted.plant.split(fitted.x)[1], strict=True))
+    names = [f"{family}:{law.place}" for family in law.known_as(thetas[id(law)])] if pool else []
+    return [i for i in names if i in pool]
 
 
 class Contest:
@@ -121,16 +135,21 @@ class Contest:
             judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
             outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in duel])
             best = self._simplest(believed := [j for j in judged if self._believed(j)] or [best])
-        alike = [*(e.id for e in arena.new(best)), *self._equivalents([*judged, *beaten], best, believed[0])]
+        alike = self._alike([*judged, *beaten], best, believed[0])
         if len({i.partition(":")[0] for i in alike}) > _ALIKE:
             # So many causes that do alike are no finding: each would be named for want of the others.
             outcome.reason = f"{len(alike)} effects explain it alike: {', '.join(alike)}"
-            return outcome, None
+            if (both := self._instead(best, judged, entered)) is None:
+                return outcome, None
+            outcome.reason, best, alike = "", both, self._alike([], both, both)
+            outcome.ranking = [arena.row(best), *outcome.ranking]
         outcome.accepted = [e.id for e in arena.new(best)]
         outcome.share = best.gain / max(float(arena.base.sum()), 1e-9)
         again = {arena.label(j) for j in judged}  # the others' fits are a first look
         outcome.equivalents = [i for i in alike[len(outcome.accepted) :] if i in again]
-        outcome.equivalents += [i for i in self._known_as(best) if i not in outcome.equivalents]
+        for effect in arena.new(best):
+            rivals = outcome.rivals(effect.id)
+            rivals += [i for i in known_as(effect, best.fitted, self.pool) if i not in rivals]
         arena.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best
 
@@ -192,6 +211,22 @@ class Contest:
         found = [replace(fine.enter_halved(j), fitted=j.fitted) for j in duel]
         return sorted(found, key=lambda j: -j.total)
 
+    def _instead(self, best: Judged, judged: Sequence[Judged], entered: Sequence[Judged]) -> Judged | None:
+        """Two laws at once where too many single ones do alike for any of them to be believed.
+
+        What they leave may be another law's, which hides which of them is at work. Where much is left, pairs were tried
+        before, and lost.
+        """
+        if not _FAINT < self.arena.leftover <= _LEFT:
+            return None
+        both = [j for j in self._pairs(judged, entered) if j.total > _TOGETHER * best.total and self._believed(j)]
+        return self._simplest(both) if both else None
+
+    def _alike(self, judged: Sequence[Judged], best: Judged, leading: Judged) -> list[str]:
+        """Ids of the law that is accepted and of what explains the data as well, each once."""
+        ids = [*(e.id for e in self.arena.new(best)), *self._equivalents(judged, best, leading)]
+        return list(dict.fromkeys(ids))
+
     def _equivalents(self, judged: Sequence[Judged], best: Judged, leading: Judged) -> list[str]:
         """Ids of what explains the data as well as the law that is accepted."""
         arena, chosen = self.arena, self.arena.new(best)
@@ -207,14 +242,6 @@ class Contest:
             for j in rivals
             if not any(contains(e, w) for e in arena.new(j) for laws in plainer for w in laws if w is not e)
         ]
-
-    def _known_as(self, best: Judged) -> list[str]:
-        """Ids of effects that are the accepted law by another name, whether or not they were screened in full."""
-        if not self.pool:
-            return []
-        thetas = dict(zip(map(id, best.fitted.plant.effects), best.fitted.plant.split(best.fitted.x)[1], strict=True))
-        names = [f"{family}:{e.place}" for e in self.arena.new(best) for family in e.known_as(thetas[id(e)])]
-        return [i for i in names if i in self.pool]
 
     def _apart(self, judged: Sequence[Judged]) -> list[Judged]:
         """Values of their own at each place: for what was accepted before, and for the leading laws at several places.
@@ -249,13 +276,7 @@ class Contest:
         for j in (*judged, *entered):
             if len(j.fitted.plant.effects) > len(arena.current.plant.effects) and arena.plausible(j):
                 pool.setdefault(mechanism(arena.new(j)[0]), j)
-        best = list(pool.values())[:_PAIRED]
-        pairs = [
-            arena.enter_both(a, b)
-            for i, a in enumerate(best)
-            for b in best[i + 1 :]
-            if arena.new(a)[0].family != arena.new(b)[0].family
-        ]
+        pairs = [arena.enter_both(a, b) for a, b in promising(arena, list(pool.values()), _PAIRED)]
         gain = max((j.total for j in judged if arena.plausible(j)), default=0.0)
         return sorted((p for p in pairs if p.total > gain), key=lambda j: -j.total)
 

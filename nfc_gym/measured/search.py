@@ -19,9 +19,10 @@ from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.remainder import CLEARLY, SILENT, LawSearch, Remainder
-from nfc_gym.measured.rounds import Contest, Round
+from nfc_gym.measured.rounds import Contest, Round, known_as
 from nfc_gym.measured.screen import Screen, Screened
 from nfc_gym.measured.settle import settle, slack
+from nfc_gym.measured.sparser import sparser
 from nfc_gym.measured.suspects import Suspects
 from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects.base import Effect
@@ -216,22 +217,34 @@ class Search:
         return (vague[-1], "its fitted sizes do not differ from nothing") if vague else None
 
     def _exchange(self, arena: Arena, rounds: list[Round]) -> Fit | None:
-        """A model in which another law took the place of an earlier one, if that is clearly better."""
+        """A model with another law in the place of one, if that is clearly better, or with two plainer ones there."""
         if sum(bool(r.exchanged) for r in rounds) >= self.options.swaps:
             return None
-        swap = swapped(arena, self.lookout, self.named, self.options.worth, self.say)
+        if (plainer := sparser(arena, self.named, self.options.worth)) is not None:
+            self.say(f"two laws in place of {plainer[0].id}: fewer numbers do as well")
+            rounds.append(self._exchanged(arena.current, plainer[1].fitted, "with fewer numbers"))
+            return plainer[1].fitted
+        swap = swapped(arena, self.lookout, self.named, self.options.worth, self.say, _met(rounds))
         if (found := swap.better) is None:
             for r in rounds:
-                if len(r.accepted) == 1:
-                    r.equivalents += [i for i in swap.alike.get(r.accepted[0], []) if i not in r.equivalents]
+                for law in r.accepted:
+                    rivals = r.rivals(law)
+                    rivals += [i for i in swap.alike.get(law, []) if i not in rivals]
             return None
-        gone, come = (
-            [e.id for e in one.plant.effects if e not in other.plant.effects]
-            for one, other in ((arena.current, found), (found, arena.current))
-        )
-        place = ", ".join(gone)
-        rounds.append(Round(come, 0.0, reason=f"in place of {place}, beside the others", exchanged=place))
+        rounds.append(self._exchanged(arena.current, found, "beside the others"))
         return found
+
+    def _exchanged(self, before: Fit, after: Fit, how: str) -> Round:
+        """The round in which one model takes the place of another."""
+        gone, come = (
+            [e for e in one.plant.effects if e not in other.plant.effects]
+            for one, other in ((before, after), (after, before))
+        )
+        place = ", ".join(e.id for e in gone)
+        out = Round([e.id for e in come], 0.0, reason=f"in place of {place}, {how}", exchanged=place)
+        for law in come:
+            out.rivals(law.id).extend(known_as(law, after, {e.id for e in self.named}))
+        return out
 
     def _begin(self, state: State) -> Arena:
         """The arena of the round that follows a state.
@@ -283,3 +296,11 @@ class Search:
         rival = bare.judge(fit(problem, arena.under, plant, np.concatenate([bare.current.x, effect.null]), 10))
         named = bare.judge(arena.current)
         return rival.total > CLEARLY * named.total and not arena.ties(rival, named)
+
+
+def _met(rounds: Sequence[Round]) -> set[str] | None:
+    """Ids of what the law accepted last was compared with in its round; None where it was accepted with another."""
+    last = next((r for r in reversed(rounds) if r.accepted), None)
+    if last is not None and len(last.accepted) > 1:
+        return None
+    return {row["id"] for row in last.ranking} if last is not None else set()

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -151,7 +152,7 @@ def looked_at(pool: Sequence[Effect], suspects: Suspects, rounds: Sequence[Any])
     They alone get a row in the identifiability table, which takes a roll-out and more for each.
     """
     ranked = {i for r in rounds for row in r.ranking for i in row["id"].split(" + ")}
-    named = {i for r in rounds for i in (*r.accepted, *r.equivalents)}
+    named = {i for r in rounds for i in (*r.accepted, *r.equivalents, *chain(*r.alike.values()))}
     families = {i.partition(":")[0] for i in ranked | named} | set(suspects.likely)
     return [e for e in pool if e.family in families]
 

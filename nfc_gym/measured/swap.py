@@ -3,10 +3,12 @@
 A greedy search takes what gains most by itself, and the next law mends what the first left; the two right ones together
 may do better than both. When nothing more is accepted, each earlier law is therefore taken out in turn, and what would
 then be accepted in its place must not be clearly better. What does as well there is an equivalent of the law, though
-it may have done worse while what came later was missing.
+it may have done worse while what came later was missing. The law accepted last met its rivals beside all the others;
+only its own family's other places, of which a round's shortlist has few, are asked again. Of two laws that were
+accepted at once neither has met any.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 from nfc_gym.measured.arena import Arena, contains
@@ -14,7 +16,7 @@ from nfc_gym.measured.contest import shortlist
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.rounds import NEARLY
-from nfc_gym.measured.screen import Screen, mimics
+from nfc_gym.measured.screen import Screen, Screened, mimics
 from nfc_gym.physics.effects.base import Effect
 
 _RIVALS = 3  # refitted in place of each law
@@ -33,27 +35,36 @@ class Swap:
     alike: dict[str, list[str]] = field(default_factory=dict)
 
 
-def swapped(arena: Arena, lookout: Lookout, pool: Sequence[Effect], worth: float, say: Callable[[str], None]) -> Swap:
-    """Look for other laws in the place of each that the model to beat has, but the last.
+def swapped(
+    arena: Arena,
+    lookout: Lookout,
+    pool: Sequence[Effect],
+    worth: float,
+    say: Callable[[str], None],
+    met: Collection[str] | None = (),
+) -> Swap:
+    """Look for other laws in the place of each that the model to beat has.
 
     Args:
       arena: whose model to beat has the laws.
       lookout: which screens.
       pool: candidates.
       worth: share of the misfit that a law must explain to be named.
+      met: ids of what the law accepted last was compared with in its round; None where it was accepted with another.
     """
     alike: dict[str, list[str]] = {}
-    # The last law accepted was the best of all beside the others.
-    for effect in arena.current.plant.effects[:-1]:
+    effects = arena.current.plant.effects
+    for effect in effects:
+        others = [e for e in pool if e.id != effect.id]
+        asked = met if effect is effects[-1] else None
+        if asked is not None:
+            others = [e for e in others if e.family == effect.family and e.id not in asked]
+        if not others:
+            continue
         without = arena.without(effect)
         kept = without.judge(arena.current)
         screen = Screen(without.fit_data.problem, without.under, without.current)
-        others = [e for e in pool if e.id != effect.id]
-        found = lookout.closer(screen, lookout.screen(screen, others))
-        picks = shortlist(found, _RIVALS)
-        # Many places of one family may look better than the one where it does what the law does.
-        picks += mimics(screen.try_one(effect), [s for s in found if not any(s is p for p in picks)], screen.projected)
-        for pick in picks:
+        for pick in _picked(lookout, screen, effect, others, asked is None):
             rival = without.enter([pick])
             if not (without.worth(rival, worth) and without.plausible(rival) and without.told_apart(rival)):
                 continue
@@ -67,3 +78,15 @@ def swapped(arena: Arena, lookout: Lookout, pool: Sequence[Effect], worth: float
             if without.ties(kept, rival) or without.ties(kept, without.enter_again(rival)):
                 alike.setdefault(effect.id, []).append(pick.effect.id)
     return Swap(alike=alike)
+
+
+def _picked(
+    lookout: Lookout, screen: Screen, effect: Effect, others: Sequence[Effect], leading: bool
+) -> list[Screened]:
+    """What is refitted in a law's place: what screening cannot tell from it, and before these what leads there."""
+    found = lookout.screen(screen, others)
+    found = lookout.closer(screen, found) if leading else found
+    picks = shortlist(found, _RIVALS) if leading else []
+    # Many places of one family may look better than the one where it does what the law does.
+    rest = [s for s in found if not any(s is p for p in picks)]
+    return [*picks, *mimics(screen.try_one(effect), rest, screen.projected)]

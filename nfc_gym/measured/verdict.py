@@ -177,7 +177,7 @@ def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any
 def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[str, float]) -> list[dict[str, Any]]:
     """Accepted effects with sentences, intervals and equivalents; sd (size,) of all parameters."""
     at = len(fitted.plant.space)
-    equivalents = {i: r.equivalents for r in rounds for i in r.accepted}
+    equivalents = {i: r.rivals(i) for r in rounds for i in r.accepted}
     rows = []
     for effect, theta in zip(fitted.plant.effects, fitted.plant.split(fitted.x)[1], strict=True):
         own = sd[at : at + len(theta)]

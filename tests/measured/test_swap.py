@@ -8,7 +8,7 @@ from hinge import DRY, FRICTION, LAGGING, SCALES, SPRING, VISCOUS, arena, given,
 
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.rounds import Round
-from nfc_gym.measured.search import Options, Search
+from nfc_gym.measured.search import Options, Search, _met
 from nfc_gym.measured.swap import Swap, swapped
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.joint import DampingPoly
@@ -57,7 +57,36 @@ def test_equivalents_in_the_last_model_join_those_of_the_round(monkeypatch: pyte
     """A law that did worse while another was missing may do as well beside it."""
     search: Any = object.__new__(Search)
     search.options, search.lookout, search.named, search.say = Options(), None, [], None
-    rounds = [Round(["a:x"], 0.5, equivalents=["b:x"]), Round(["d:x"], 0.1), Round([], 0.0)]
-    monkeypatch.setattr("nfc_gym.measured.search.swapped", lambda *_: Swap(alike={"a:x": ["b:x", "c:x"]}))
+    rounds = [Round(["a:x"], 0.5, equivalents=["b:x"]), Round(["d:x", "e:x"], 0.1), Round([], 0.0)]
+    alike = {"a:x": ["b:x", "c:x"], "e:x": ["f:x"]}
+    monkeypatch.setattr("nfc_gym.measured.search.swapped", lambda *_: Swap(alike=alike))
+    monkeypatch.setattr("nfc_gym.measured.search.sparser", lambda *_: None)
     assert search._exchange(None, rounds) is None
     assert [r.equivalents for r in rounds] == [["b:x", "c:x"], [], []]
+    assert [rounds[1].rivals(i) for i in rounds[1].accepted] == [[], ["f:x"]]
+
+
+@pytest.mark.parametrize(
+    ("met", "alike"),
+    [((), True), (("damping_poly:aside",), False), (None, True)],
+    ids=["nobody", "its other place", "accepted with the first"],
+)
+def test_the_last_law_meets_its_familys_other_places(met: tuple[str, ...] | None, alike: bool) -> None:
+    """A round's shortlist has few of them; all others have met it in its round, if it came alone."""
+
+    class Aside(DampingPoly):
+        id = property(lambda self: "damping_poly:aside")  # type: ignore[assignment]
+
+    contest = arena(LAGGING, [build(*SPRING), build(*VISCOUS)])
+    lookout = Lookout(contest.fit_data.problem, np.random.default_rng(0), lambda text: None)
+    found = swapped(contest, lookout, [*pool(), *Aside.propose(given(), SCALES)], 0.02, lambda text: None, met)
+    assert found.better is None
+    assert found.alike == ({"damping_poly:hinge": ["damping_poly:aside"]} if alike else {})
+
+
+def test_what_the_last_law_met() -> None:
+    one, two = Round(["a:x"], 0.5, [{"id": "b:x"}]), Round(["a:x", "b:x"], 0.5, [{"id": "c:x"}])
+    none = Round([], 0.0, [{"id": "d:x"}])
+    assert _met([two, one, none]) == {"b:x"}
+    assert _met([one, two, none]) is None
+    assert _met([none]) == set()
