@@ -46,5 +46,5 @@ def test_two_places_need_two_numbers_anyway_and_what_may_not_be_named_is_not_tri
 
 
 def test_the_odd_one_out_leaves_the_others_alike() -> None:
-    assert odd_one_out(np.array([[1.0, 5.0], [1.1, 5.2], [3.0, 5.1]])) == 2
+    assert odd_one_out(np.array([[1.0, 5.0], [1.1, 5.1], [3.0, 5.3]])) == 2
     assert odd_one_out(np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 9.0]])) == 2
