@@ -227,8 +227,17 @@ class Arena:
     @property
     def leftover(self) -> float:
         """What the model that set the metric leaves beyond the noise: nats a number, 0 if nothing."""
+        return self._beyond(self.extra)
+
+    def leaves(self, fitted: Fit) -> float:
+        """The same for a fitted model, whoever set the metric."""
+        data = self.fit_data
+        return self._beyond(slack(data.problem, data.sigma, fitted.plant, fitted.x))
+
+    def _beyond(self, extra: Array) -> float:
+        """Nats a number of a slack (m,) beyond the noise."""
         noise = np.einsum("sii->i", self.fit_data.sigma) / max(len(self.fit_data.problem), 1)
-        return float(0.5 * np.log1p(self.extra / np.maximum(noise, 1e-30)).mean())
+        return float(0.5 * np.log1p(extra / np.maximum(noise, 1e-30)).mean())
 
     def likelier(self, j: Judged) -> bool:
         """Whether a candidate is likelier than the model to beat by more than its price, each with its own slack."""

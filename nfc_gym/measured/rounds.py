@@ -15,7 +15,8 @@ NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reac
 _SHARED = 0.8  # the same for the same law at a wider place
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
 _PAIRED = 3  # pairs of mechanisms that are tried
-_TOGETHER = 1.25  # of what the best gains alone: what a pair must gain to be accepted at once
+_TOGETHER = 1.25  # of what the best gains alone, believed or not: what a pair must gain to be accepted at once
+_HALF = 0.5  # of what was left: what a pair may leave where that is much
 _LEFT = 0.1  # nats a number beyond the noise, below which a second law beside one that is believed has nothing to mend
 _FINALISTS = 4  # candidates that are judged again under the sharper metric
 _SHARP = 0.1  # nats a number beyond the noise, below which the metric of the model to beat is sharp enough
@@ -117,9 +118,7 @@ class Contest:
         believed = [j for j in judged if self._believed(j)]
         pairs = self._pairs(judged, entered) if arena.leftover > (_LEFT if believed else _FAINT) else []
         outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
-        alone = max((j.total for j in believed), default=0.0)
-        both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(j)]
-        believed = both or believed
+        believed = self._together(pairs, believed, judged) or believed
         if not believed:
             outcome.reason = f"the best candidate, {arena.label(judged[0])}, gains no more on unseen logs than chance"
             return outcome, None
@@ -211,6 +210,19 @@ class Contest:
         found = [replace(fine.enter_halved(j), fitted=j.fitted) for j in duel]
         return sorted(found, key=lambda j: -j.total)
 
+    def _together(self, pairs: Sequence[Judged], believed: Sequence[Judged], judged: Sequence[Judged]) -> list[Judged]:
+        """The pairs that gain clearly more than one law does, are believed, and leave little or half of what was there.
+
+        Two stand-ins for what the library lacks gain more than one of them, and leave most of it even so; each law more
+        is then tried, exchanged and dropped at the cost of a round. Where no single law is believed the best of all
+        sets the mark.
+        """
+        arena = self.arena
+        alone = max((j.total for j in believed or judged if arena.plausible(j)), default=0.0)
+        both = [j for j in pairs if j.total > _TOGETHER * alone and self._believed(j)]
+        least = max(_LEFT, _HALF * arena.leaves(arena.current)) if both else 0.0
+        return [j for j in both if arena.leaves(j.fitted) <= least]
+
     def _instead(self, best: Judged, judged: Sequence[Judged], entered: Sequence[Judged]) -> Judged | None:
         """Two laws at once where too many single ones do alike for any of them to be believed.
 
@@ -219,7 +231,7 @@ class Contest:
         """
         if not _FAINT < self.arena.leftover <= _LEFT:
             return None
-        both = [j for j in self._pairs(judged, entered) if j.total > _TOGETHER * best.total and self._believed(j)]
+        both = self._together(self._pairs(judged, entered), [best], judged)
         return self._simplest(both) if both else None
 
     def _alike(self, judged: Sequence[Judged], best: Judged, leading: Judged) -> list[str]:

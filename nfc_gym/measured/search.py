@@ -150,7 +150,7 @@ class Search:
                 break
             state = State(better.plant, better.x, tuple(rounds), frozenset(self.lookout.hopeless))
             keep(state)
-        confirmed = self._confirmed(arena, rounds)
+        confirmed = self._plainer(self._confirmed(arena, rounds), rounds)
         if confirmed is not arena:
             arena, screen = confirmed, Screen(self.fit_data.problem, confirmed.under, confirmed.current)
         dropped: list[str] = []
@@ -209,6 +209,18 @@ class Search:
             arena = self.settle(bare.plant, bare.x, polished=True)
         return arena
 
+    def _plainer(self, arena: Arena, rounds: list[Round]) -> Arena:
+        """The arena with two laws in place of one whose values differ by place, if fewer numbers do as well.
+
+        Asked of what is confirmed alone: it says in other words what was found, and nothing new competes beside it.
+        """
+        while (found := sparser(arena, self.named, self.options.worth)) is not None:
+            law, plainer = found
+            self.say(f"two laws in place of {law.id}: fewer numbers do as well")
+            rounds.append(self._exchanged(arena.current, plainer.fitted, "with fewer numbers"))
+            arena = self._confirmed(self.settle(plainer.fitted.plant, plainer.fitted.x), rounds)
+        return arena
+
     def _doubtful(self, arena: Arena) -> tuple[Effect, str] | None:
         """An accepted effect that had better not be claimed, and why."""
         if found := artefacts(arena, self.options.worth):
@@ -217,13 +229,9 @@ class Search:
         return (vague[-1], "its fitted sizes do not differ from nothing") if vague else None
 
     def _exchange(self, arena: Arena, rounds: list[Round]) -> Fit | None:
-        """A model with another law in the place of one, if that is clearly better, or with two plainer ones there."""
+        """A model in which another law took the place of an earlier one, if that is clearly better."""
         if sum(bool(r.exchanged) for r in rounds) >= self.options.swaps:
             return None
-        if (plainer := sparser(arena, self.named, self.options.worth)) is not None:
-            self.say(f"two laws in place of {plainer[0].id}: fewer numbers do as well")
-            rounds.append(self._exchanged(arena.current, plainer[1].fitted, "with fewer numbers"))
-            return plainer[1].fitted
         swap = swapped(arena, self.lookout, self.named, self.options.worth, self.say, _met(rounds))
         if (found := swap.better) is None:
             for r in rounds:

@@ -4,8 +4,8 @@ A greedy search takes what gains most by itself, and the next law mends what the
 may do better than both. When nothing more is accepted, each earlier law is therefore taken out in turn, and what would
 then be accepted in its place must not be clearly better. What does as well there is an equivalent of the law, though
 it may have done worse while what came later was missing. The law accepted last met its rivals beside all the others;
-only its own family's other places, of which a round's shortlist has few, are asked again. Of two laws that were
-accepted at once neither has met any.
+only its own family's other places, of which a round's shortlist has few, are asked again, unless it stands alone. Of
+two laws that were accepted at once neither has met any.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -59,7 +59,8 @@ def swapped(
         asked = met if effect is effects[-1] else None
         if asked is not None:
             others = [e for e in others if e.family == effect.family and e.id not in asked]
-        if not others:
+        if not others or (asked is not None and len(effects) == 1):
+            # A law that stands alone met what does nearly the same in its round, and nothing has joined it since.
             continue
         without = arena.without(effect)
         kept = without.judge(arena.current)

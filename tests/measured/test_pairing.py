@@ -52,14 +52,52 @@ def test_a_pair_has_two_families_and_does_not_undo_itself() -> None:
     assert len(promising(arena([1.0, 1.0, 1.0]), [one, same, back], 3)) == 2
 
 
+def standing(leftover: float, before: float = 0.0) -> Any:
+    """An arena in which all is plausible whose total is no more than 1000; what a model leaves is its own to say."""
+    data, current = SimpleNamespace(problem=SimpleNamespace(rough=False)), SimpleNamespace(left=before)
+    return SimpleNamespace(
+        leftover=leftover,
+        fit_data=data,
+        current=current,
+        leaves=lambda fitted: fitted.left,
+        plausible=lambda j: j.total <= 1000.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("totals", "trusted", "found"),
+    [([100.0, 90.0], [90.0], True), ([100.0, 90.0], [], False), ([5000.0, 90.0], [], True)],
+    ids=["more than what is believed", "hardly more than what is not", "more than all that is plausible"],
+)
+def test_two_laws_must_gain_clearly_more_than_one(totals: list[float], trusted: list[float], found: bool) -> None:
+    """Where none is believed too: stand-ins for what the library lacks gain a little more by twos."""
+    both: Any = SimpleNamespace(total=120.0, fitted=SimpleNamespace(left=0.01))
+    contest: Any = Contest(standing(0.2), SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
+    contest._believed = lambda j: True
+    alone, believed = ([SimpleNamespace(total=t) for t in some] for some in (totals, trusted))
+    assert contest._together([both], believed, alone) == ([both] if found else [])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "found"),
+    [(0.3, 0.05, True), (0.3, 0.2, False), (2.0, 0.9, True), (2.0, 1.5, False)],
+    ids=["little", "most of what was little", "less than half of much", "most of much"],
+)
+def test_two_laws_must_leave_little_or_half(before: float, after: float, found: bool) -> None:
+    both: Any = SimpleNamespace(total=500.0, fitted=SimpleNamespace(left=after))
+    contest: Any = Contest(standing(0.2, before), SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
+    contest._believed = lambda j: True
+    assert contest._together([both], [], []) == ([both] if found else [])
+
+
 @pytest.mark.parametrize(
     ("leftover", "total", "found"),
     [(0.05, 200.0, True), (0.05, 120.0, False), (0.01, 200.0, False), (0.5, 200.0, False)],
     ids=["much better", "hardly better", "nothing left", "tried before"],
 )
 def test_two_laws_where_too_many_do_alike(leftover: float, total: float, found: bool) -> None:
-    both: Any = SimpleNamespace(total=total)
-    at: Any = SimpleNamespace(leftover=leftover, fit_data=SimpleNamespace(problem=SimpleNamespace(rough=False)))
+    both: Any = SimpleNamespace(total=total, fitted=SimpleNamespace(left=0.01))
+    at: Any = standing(leftover)
     contest: Any = Contest(at, SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
     contest._pairs, contest._believed, contest._simplest = lambda *_: [both], lambda j: True, lambda js: js[0]
     assert contest._instead(SimpleNamespace(total=100.0), [], []) is (both if found else None)

@@ -1,5 +1,6 @@
 """An earlier law gives way to the one that does better beside the others."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,6 @@ def test_equivalents_in_the_last_model_join_those_of_the_round(monkeypatch: pyte
     rounds = [Round(["a:x"], 0.5, equivalents=["b:x"]), Round(["d:x", "e:x"], 0.1), Round([], 0.0)]
     alike = {"a:x": ["b:x", "c:x"], "e:x": ["f:x"]}
     monkeypatch.setattr("nfc_gym.measured.search.swapped", lambda *_: Swap(alike=alike))
-    monkeypatch.setattr("nfc_gym.measured.search.sparser", lambda *_: None)
     assert search._exchange(None, rounds) is None
     assert [r.equivalents for r in rounds] == [["b:x", "c:x"], [], []]
     assert [rounds[1].rivals(i) for i in rounds[1].accepted] == [[], ["f:x"]]
@@ -82,6 +82,31 @@ def test_the_last_law_meets_its_familys_other_places(met: tuple[str, ...] | None
     found = swapped(contest, lookout, [*pool(), *Aside.propose(given(), SCALES)], 0.02, lambda text: None, met)
     assert found.better is None
     assert found.alike == ({"damping_poly:hinge": ["damping_poly:aside"]} if alike else {})
+
+
+def test_a_law_that_stands_alone_met_its_kind_in_its_round() -> None:
+    """Nothing has joined it since, and a second look would cost a round's screening in every search that finds one."""
+    asked: list[str] = []
+    plant = SimpleNamespace(effects=[build(*VISCOUS)[0]])
+    contest: Any = SimpleNamespace(current=SimpleNamespace(plant=plant), without=lambda effect: asked.append(effect.id))
+    lookout: Any = None
+    assert swapped(contest, lookout, pool(), 0.02, lambda text: None) == Swap()
+    assert not asked
+
+
+def test_fewer_numbers_are_asked_of_what_is_confirmed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And two laws in place of one must outlive half the step as any other."""
+    search: Any = object.__new__(Search)
+    search.options, search.named, search.say = Options(), [], lambda text: None
+    many, plain = (SimpleNamespace(current=n, fitted=SimpleNamespace(plant=n, x=None)) for n in ("many", "plain"))
+    found = iter([(SimpleNamespace(id="gain:a+b+c:each"), plain), None])
+    monkeypatch.setattr("nfc_gym.measured.search.sparser", lambda *_: next(found))
+    search._exchanged = lambda before, after, how: Round([after.plant], 0.0)
+    search.settle = lambda plant, x: f"settled {plant}"
+    search._confirmed = lambda arena, rounds: f"confirmed {arena}"
+    rounds: list[Round] = []
+    assert search._plainer(many, rounds) == "confirmed settled plain"
+    assert [r.accepted for r in rounds] == [["plain"]]
 
 
 def test_what_the_last_law_met() -> None:
