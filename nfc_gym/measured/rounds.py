@@ -1,6 +1,6 @@
 """One round of the search: refit the shortlist, judge it on the selection logs, and decide which law is accepted."""
 
-from collections.abc import Container, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 from nfc_gym.measured.arena import Arena, contains
@@ -61,10 +61,12 @@ def ranked(ranking: list[dict], news: list[dict]) -> list[dict]:
     return news + [row for row in ranking if row["id"] not in ids]
 
 
-def known_as(law: Effect, fitted: Fit, pool: Container[str]) -> list[str]:
+def known_as(law: Effect, fitted: Fit, pool: Collection[str]) -> list[str]:
     """Ids, of those in a pool, of effects that are a fitted model's law by another name."""
+    if not pool:
+        return []
     thetas = dict(zip(map(id, fitted.plant.effects), fitted.plant.split(fitted.x)[1], strict=True))
-    names = [f"{family}:{law.place}" for family in law.known_as(thetas[id(law)])] if pool else []
+    names = (f"{family}:{law.place}" for family in law.known_as(thetas[id(law)]))
     return [i for i in names if i in pool]
 
 
