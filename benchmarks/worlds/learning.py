@@ -1,6 +1,7 @@
 """Policies that go on learning by PPO: in the true world, in what was executed there, or in randomised ones."""
 
 import copy
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -85,6 +86,7 @@ def improve(
       seed: of actions and of the environments' episodes.
       steps: control steps of all simulations together.
     """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # the size of each buffer is no news
     agent = ppo_agent(policy)
     learner = agent.learner(agent.actor, agent.action_size())
     horizon = min(learner.horizon if envs.num_envs > 1 else EPISODE, max(1, steps // envs.num_envs))

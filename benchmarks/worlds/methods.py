@@ -134,7 +134,7 @@ def inference(job: Job) -> Any:
         return load_source(job.posterior)
     known = {"map_error": ERRORS.get(job.world.robot, OTHERS)} if job.world.ground == "Rough" else {}
     return Assimilation(
-        f"nfc_gym/{job.world.place}-v0", reach=REACH, effects=True, seed=job.seed, nthread=job.budget.threads, **known
+        f"nfc_gym/{job.world.place}-v0", reach=REACH, seed=job.seed, nthread=job.budget.threads, **known
     )
 
 

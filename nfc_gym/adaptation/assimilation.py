@@ -241,7 +241,7 @@ class Assimilation:
     ground: Heightfield | None = None
     map_error: float = 0.0
     delta_s: bool = True
-    effects: bool = False
+    effects: bool = True
     motor: float = MOTOR
     seed: int = 0
     nthread: int = 1

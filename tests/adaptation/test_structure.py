@@ -71,8 +71,8 @@ def late(delay: float) -> Any:
 def test_a_delay_is_found_and_no_mass_makes_up_for_it() -> None:
     trajectory = driven_in(late(0.08), {}, 300)
     nominal = Machine(ID).space.nominal[0]
-    blind = Assimilation(ID, delta_s=False).infer(trajectory)
-    seeing = Assimilation(ID, effects=True)
+    blind = Assimilation(ID, delta_s=False, effects=False).infer(trajectory)
+    seeing = Assimilation(ID)
     belief = seeing.infer(trajectory)
     found = {e.family: theta for e, theta in belief.effects(500, np.random.default_rng(0))}
     assert abs(np.median(found["delay"]) - 0.08) < 0.03
@@ -81,7 +81,7 @@ def test_a_delay_is_found_and_no_mass_makes_up_for_it() -> None:
 
 
 def test_worlds_of_a_belief_have_its_effects_each_in_a_size_of_its_own() -> None:
-    belief = Assimilation(ID, effects=True).infer(driven_in(late(0.08), {}, 120))
+    belief = Assimilation(ID).infer(driven_in(late(0.08), {}, 120))
     given: Any = {"hallucinate": True, "beta": 1.0, "episode": 50, "threads": 1, "seed": 0}
     ways = []
     for parts in (("psi", "effects"), ("psi",)):
