@@ -4,9 +4,9 @@ The trajectory is cut into segments of `SPAN` control steps. Each is replayed fr
 start, under many draws of psi, the same noise in all of them, so that what differs between two replays is psi's doing
 alone. A regression of where segments end on psi (in probit coordinates of the prior's box, where the prior is standard
 normal) gives a linear model of the robot around the present belief, and Bayes' rule for a linear model with Gaussian
-noise the next belief; after a few rounds the draws lie where the posterior does (iterated posterior linearisation:
-Garcia-Fernandez et al. 2015). The noise of a segment's end is the sensors', what the noise of start, motors and map
-makes of it, found by replays of one psi, and what the regression leaves.
+noise the next belief (iterated posterior linearisation: Garcia-Fernandez et al. 2015). Its mean goes there only as far
+as replays say that it is better. The noise of a segment's end is the sensors' and what the noise of start, motors and
+map makes of it, found by replays of one psi, scaled to what the best replays miss, and what the regression leaves.
 
 What the replays under the posterior's psi still miss, a control step, is delta_s: its mean over the segments, and how
 sure that mean is. With `effects`, sizes of what the model may lack (`structure`) are inferred along with psi: where a
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from nfc_gym.adaptation.linear import Linear, as_seen, cost, regressed
 from nfc_gym.adaptation.perceived import perceived_ground
 from nfc_gym.adaptation.structure import Structure, kept, structure_of
 from nfc_gym.adaptation.trajectory import Trajectory
@@ -52,8 +53,6 @@ _NEAR = 0.4
 _STEPS = np.array([1.0, 0.5, 0.2, 0.05, 0.0])  # of the way to where the linear model leads, of which the best is gone
 _SPARSER = 10  # times that a round asks which effects are there
 _LEAST = 0.02  # variance of the prior of an effect that is not
-_QUIET = 0.05  # of the variance that is assumed of ends, at least
-_LOST = 1e3  # of the sensors' noise, by which a replay that came apart counts as off
 _SHRUNK = 0.1  # of a covariance of few draws, towards its diagonal
 _PRESENT = 0.1  # of an effect's scale, below which it is left out of the worlds that a belief stands for
 _EDGE = 1e-4  # how near to its box's bounds psi is drawn, as a share of the box
@@ -77,90 +76,6 @@ class Box:
     def z(self, psi: Array) -> Array:
         """Its inverse."""
         return ndtri(np.clip((psi - self.low) / (self.high - self.low), _EDGE, 1 - _EDGE))
-
-
-@dataclass(frozen=True)
-class Linear:
-    """The robot as linear in z around where draws were taken: what is missed is offset - slope z.
-
-    Attributes:
-      slope: (n, k, d).
-      offset: (n, k), at z = 0.
-      left: (n, k) variance that the regression leaves.
-      scatter: (d, d) inverse of the draws' scatter matrix.
-    """
-
-    slope: Array
-    offset: Array
-    left: Array
-    scatter: Array
-
-    def posterior(self, noise: Array, prior: Array) -> tuple[Array, Array]:
-        """Mean and covariance of z ~ N(0, diag(prior)) given that nothing is missed, by noise (n, k, k)."""
-        n, k, d = self.slope.shape
-        white: Any = np.linalg.inv(np.linalg.cholesky(noise))
-        slope, offset = (white @ self.slope).reshape(n * k, d), (white @ self.offset[..., None]).reshape(-1)
-        unit = np.sqrt(prior)
-        # The slope of k ends is off by independent errors, which would add up to a precision that is not there.
-        spurious = (white**2 @ self.left[..., None]).sum()
-        excess = unit[:, None] * spurious * self.scatter * unit
-        mean, covariance = linear_posterior(slope * unit, offset, np.ones(n * k), excess)
-        return unit * mean, unit[:, None] * covariance * unit
-
-
-def regressed(z: Array, off: Array) -> Linear:
-    """Of what replays under draws (m, d) miss, (m, n, k), on the draws; those that come apart are left out.
-
-    Raises:
-      InputError: too few are left.
-    """
-    fine = np.isfinite(off).all((1, 2))
-    if fine.sum() < z.shape[1] + 4:
-        raise InputError("assimilation: most replays come apart: the trajectory does not fit this robot")
-    z, off = z[fine], off[fine]
-    centre, (m, n, k) = z.mean(0), off.shape
-    design = np.concatenate([z - centre, np.ones((m, 1))], 1)
-    y = off.reshape(m, -1)
-    found: Any = np.linalg.lstsq(design, y, rcond=None)[0]
-    left = ((y - design @ found) ** 2).sum(0) / max(1, m - design.shape[1])
-    slope = -found[:-1].T
-    scatter: Any = np.linalg.inv((z - centre).T @ (z - centre))
-    return Linear(slope.reshape(n, k, -1), (found[-1] + slope @ centre).reshape(n, k), left.reshape(n, k), scatter)
-
-
-def _as_seen(noise: Array, off: Array) -> Array:
-    """Noise (n, k, k) of segments, scaled entry by entry to what the best replays miss, (n, k).
-
-    What nothing in the model explains says nothing of the model's parameters, and counts as noise; and where starts are
-    known better than was assumed, there is less of it.
-    """
-    squared = (np.where(np.isfinite(off), off, _LOST) ** 2).mean(0) / np.diagonal(noise, axis1=1, axis2=2).mean(0)
-    share = np.sqrt(np.maximum(squared, _QUIET))
-    return share[:, None] * noise * share
-
-
-def _cost(z: Array, prior: Array, off: Array, noise: Array) -> Array:
-    """(m,) twice the negative logarithm of prior times likelihood of z (m, d) that miss by (m, n, k)."""
-    each: Any = np.linalg.solve(noise, np.where(np.isfinite(off), off, _LOST)[..., None])[..., 0]
-    return (z * z / prior).sum(1) + (np.where(np.isfinite(off), off, _LOST) * each).sum((1, 2))
-
-
-def linear_posterior(slope: Array, offset: Array, noise: Array, excess: Any = 0.0) -> tuple[Array, Array]:
-    """Mean (d,) and covariance (d, d) of z ~ N(0, I) given offset = slope z + N(0, diag(noise)).
-
-    Args:
-      slope: (k, d).
-      offset: (k,).
-      noise: (k,) variances.
-      excess: (d, d) precision that errors of the slope alone would seem to give, to be taken off; directions of which
-        nothing then is left keep the prior.
-    """
-    weighted = slope / noise[:, None]
-    precision = weighted.T @ slope
-    values, vectors = np.linalg.eigh(precision - excess)
-    covariance = (vectors / (1 + np.maximum(values, 0))) @ vectors.T
-    mean: Any = np.linalg.solve(np.eye(len(precision)) + precision, weighted.T @ offset)
-    return mean, covariance
 
 
 @dataclass(frozen=True)
@@ -277,7 +192,7 @@ class Assimilation:
         d = len(self.machine.space) + len(self.structure)
         mean, covariance, prior = np.zeros(d), np.eye(d), np.ones(d)
         noise = self._noise(segments, mean, rng, seen, scale) + np.eye(int(seen.sum()))
-        each = _as_seen(noise, self._misses(segments, mean[None], seen, scale)[0])
+        each = as_seen(noise, self._misses(segments, mean[None], seen, scale)[0])
         for _ in range(ROUNDS):
             z = rng.multivariate_normal(mean, _NEAR * covariance, max(DRAWS, 2 * d), method="cholesky")
             linear = regressed(z, self._misses(segments, z, seen, scale))
@@ -285,8 +200,8 @@ class Assimilation:
             wanted, covariance, prior = self._believed(linear, each, prior)
             tried = mean + _STEPS[:, None] * (wanted - mean)
             off = self._misses(segments, tried, seen, scale)
-            best = int(np.argmin(_cost(tried, prior, off, each)))
-            mean, each = tried[best], _as_seen(noise, off[best])
+            best = int(np.argmin(cost(tried, prior, off, each)))
+            mean, each = tried[best], as_seen(noise, off[best])
         belief = Assimilated(self.box, mean, covariance, structure=self.structure)
         return self._with_residual(belief, segments, rng) if self.delta_s else belief
 
