@@ -89,7 +89,7 @@ def improve(
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # the size of each buffer is no news
     agent = ppo_agent(policy)
     learner = agent.learner(agent.actor, agent.action_size())
-    horizon = min(learner.horizon if envs.num_envs > 1 else EPISODE, max(1, steps // envs.num_envs))
+    horizon = min(learner.horizon(envs.num_envs) if envs.num_envs > 1 else EPISODE, max(1, steps // envs.num_envs))
     torch.manual_seed(seed)
     env = torchrl_env(envs)
     env.set_seed(seed)

@@ -25,6 +25,7 @@ from nfc_gym.adaptation.ppo import Actor, Diverged, OnPolicy, Power, PPOConfig, 
 from nfc_gym.adaptation.sight import Sight
 from nfc_gym.core.errors import InputError
 
+_HORIZON = 4  # control steps of a simulation between two rounds of updates off policy
 MakeLoss = Callable[[Actor, int], LossModule]
 
 
@@ -32,12 +33,14 @@ class Learner(Protocol):
     """What improves an actor from batches of steps.
 
     Attributes:
-      horizon: control steps of each simulation that it wants in a batch.
       loss: the TorchRL loss.
     """
 
-    horizon: int
     loss: LossModule
+
+    def horizon(self, n: int) -> int:
+        """Control steps that it wants of each of n simulations in a batch."""
+        ...
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from steps (n, horizon); returns values to write down; raises `Diverged`."""
@@ -76,8 +79,6 @@ class OffPolicy:
       config: see `OffPolicyConfig`.
     """
 
-    horizon = 4
-
     def __init__(self, loss: LossModule, config: OffPolicyConfig) -> None:
         self.loss, self.config = loss, config
         device = next(loss.parameters()).device
@@ -88,6 +89,10 @@ class OffPolicy:
         self.power = Power().to(device)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(config.capacity, device=device), batch_size=config.batch)
         self._seen = 0
+
+    def horizon(self, n: int) -> int:
+        """Short: what is new is learned from many times anyway."""
+        return _HORIZON
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """See `Learner`."""

@@ -40,7 +40,8 @@ class AdaptConfig:
 
     Attributes:
       missions: trajectories that are executed.
-      worlds: N, simulations that are drawn from the belief.
+      worlds: N, simulations that are drawn from the belief; so many only that each has steps for several episodes.
+        Until its first one has ended a simulation shows but the beginning of what there is to learn.
       steps: control steps of all of them together, after each anomaly.
       episode: control steps of an episode in them; None is the environment's own.
       hallucinate: train pi_h too, which leans the draws in the policy's favour.
@@ -50,11 +51,11 @@ class AdaptConfig:
     """
 
     missions: int = 10
-    worlds: int = 256
+    worlds: int = 64
     steps: int = 500_000
     episode: int | None = None
     hallucinate: bool = True
-    parts: Sequence[str] = ("psi", "delta_s", "delta_e", "effects")
+    parts: Sequence[str] = ("psi", "delta_s", "delta_e", "effects", "noise")
     beta: float = 1.0
     seed: int = 0
 

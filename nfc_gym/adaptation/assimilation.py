@@ -41,15 +41,19 @@ from nfc_gym.terrain import Heightfield
 Array = NDArray[np.float64]
 SPAN = 10  # control steps of a segment: long enough to show psi, short enough for motion to be nearly linear in it
 SHORT = 5  # of a robot that fell at once
-SEGMENTS = 40  # of a trajectory at most, evenly spread
+SEGMENTS = 40  # of a trajectory at most, evenly spread; and of all that are remembered
+MEMORY = 4  # trajectories
 DRAWS = 64  # replays a segment, and of the noise
-ROUNDS = 8
 EARLIER = 15  # control steps before a segment, whose commands delays and lags still remember
 GROUNDS = 8  # that a perceived ground may as well be, by which its noise counts
 _EVEN = 1e-4  # m: noise of a map below which it is left out
-# Of the covariance that the regression alone would believe, at which the next draws lie around its mean. Wider ones are
-# bent by what is not linear, which then counts as noise: of fifty unknowns little was left to learn.
-_NEAR = 0.4
+# Of the covariance that is believed, at which each round's draws lie around the mean. Wide ones find the way, bent by
+# what is not linear, which counts as noise; narrow ones find the place.
+_NEAR = (0.4, 0.4, 0.4, 0.4, 0.2, 0.1, 0.05, 0.02)
+_NEARER = (1, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.008, 0.004, 0.002, 0.001)  # the same, of `Assimilated.near`
+_ALIKE = 2.0  # nats a parameter that draws of `near` may fit worse than the mean, twice what is due to their number
+_SPREAD = 1.4826  # of a normal, over its median size
+_FEW = 12  # draws by which that is seen
 _STEPS = np.array([1.0, 0.5, 0.2, 0.05, 0.0])  # of the way to where the linear model leads, of which the best is gone
 _SPARSER = 10  # times that a round asks which effects are there
 _LEAST = 0.02  # variance of the prior of an effect that is not
@@ -88,6 +92,8 @@ class Assimilated:
       delta: (s,) mean of delta_s, a control step; None says nothing of it.
       spread: (s,) standard deviation of that mean.
       structure: of k sizes.
+      noise: (s,) standard deviation of `proprio` as it is sensed; None says nothing of it.
+      share: of the covariance, within which draws replay what was seen about as well as the mean does.
     """
 
     box: Box
@@ -96,16 +102,33 @@ class Assimilated:
     delta: Array | None = None
     spread: Array | None = None
     structure: Structure = field(default_factory=Structure)
+    noise: Array | None = None
+    share: float = 1.0
+
+    def near(self) -> "Assimilated":
+        """As wide only as draws still do what was seen.
+
+        What is believed is a bent valley, and its covariance the box around it: a draw from that box, whose psi and
+        effects moreover are drawn apart, is as a rule a robot that nothing of the trajectory speaks for.
+        """
+        d = len(self.box.low)
+        apart = self.covariance.copy()
+        apart[:d, d:] = apart[d:, :d] = 0
+        return replace(self, covariance=self.share * apart, share=1.0)
+
+    def coordinates(self, n: int, rng: np.random.Generator) -> Array:
+        """(n, d + k) draws of z."""
+        return rng.multivariate_normal(self.mean, self.covariance, n, method="cholesky")
 
     def effects(self, n: int, rng: np.random.Generator) -> list[tuple[Effect, Array]]:
         """Effects at work and their sizes (n, k) in n worlds; what is as good as absent is left out."""
-        z = rng.multivariate_normal(self.mean, self.covariance, n, method="cholesky")
+        z = self.coordinates(n, rng)
         found = kept(self.structure, self.structure.values(z[:, len(self.box.low) :]), _PRESENT)
         return [(self.structure.effects[i], theta) for i, theta in found.items()]
 
     def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
         """See `Sampler`."""
-        z = rng.multivariate_normal(self.mean, self.covariance, n, method="cholesky")
+        z = self.coordinates(n, rng)
         psi = self.box.psi(z[:, : len(self.box.low)])
         if self.delta is None or self.spread is None:
             return Fidelity(psi)
@@ -118,7 +141,7 @@ class Segments:
 
     Attributes:
       starts: (n, nq + nv), or with the actuators' states behind them (n, nq + nv + na).
-      first, last: (n, s) `proprio` where they start and end.
+      first, second, last: (n, s) `proprio` where they start, a control step later, and where they end.
       actions: (n, span, a).
       earlier: (n, EARLIER, a) the actions before; the first one of the trajectory stands for what came before it.
       maps: the ground underfoot, and others that it may as well be; none is a plane.
@@ -127,6 +150,7 @@ class Segments:
 
     starts: Array
     first: Array
+    second: Array
     last: Array
     actions: Array
     earlier: Array
@@ -147,6 +171,7 @@ class Assimilation:
       delta_s: whether to infer residual dynamics too.
       effects: whether to infer the sizes of effects that the model may lack too.
       motor: standard deviation of the motors' noise, a share of the actions' range.
+      memory: earlier trajectories, of the same world, that a belief is made of besides the last one.
       seed: of all draws.
       nthread: threads.
     """
@@ -158,8 +183,10 @@ class Assimilation:
     delta_s: bool = True
     effects: bool = True
     motor: float = MOTOR
+    memory: int = MEMORY
     seed: int = 0
     nthread: int = 1
+    remembered: tuple[Trajectory, ...] = ()
     machine: Machine = field(init=False)
     box: Box = field(init=False)
     structure: Structure = field(init=False)
@@ -186,33 +213,44 @@ class Assimilation:
           InputError: it is shorter than a segment, of another robot, tells no state to start from, or on rough ground
             neither it nor `ground` says what is underfoot.
         """
-        segments, rng = self.segments(trajectory), np.random.default_rng(self.seed)
-        seen = told(self.machine)
+        most = SEGMENTS // max(1, len(self.remembered))
+        parts = [*(self.segments(earlier, most) for earlier in self.remembered), self.segments(trajectory)]
+        rng, seen = np.random.default_rng(self.seed), told(self.machine)
         scale = self.machine.noise[seen]
         d = len(self.machine.space) + len(self.structure)
         mean, covariance, prior = np.zeros(d), np.eye(d), np.ones(d)
-        noise = self._noise(segments, mean, rng, seen, scale) + np.eye(int(seen.sum()))
-        each = as_seen(noise, self._misses(segments, mean[None], seen, scale)[0])
-        for _ in range(ROUNDS):
-            z = rng.multivariate_normal(mean, _NEAR * covariance, max(DRAWS, 2 * d), method="cholesky")
-            linear = regressed(z, self._misses(segments, z, seen, scale))
+        noise = self._noise(parts, mean, rng, seen, scale) + np.eye(int(seen.sum()))
+        off = self._misses(parts, mean[None], seen, scale)
+        each = as_seen(noise, off[0])
+        for near in _NEAR:
+            z = rng.multivariate_normal(mean, near * covariance, max(DRAWS, 2 * d), method="cholesky")
+            linear = regressed(z, self._misses(parts, z, seen, scale))
             each = each + linear.left[..., None] * np.eye(noise.shape[-1])
             wanted, covariance, prior = self._believed(linear, each, prior)
             tried = mean + _STEPS[:, None] * (wanted - mean)
-            off = self._misses(segments, tried, seen, scale)
+            off = self._misses(parts, tried, seen, scale)
             best = int(np.argmin(cost(tried, prior, off, each)))
-            mean, each = tried[best], as_seen(noise, off[best])
+            mean, off = tried[best], off[best : best + 1]
+            each = as_seen(noise, off[0])
         belief = Assimilated(self.box, mean, covariance, structure=self.structure)
-        return self._with_residual(belief, segments, rng) if self.delta_s else belief
+        worst = cost(mean[None], prior, off, each)[0] + _ALIKE * d
+        for share in _NEARER:
+            belief = replace(belief, share=share)
+            z = belief.near().coordinates(_FEW, rng)
+            if np.median(cost(z, prior, self._misses(parts, z, seen, scale), each)) <= worst:
+                break
+        belief = replace(belief, noise=self._sensed(trajectory.states, parts, mean, off[0] * scale, seen))
+        return self._with_residual(belief, parts, rng) if self.delta_s else belief
 
     def updated(self, trajectory: Trajectory, belief: Sampler) -> "Assimilation":
-        """Itself: a belief is made of one trajectory, whose world may be another than the last one's."""
-        return self
+        """One that remembers the trajectory: where a policy that was adapted goes wrong, its belief did."""
+        kept = (*self.remembered, trajectory)[-self.memory :] if self.memory else ()
+        return replace(self, remembered=kept)
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 
-    def segments(self, trajectory: Trajectory) -> Segments:
-        """Up to `SEGMENTS` parts of a trajectory, evenly spread."""
+    def segments(self, trajectory: Trajectory, most: int = SEGMENTS) -> Segments:
+        """Parts of a trajectory, evenly spread."""
         span = SPAN if len(trajectory) >= 2 * SPAN else SHORT
         count = len(trajectory) // span
         kind = self.machine.kind
@@ -223,7 +261,7 @@ class Assimilation:
             )
         if count < 2:
             raise InputError(f"assimilation: {len(trajectory)} control steps; want at least {2 * SHORT}")
-        at = span * np.unique(np.linspace(0, count - 1, min(count, SEGMENTS)).round().astype(int))
+        at = span * np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
         first = trajectory.states[at]
         hidden = not trajectory.estimate.size
         starts = observed(self.machine, first) if hidden else trajectory.estimate[at]
@@ -231,7 +269,7 @@ class Assimilation:
         actions = given[at[:, None] + np.arange(span)]
         earlier = given[np.maximum(at[:, None] + np.arange(-EARLIER, 0), 0)]
         last, maps = trajectory.states[at + span], self._grounds(trajectory)
-        return Segments(starts, first, last, actions, earlier, maps, hidden)
+        return Segments(starts, first, trajectory.states[at + 1], last, actions, earlier, maps, hidden)
 
     def _grounds(self, trajectory: Trajectory) -> list[Heightfield]:
         """See `Segments.maps`: the likeliest is the first."""
@@ -265,20 +303,22 @@ class Assimilation:
             mean, covariance = linear.posterior(noise, prior)
         return mean, covariance, prior
 
-    def _misses(self, segments: Segments, z: Array, seen: NDArray[np.bool_], scale: Array) -> Array:
+    def _misses(self, parts: Sequence[Segments], z: Array, seen: NDArray[np.bool_], scale: Array) -> Array:
         """(m, n, k) by how much the ends that were seen are off replays under z (m, d), in sensors' noise."""
-        ends = self._ends(segments, z, None)
-        return self.machine.difference(segments.last[None], ends)[..., seen] / scale
+        off = [self.machine.difference(p.last[None], self._ends(p, z, None)) for p in parts]
+        return np.concatenate(off, 1)[..., seen] / scale
 
     def _noise(
-        self, segments: Segments, z: Array, rng: np.random.Generator, seen: NDArray[np.bool_], scale: Array
+        self, parts: Sequence[Segments], z: Array, rng: np.random.Generator, seen: NDArray[np.bool_], scale: Array
     ) -> Array:
         """(n, k, k) covariance of a segment's end by the noise of start, motors and map, in units of the sensors'.
 
         One bump tilts, lifts and slows a robot at once: entries taken as independent would count it several times.
         """
-        ends = self._ends(segments, np.tile(z, (DRAWS, 1)), rng)
-        off = self.machine.difference(ends, np.broadcast_to(segments.last, ends.shape))[..., seen] / scale
+        many = np.tile(z, (DRAWS, 1))
+        ends = np.concatenate([self._ends(p, many, rng) for p in parts], 1)
+        last = np.concatenate([p.last for p in parts])
+        off = self.machine.difference(ends, np.broadcast_to(last, ends.shape))[..., seen] / scale
         off = off[np.isfinite(off).all((1, 2))]
         if len(off) < DRAWS // 4:
             raise InputError("assimilation: most replays come apart: the trajectory does not fit this robot")
@@ -286,10 +326,31 @@ class Assimilation:
         found = np.einsum("mnk,mnl->nkl", off, off) / (len(off) - 1)
         return (1 - _SHRUNK) * found + _SHRUNK * found * np.eye(found.shape[1])
 
-    def _with_residual(self, belief: Assimilated, segments: Segments, rng: np.random.Generator) -> Assimilated:
+    def _sensed(
+        self, states: Array, parts: Sequence[Segments], mean: Array, late: Array, seen: NDArray[np.bool_]
+    ) -> Array:  # fmt: skip
+        """(s,) noise of `proprio`: the least of three sizes, each of which holds more than noise.
+
+        What the mean's replays miss after a step still has the start's noise, and at the ends (n, k) what the model
+        gets wrong; fourth differences of what was sensed, of which white noise has 70 times its variance, have what is
+        rough in the motion. Medians leave out impacts.
+        """
+        short = [replace(p, actions=p.actions[:, :1], last=p.second) for p in parts]
+        soon = self._misses(short, mean[None], seen, np.ones(int(seen.sum())))[0]
+        sizes = [soon, late]
+        if len(states) > SPAN:
+            sizes.append(np.diff(states[:, seen], 4, axis=0) / np.sqrt(70))
+        found = np.zeros(len(seen))
+        found[seen] = _SPREAD * np.min([np.nanmedian(np.abs(size), 0) for size in sizes], 0)
+        return found
+
+    def _with_residual(
+        self, belief: Assimilated, parts: Sequence[Segments], rng: np.random.Generator
+    ) -> Assimilated:  # fmt: skip
         """What replays under the belief miss, a control step."""
-        ends = self._ends(segments, rng.multivariate_normal(belief.mean, belief.covariance, DRAWS), None)
-        missed = self.machine.difference(segments.last[None], ends) / segments.actions.shape[1]
+        z = belief.near().coordinates(DRAWS, rng)
+        off = [self.machine.difference(p.last[None], self._ends(p, z, None)) / p.actions.shape[1] for p in parts]
+        missed = np.concatenate(off, 1)
         missed = np.nanmean(np.where(np.isfinite(missed), missed, np.nan), 0) * told(self.machine)
         spread = missed.std(0, ddof=1) / np.sqrt(len(missed))
         return replace(belief, delta=missed.mean(0), spread=spread)

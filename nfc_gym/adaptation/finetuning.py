@@ -41,7 +41,7 @@ class FineTuneConfig:
 
     Attributes:
       steps: control steps of all simulations together.
-      envs: simulations.
+      envs: simulations; so few that each comes to the end of an episode between two points of the curve.
       vary: sizes of effects and psi are uniform over this multiple of their 95 % intervals; 0 is the fitted ones.
       episode: control steps of the episodes that judge; None is the environment's own. Learning takes the shorter ones
         of the robot's `Recipe`, where that has such.
@@ -51,7 +51,7 @@ class FineTuneConfig:
     """
 
     steps: int = 500_000
-    envs: int = 256
+    envs: int = 64
     vary: float = 1.0
     episode: int | None = None
     every: int = 8
@@ -91,13 +91,12 @@ class FineTuning:
         self.policy, self.extension, self.config = policy, extension, config
         self.path, self.of, self.threads, self.record = folder / STATE, of, threads, record
         recipe = recipe_of(extension.environment)
-        self.ppo = replace(recipe.ppo, rate=_RATE)
+        self.ppo = replace(recipe.ppo, rate=_RATE, together=_TOGETHER)
         self.whole = config.episode or gymnasium.spec(extension.environment).max_episode_steps or 1000
         self.episode = min(recipe.episode, self.whole)
         self.network = policy.network
         self.device = self.network.scale.mean.device
         self.learner = OnPolicy(clipped(self.network.actor, self.network.critic, self.ppo), self.ppo)
-        self.learner.horizon = min(max(_TOGETHER // config.envs, 16), 64)
         self.best = copy.deepcopy(self.network)
         self.steps, self.curve, self.diverged = 0, [], None
         self._envs: dict[str, VectorEnv] = {}
@@ -137,7 +136,8 @@ class FineTuning:
         env = torchrl_env(VectorSight(staggered, self.policy.sight))
         env.set_seed(mixed(config.seed, *at, 2) % 2**31)
         told: dict[str, float] = {}
-        for batch in islice(batches(env, self.network.actor, self.learner.horizon, self.device), config.every):
+        drawn = batches(env, self.network.actor, self.learner.horizon(config.envs), self.device)
+        for batch in islice(drawn, config.every):
             told = self.learner.learn(batch)
             self.steps += batch.numel()
             said = f"{self.steps:,}/{config.steps:,} steps in {config.envs} worlds  {in_words(_shown(self.curve[-1]))}"

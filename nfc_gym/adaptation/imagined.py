@@ -15,6 +15,7 @@ from nfc_gym.core.posterior import Sampler
 from nfc_gym.wrappers import (
     VectorApplyEffects,
     VectorHallucinate,
+    VectorPerturbSignals,
     VectorRandomizePsi,
     VectorResidualDynamics,
     VectorResidualTerrain,
@@ -39,7 +40,8 @@ class Parts:
         return Fidelity(**{part: getattr(drawn, part) for part in self.parts})
 
 
-EFFECTS = "effects"  # what a belief may have besides the parts of a fidelity: `effects(n, rng)`
+# What a belief may have besides the parts of a fidelity: `effects(n, rng)`, and standard deviations of what is sensed.
+EFFECTS, NOISE = "effects", "noise"
 
 
 def spoken(posterior: Sampler, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -48,9 +50,9 @@ def spoken(posterior: Sampler, wanted: Sequence[str]) -> tuple[str, ...]:
     Raises:
       InputError: of none.
     """
-    wrong = [p for p in wanted if p not in (*PARTS, EFFECTS)]
+    wrong = [p for p in wanted if p not in (*PARTS, EFFECTS, NOISE)]
     if wrong:
-        raise InputError(f"adapt: no part {wrong[0]!r} of a belief; there are: {', '.join((*PARTS, EFFECTS))}")
+        raise InputError(f"adapt: no part {wrong[0]!r} of a belief; there are: {', '.join((*PARTS, EFFECTS, NOISE))}")
     given = posterior.sample(2, np.random.default_rng(0)).given
     found = tuple(p for p in wanted if p in given)
     if not found:
@@ -69,7 +71,7 @@ def imagined(
       belief: a posterior given what was observed.
       n: simulations.
       hallucinate: widen the action by pi_h; else each episode draws from the belief itself.
-      parts: of the belief, those that are used where it speaks of them: of a fidelity, and `effects`.
+      parts: of the belief, those that are used where it speaks of them: of a fidelity, `effects` and `noise`.
       beta: see `Hallucinate`.
       episode: control steps.
       threads: of the physics.
@@ -78,6 +80,7 @@ def imagined(
       settings: of the environment.
     """
     found = spoken(belief, parts)
+    belief = getattr(belief, "near", lambda: belief)()
     envs: VectorEnv = vector_env(environment, n, threads=threads, episode=episode, **(settings or {}))
     if "delta_e" in found and envs.unwrapped.rough:  # type: ignore[attr-defined]
         envs = VectorResidualTerrain(envs, Parts(belief, ("delta_e",)))
@@ -87,6 +90,9 @@ def imagined(
     if acting:  # each simulation has sizes of its own
         values = [v for _, v in acting]
         envs = VectorApplyEffects(envs, [(e, v.mean(0)) for e, v in acting], values=values)
+    noise = getattr(belief, NOISE, None)
+    if NOISE in parts and noise is not None:
+        envs = VectorPerturbSignals(envs, {"proprio": {"sd": noise.tolist()}})
     if hallucinate and moving:
         envs = VectorHallucinate(envs, Parts(belief, moving), beta=beta)
     else:

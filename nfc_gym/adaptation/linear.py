@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 
 Array = NDArray[np.float64]
-QUIET = 0.05  # of the variance that is assumed of ends, at least
+QUIET = 0.02  # of the sensors' variance, at least
+_NONE = 1e-3  # of a variance, which is as good as none
 LOST = 1e3  # of the sensors' noise, by which a replay that came apart counts as off
 
 
@@ -63,14 +64,20 @@ def regressed(z: Array, off: Array) -> Linear:
 
 
 def as_seen(noise: Array, off: Array) -> Array:
-    """Noise (n, k, k) of segments, scaled entry by entry to what the best replays miss, (n, k).
+    """Noise (n, k, k) of segments' ends, in units of the sensors', scaled entry by entry to what replays miss, (n, k).
 
-    What nothing in the model explains says nothing of the model's parameters, and counts as noise; and where starts are
-    known better than was assumed, there is less of it.
+    Of the variance of each entry 1 is the sensor's; the rest, of start, motors and map, is correlated. What is missed
+    beyond the sensor's is taken for the rest, however much that was assumed to be: what nothing in the model explains
+    says nothing of its parameters. Where less is missed than sensors were thought to add, sensors are better.
     """
-    squared = (np.where(np.isfinite(off), off, LOST) ** 2).mean(0) / np.diagonal(noise, axis1=1, axis2=2).mean(0)
-    share = np.sqrt(np.maximum(squared, QUIET))
-    return share[:, None] * noise * share
+    missed = (np.where(np.isfinite(off), off, LOST) ** 2).mean(0)
+    rest = noise - np.eye(noise.shape[-1])
+    sensor = np.clip(missed, QUIET, 1.0)
+    assumed = np.diagonal(rest, axis1=1, axis2=2).mean(0)
+    times = np.maximum(missed - sensor, 0) / np.maximum(assumed, _NONE) + _NONE
+    beyond = np.maximum(missed - sensor - times * assumed, 0)  # where nothing was assumed that could be more
+    share = np.sqrt(times)
+    return share[:, None] * rest * share + np.diag(sensor + beyond)
 
 
 def cost(z: Array, prior: Array, off: Array, noise: Array) -> Array:

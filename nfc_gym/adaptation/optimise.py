@@ -61,7 +61,7 @@ def optimise(
     if isinstance(worlds, RayWorlds):
         worlds.restarted = episodes.forget
     try:
-        with closing(gathered(worlds, actor, learner.horizon, agent.device, mixed(seed, 1))) as drawn:
+        with closing(gathered(worlds, actor, learner.horizon(worlds.num_envs), agent.device, mixed(seed, 1))) as drawn:
             while done < steps:
                 batch = next(drawn)
                 if pi_h is not None and pi_h.scale.count == 0:

@@ -17,6 +17,7 @@ Actor = ProbabilisticTensorDictSequential
 _TOLD = ("loss_critic", "kl_approx", "clip_fraction")
 _SLOWEST, _FASTEST = 1e-5, 2e-3  # step sizes
 _RUNAWAY = 5.0  # nats between two policies of one iteration: nothing that was learned so far is left
+_SHORTEST, _LONGEST = 16, 128  # control steps of a simulation in an iteration
 _FORGET = 0.98  # an iteration's share of the past in the size of rewards
 
 
@@ -36,6 +37,7 @@ class PPOConfig:
       divergence: nats that the policy should move an iteration; the step size is led there.
       entropy: weight of the bonus.
       norm: gradients are cut to this.
+      together: control steps of all simulations in an iteration.
     """
 
     gamma: float = 0.99
@@ -47,6 +49,7 @@ class PPOConfig:
     divergence: float = 0.01
     entropy: float = 0.002
     norm: float = 1.0
+    together: int = 4096
 
 
 def summed(losses: TensorDictBase) -> Tensor:
@@ -91,18 +94,17 @@ class OnPolicy:
     Args:
       loss: a TorchRL loss with a critic of state values, `clipped` or another of its on-policy ones.
       config: see `PPOConfig`; `clip` and `entropy` are of the loss.
-
-    Attributes:
-      horizon: control steps of each simulation that it wants in a batch.
     """
-
-    horizon = 32
 
     def __init__(self, loss: LossModule, config: PPOConfig) -> None:
         self.config, self.loss = config, loss
         loss.make_value_estimator(ValueEstimators.GAE, gamma=config.gamma, lmbda=config.trace)
         self.optimiser = torch.optim.Adam(loss.parameters(), lr=config.rate, eps=1e-5)
         self.power = Power().to(next(loss.parameters()).device)
+
+    def horizon(self, n: int) -> int:
+        """Control steps that it wants of each of n simulations in a batch."""
+        return min(max(self.config.together // n, _SHORTEST), _LONGEST)
 
     @property
     def rate(self) -> float:

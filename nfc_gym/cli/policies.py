@@ -104,7 +104,7 @@ def adapt(
         typer.Option(metavar="PATH", help="Plays the machine, a path as --effects: judged in, never learned from."),
     ] = None,
     steps: Annotated[int, typer.Option(metavar="N", min=1, help="Of all simulations together.")] = 500_000,
-    envs: Annotated[int, typer.Option(min=1, help="Simulations at once.")] = 256,
+    envs: Annotated[int, typer.Option(min=1, help="Simulations at once.")] = 64,
     vary: Annotated[
         float,
         typer.Option(

@@ -44,10 +44,10 @@ def driven(psi: dict[str, float], steps: int = 100) -> Trajectory:
     return driven_in(gym.make("nfc_gym/JackalFlat-v0", context=["psi"]), psi, steps)
 
 
-def driven_in(env: Any, psi: dict[str, float], steps: int) -> Trajectory:
+def driven_in(env: Any, psi: dict[str, float], steps: int, seed: int = 1) -> Trajectory:
     """The same in an environment."""
     observation, _ = env.reset(seed=0, options={"psi": psi})
-    rng, action, data = np.random.default_rng(1), np.zeros(2), env.unwrapped.data
+    rng, action, data = np.random.default_rng(seed), np.zeros(2), env.unwrapped.data
     states, estimate, actions = [observation["proprio"]], [np.concatenate([data.qpos, data.qvel])], []
     for _ in range(steps):
         action = np.clip(0.9 * action + 0.3 * rng.standard_normal(2), -1, 1)

@@ -11,7 +11,7 @@ LESS = {
     "max_episode_steps=400": "max_episode_steps=60",
     "range(60)": "range(4)",
     "rate=0.05": "rate=0.9",
-    "missions=10, worlds=256, steps=500_000": "missions=1, worlds=4, steps=256",
+    "missions=10, worlds=64, steps=500_000": "missions=1, worlds=4, steps=256",
     "threshold=limit": "threshold=0.9 * limit",
 }
 

@@ -35,10 +35,14 @@ def test_a_linear_robot_is_found_and_what_came_apart_is_left_out() -> None:
         regressed(z, np.full_like(off, np.nan))
 
 
-def test_noise_is_what_the_best_replays_miss() -> None:
+def test_noise_is_what_the_best_replays_miss_and_sensors_keep_theirs() -> None:
     rng = np.random.default_rng(1)
-    noise = np.tile([[1.0, 0.5], [0.5, 1.0]], (4000, 1, 1))
-    found = as_seen(noise, rng.standard_normal((4000, 2)) * (3.0, 0.01))
-    np.testing.assert_allclose(found[0, 0, 0], 9.0, rtol=0.1)
-    np.testing.assert_allclose(found[0, 1, 1], QUIET)
-    np.testing.assert_allclose(found[0, 0, 1], 0.5 * np.sqrt(found[0, 0, 0] * QUIET), rtol=1e-9)
+    rest = np.array([[4.0, 1.0, 0.0], [1.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
+    noise = np.tile(np.eye(3) + rest, (4000, 1, 1))
+    found = as_seen(noise, rng.standard_normal((4000, 3)) * (3.0, 0.01, 2.0))[0]
+    np.testing.assert_allclose(found[0, 0], 9.0, rtol=0.1)
+    np.testing.assert_allclose(found[1, 1], QUIET, rtol=0.3, err_msg="better sensors than were assumed")
+    np.testing.assert_allclose(found[2, 2], 4.0, rtol=0.1, err_msg="where nothing but the sensor was assumed")
+    assert np.linalg.eigvalsh(found).min() > 0.9 * QUIET
+    quiet = as_seen(noise, rng.standard_normal((4000, 3)))[0]
+    np.testing.assert_allclose(quiet, np.eye(3), atol=0.1, err_msg="sensors' noise alone, and none of the rest")

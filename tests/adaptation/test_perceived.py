@@ -79,7 +79,7 @@ def test_the_belief_is_as_with_the_true_ground(
     driven: tuple[Trajectory, Heightfield], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 11)
-    monkeypatch.setattr("nfc_gym.adaptation.assimilation.ROUNDS", 4)
+    monkeypatch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4, 0.4, 0.2))
     trajectory, true = driven
     perceived, given = (
         Assimilation(ROUGH, ground=g, delta_s=False, effects=False).infer(trajectory) for g in (None, true)

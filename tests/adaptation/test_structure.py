@@ -14,7 +14,7 @@ from nfc_gym.adaptation.structure import names, structure_of
 from nfc_gym.physics.effects import build
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.residuals import Given, Residuals
-from nfc_gym.wrappers import ApplyEffects
+from nfc_gym.wrappers import ApplyEffects, PerturbSignals
 
 ID = "nfc_gym/JackalFlat-v0"
 DRIVES = "front_left+front_right+rear_left+rear_right"
@@ -98,3 +98,62 @@ def test_worlds_of_a_belief_have_its_effects_each_in_a_size_of_its_own() -> None
         worlds.close()
     assert np.ptp(ways[0]) > 0
     assert ways[0].mean() < ways[1].mean(), "late commands bring a rover less far"
+
+
+def test_sensors_noise_is_found_and_worlds_have_it() -> None:
+    q = Assimilation(ID)
+    sd = np.where(q.machine.noise > 0, 3 * q.machine.noise, 0.0)
+    noisy = PerturbSignals(gym.make(ID, context=["psi"]), {"proprio": {"sd": sd.tolist()}})
+    belief = q.infer(driven_in(noisy, {}, 200))
+    assert belief.noise is not None
+    assert (belief.noise[q.machine.noise == 0] == 0).all(), "where no sensor is"
+    found = belief.noise[sd > 0] / sd[sd > 0]
+    assert 0.7 < np.median(found) < 1.5, found
+    seen = {}
+    for parts in (("psi", "noise"), ("psi",)):
+        worlds = imagined(ID, belief, 32, hallucinate=False, parts=parts, beta=1.0, episode=50, threads=1, seed=0)
+        observation, _ = worlds.reset(seed=0)
+        seen[parts] = observation["observation"][:, : len(sd)]
+        worlds.close()
+    off = (seen["psi", "noise"] - seen[("psi",)]).std(0)
+    np.testing.assert_allclose(off[sd > 0], belief.noise[sd > 0], rtol=0.5)
+    assert (off[sd == 0] == 0).all()
+
+
+def test_worlds_are_drawn_where_replays_do_as_was_seen() -> None:
+    q = Assimilation(ID, delta_s=False)
+    trajectory = driven_in(late(0.08), {}, 200)
+    belief = q.infer(trajectory)
+    near = belief.near()
+    assert belief.share < 1
+    segments, rng = q.segments(trajectory), np.random.default_rng(0)
+    seen = q.machine.noise > 0
+    off = {}
+    for name, of in (
+        ("mean", belief.mean[None]),
+        ("near", near.coordinates(8, rng)),
+        ("all", belief.coordinates(8, rng)),
+    ):
+        off[name] = np.median((q._misses([segments], of, seen, q.machine.noise[seen]) ** 2).mean((1, 2)))
+    assert off["near"] < 2 * off["mean"]
+    assert off["near"] < 0.5 * off["all"]
+    d = len(q.machine.space)
+    assert not near.covariance[:d, d:].any(), "psi and effects are drawn apart"
+
+
+def test_what_is_remembered_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 12)
+    monkeypatch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4))
+    first, second = (driven_in(late(0.08), {}, 120, seed) for seed in (3, 4))
+    q = Assimilation(ID, delta_s=False, memory=2)
+    alone = q.infer(second)
+    both = q.updated(first, alone).infer(second)
+    seen = q.machine.noise > 0
+    means = np.stack([alone.mean, both.mean])
+    off = np.sqrt((q._misses([q.segments(first)], means, seen, q.machine.noise[seen]) ** 2).mean((1, 2)))
+    assert off[1] < off[0], "the first trajectory is explained better by a belief that remembers it"
+    for _ in range(3):
+        q = q.updated(first, alone)
+    assert len(q.remembered) == 2
+    forgetful = Assimilation(ID, delta_s=False, memory=0)
+    np.testing.assert_array_equal(forgetful.updated(first, alone).infer(second).mean, alone.mean)
