@@ -8,7 +8,8 @@ Table II: return in a hidden world of each environment, between a random policy 
 (1), the paper's min-max normalisation beside. Table III: the Jackal's broken axle on a figure of eight, in the paper's
 scenarios. With `--counting` Table II takes the worlds that `hidden_worlds.py --find K --json FILE` has found to count.
 Every cell (table, world, method, seed) is kept in --out, so the same command goes on where it was stopped; `--stop
-SECONDS` begins no new cell after that time. What is hidden is drawn from `--seed`, itself drawn once and kept.
+SECONDS` begins no new cell after that time. `--beside DIR` shows an earlier run's random policy, unadapted policy and
+oracle in the same worlds, where --out has none. What is hidden is drawn from `--seed`, itself drawn once and kept.
 Pretrained policies are those that `pretrain.py --out DIR` made, else the package's; posteriors (also .npz) and
 detectors are `<place>.safetensors` in their folders; so are TD-MPC2's world models, which `tdmpc2_pretrain.py` makes.
 The control rate is that of one robot's decisions on this machine.
@@ -52,6 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         kept = Kept(out, {"seed": args.seed, "episodes": args.episodes, "steps": args.steps, "envs": args.envs,
                           "executed": args.executed, "task": args.task, "engine": args.engine})  # fmt: skip
         cells = filled(args, kept, out, began)
+        if args.beside:
+            references(args, cells)
         rng = np.random.default_rng(0)
         parts = [table(cells, args.methods, rng) for table in (tables.table_two, tables.table_three)]
         text = "\n".join(t for t, _ in parts if t) + f"\n{paper.CAVEAT}\n"
@@ -90,6 +93,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--threads", type=int, default=0, help="of the physics; 0 is all")
     add("--device", default="cpu")
     add("--seed", type=int, help="of what is hidden; default drawn once, and kept in --out")
+    add("--beside", type=Path, metavar="DIR", help="--out of an earlier run, perhaps with another budget")
     add("--stop", type=float, metavar="SECONDS")
     add("--out", type=Path, metavar="DIR")
     add("--json", type=Path, metavar="FILE")
@@ -180,6 +184,16 @@ def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tab
             cells.add((table, world.place, world.scenario, world.seed, seed), method, cell)
             print(f"{name}: {told(cell)}, {time.monotonic() - start:.0f} s", flush=True)
     return cells
+
+
+def references(args: argparse.Namespace, cells: tables.Cells) -> None:
+    """What a table is measured by, from an earlier run in the same worlds, where this one has none."""
+    for table, world, _, seed in asked(args):
+        key = (table, world.place, world.scenario, world.seed, seed)
+        for method in ("random", "unadapted", "oracle"):
+            file = args.beside / "cells" / f"{table}_{world.name}_{method}_{seed}.json"
+            if file.is_file() and method not in cells.found.get(key, {}):
+                cells.add(key, method, json.loads(file.read_text()))
 
 
 def files(args: argparse.Namespace, place: str) -> tuple[str, str | None, str | None, str | None]:

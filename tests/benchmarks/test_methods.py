@@ -127,3 +127,23 @@ def test_algorithm_one_runs_in_a_hidden_world(tmp_path: Path) -> None:
     assert len(cell["curve"]) == 1  # of the one mission
     assert cell["notes"]["anomalies"] == 1
     assert (tmp_path / "states").is_dir()
+
+
+def test_a_table_takes_its_references_from_an_earlier_run(tmp_path: Path) -> None:
+    import json
+
+    import policies
+    from worlds import tables
+
+    (tmp_path / "cells").mkdir()
+    for method in ("random", "oracle", "nfc"):
+        file = tmp_path / "cells" / f"II_JackalFlat_axle_5_{method}_0.json"
+        file.write_text(json.dumps({"curve": [[0, 1.0]]}))
+    said = ["--tables", "II", "--places", "JackalFlat", "--scenario", "axle", "--seed", "5", "--seeds", "0"]
+    args = policies.parse([*said, "--beside", str(tmp_path)])
+    cells, own = tables.Cells(), {"curve": [[0, 2.0]]}
+    key = ("II", "JackalFlat", "axle", 5, 0)
+    cells.add(key, "oracle", own)
+    policies.references(args, cells)
+    assert set(cells.found[key]) == {"random", "oracle"}
+    assert cells.found[key]["oracle"] is own
