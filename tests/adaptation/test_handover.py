@@ -26,7 +26,7 @@ ROWS = [
     | {"parameters": {"fraction": {"value": 0.7, "low": 0.6, "high": 0.8, "unit": "1"}}},
     {"family": "sensor_bias", "where": "joint:rear_left_wheel:vel", "parameters": {"bias": 0.1}},
 ]  # fmt: skip
-SMALL: dict[str, Any] = {"envs": 8, "episode": 40, "every": 1, "curve": 2}  # 512 steps an iteration
+SMALL: dict[str, Any] = {"envs": 4, "episode": 40, "every": 1, "curve": 2}  # 512 steps an iteration
 STEPS = 1536
 
 
