@@ -17,9 +17,11 @@ from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.residuals import Given, candidates
 
 Array = NDArray[np.float64]
-# Families that are asked for, at which of their places: everything of its kind together, or each place alone. They are
-# those of one size, or of one vector, whose absence is an inner or outer point of a line: a Gaussian belief fits them.
+# Families that are asked for, at which of their places: everything of its kind together, several like places together
+# (all knees), or each place alone. They are those of one size, or of one vector, whose absence is an inner or outer
+# point of a line: a Gaussian belief fits them.
 TOGETHER = ("delay", "lag")
+ALIKE = ("gain", "saturation")
 ALONE = ("coulomb", "gain", "armature")
 ON_THE_BASE = ("external_force", "com_shift", "drag_linear")
 _REACH = 3.0  # realistic sizes of the library at z = 1, of what has one sign
@@ -87,7 +89,7 @@ def structure_of(machine: Machine, families: Sequence[str] = ()) -> Structure:
     Raises:
       InputError: a family that is not asked for.
     """
-    known = (*TOGETHER, *ALONE, *ON_THE_BASE)
+    known = tuple(dict.fromkeys((*TOGETHER, *ALIKE, *ALONE, *ON_THE_BASE)))
     odd = [f for f in families if f not in known]
     if odd:
         raise InputError(f"structure: no family {odd[0]!r}; want some of: {', '.join(known)}")
@@ -101,10 +103,11 @@ def structure_of(machine: Machine, families: Sequence[str] = ()) -> Structure:
 def _asked(effect: Effect, machine: Machine, base: str) -> bool:
     if effect.family in ON_THE_BASE:
         return effect.where == (base,)
-    count = machine.model.nu if effect.family in TOGETHER else 1
+    if effect.family in TOGETHER:
+        return len(effect.where) == machine.model.nu
     driven = {machine.model.joint(int(j)).name for j in machine.model.actuator_trnid[:, 0] if j >= 0}
-    fits = effect.family not in ("coulomb", "armature") or effect.where[0] in driven
-    return len(effect.where) == count and fits
+    alone = len(effect.where) == 1 and (effect.family not in ("coulomb", "armature") or effect.where[0] in driven)
+    return (effect.family in ALIKE and len(effect.where) > 1) or (effect.family in ALONE and alone)
 
 
 def _size(i: int, effect: Effect) -> Size:

@@ -29,7 +29,7 @@ def test_sizes_are_absent_at_their_null_and_stay_within_bounds() -> None:
         one_sided = [not s.low < s.null < s.high for s in sizes]
         np.testing.assert_allclose(values[0, one_sided], effect.null[one_sided], atol=1e-12)
     both = structure_of(Machine(ID), ["gain", "delay"])
-    assert len(both) == 5
+    assert len(both) == 6, "a gain for each drive and one for all, and a delay"
     assert f"delay:{DRIVES}.delay" in names(both)
     with pytest.raises(InputError, match="no family 'ghost'"):
         structure_of(Machine(ID), ["ghost"])
@@ -90,11 +90,12 @@ def test_worlds_of_a_belief_have_its_effects_each_in_a_size_of_its_own() -> None
         size = worlds.single_action_space.shape
         assert size is not None
         action = np.zeros((6, size[0]))
-        action[:, 0] = 1.0
-        for _ in range(4):
-            worlds.step(action)
         base: Any = worlds.unwrapped
-        ways.append(np.array(base.batch.bind("qpos"))[:, 0])
+        start = np.array(base.batch.bind("qpos"))[:, :2]
+        for k in range(12):
+            action[:, 0] = float(k > 1)  # from rest: what was commanded before an episode is its first command
+            worlds.step(action)
+        ways.append(np.linalg.norm(np.array(base.batch.bind("qpos"))[:, :2] - start, axis=1))
         worlds.close()
     assert np.ptp(ways[0]) > 0
     assert ways[0].mean() < ways[1].mean(), "late commands bring a rover less far"
