@@ -8,8 +8,9 @@ Table II: return in a hidden world of each environment, between a random policy 
 (1), the paper's min-max normalisation beside. Table III: the Jackal's broken axle on a figure of eight, in the paper's
 scenarios. With `--counting` Table II takes the worlds that `hidden_worlds.py --find K --json FILE` has found to count.
 Every cell (table, world, method, seed) is kept in --out, so the same command goes on where it was stopped; `--stop
-SECONDS` begins no new cell after that time. `--beside DIR` shows an earlier run's random policy, unadapted policy and
-oracle in the same worlds, where --out has none. What is hidden is drawn from `--seed`, itself drawn once and kept.
+SECONDS` begins no new cell after that time. `--beside DIR` takes the random policy, the unadapted policy and the oracle
+of an earlier run in the same worlds, of all its seeds, and runs none. What is hidden is drawn from `--seed`, itself
+drawn once and kept.
 Pretrained policies are those that `pretrain.py --out DIR` made, else the package's; posteriors (also .npz) and
 detectors are `<place>.safetensors` in their folders; so are TD-MPC2's world models, which `tdmpc2_pretrain.py` makes.
 The control rate is that of one robot's decisions on this machine.
@@ -38,6 +39,7 @@ from worlds.methods import METHODS, Job, run
 from worlds.scenarios import TABLE_III
 from worlds.world import ENGINES, World
 
+REFERENCES = ("random", "unadapted", "oracle")  # what returns are measured by
 PLACES = tuple(f"{robot}{ground}" for robot in paper.ROBOTS for ground in paper.GROUNDS)
 
 
@@ -171,7 +173,7 @@ def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tab
     budget = Budget(args.envs, args.steps, args.budget, args.executed, judged, points, args.threads, args.device,
                     args.ratio)  # fmt: skip
     for table, world, task, seed in asked(args):
-        for method in args.methods:
+        for method in [m for m in args.methods if not (args.beside and m in REFERENCES)]:
             if args.stop and time.monotonic() - began > args.stop:
                 print("time is up: the same command goes on")
                 return cells
@@ -187,12 +189,11 @@ def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tab
 
 
 def references(args: argparse.Namespace, cells: tables.Cells) -> None:
-    """What a table is measured by, from an earlier run in the same worlds, where this one has none."""
-    for table, world, _, seed in asked(args):
-        key = (table, world.place, world.scenario, world.seed, seed)
-        for method in ("random", "unadapted", "oracle"):
-            file = args.beside / "cells" / f"{table}_{world.name}_{method}_{seed}.json"
-            if file.is_file() and method not in cells.found.get(key, {}):
+    """What a table is measured by, of all seeds of an earlier run in the same worlds."""
+    for table, world in dict.fromkeys((table, world) for table, world, *_ in asked(args)):
+        for method in REFERENCES:
+            for file in sorted((args.beside / "cells").glob(f"{table}_{world.name}_{method}_*.json")):
+                key = (table, world.place, world.scenario, world.seed, int(file.stem.rpartition("_")[2]))
                 cells.add(key, method, json.loads(file.read_text()))
 
 
