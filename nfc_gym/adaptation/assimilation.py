@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
@@ -213,6 +214,7 @@ class Assimilation:
           InputError: it is shorter than a segment, of another robot, tells no state to start from, or on rough ground
             neither it nor `ground` says what is underfoot.
         """
+        mujoco.set_mju_user_warning(lambda message: None)  # draws that come apart are left out, not talked about
         most = SEGMENTS // max(1, len(self.remembered))
         parts = [*(self.segments(earlier, most) for earlier in self.remembered), self.segments(trajectory)]
         rng, seen = np.random.default_rng(self.seed), told(self.machine)
