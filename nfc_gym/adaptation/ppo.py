@@ -1,6 +1,8 @@
-"""PPO on TorchRL's clipped loss, advantage estimator and replay buffer; the step size follows the divergence."""
+"""PPO on TorchRL's clipped loss, advantages and replay buffer; the step size of the actor follows the divergence."""
 
+import math
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -17,6 +19,8 @@ Actor = ProbabilisticTensorDictSequential
 _TOLD = ("loss_critic", "kl_approx", "clip_fraction")
 _SLOWEST, _FASTEST = 1e-5, 2e-3  # step sizes
 _RUNAWAY = 5.0  # nats between two policies of one iteration: nothing that was learned so far is left
+_BAND = 1.5  # either way, within which the divergence is as wanted; by which the step size changes beyond
+_FAR = 2.0  # times the divergence that is wanted, after which an iteration goes no further
 _SHORTEST, _LONGEST = 16, 128  # control steps of a simulation in an iteration
 _FORGET = 0.98  # an iteration's share of the past in the size of rewards
 
@@ -33,8 +37,10 @@ class PPOConfig:
       gamma, trace: discount a control step, and lambda of the generalised advantage.
       clip: of the ratio of densities.
       epochs, minibatches: passes over an iteration's steps, and parts of each.
-      rate: first step size.
-      divergence: nats that the policy should move an iteration; the step size is led there.
+      rate: first step size of the actor.
+      critic_rate: step size of the critic, which stays: what is led by how far the policy moves may be far too small
+        to learn values with.
+      divergence: nats that the policy should move an iteration; the actor's step size is led there.
       entropy: weight of the bonus.
       norm: gradients are cut to this.
       together: control steps of all simulations in an iteration.
@@ -46,7 +52,8 @@ class PPOConfig:
     epochs: int = 5
     minibatches: int = 4
     rate: float = 3e-4
-    divergence: float = 0.01
+    critic_rate: float = 1e-3
+    divergence: float = 0.02
     entropy: float = 0.002
     norm: float = 1.0
     together: int = 4096
@@ -93,13 +100,17 @@ class OnPolicy:
 
     Args:
       loss: a TorchRL loss with a critic of state values, `clipped` or another of its on-policy ones.
-      config: see `PPOConfig`; `clip` and `entropy` are of the loss.
+      config: see `PPOConfig`; `clip` and `entropy` are of the loss, and the step size of one that does not tell its
+        divergence stays.
     """
 
     def __init__(self, loss: LossModule, config: PPOConfig) -> None:
         self.config, self.loss = config, loss
         loss.make_value_estimator(ValueEstimators.GAE, gamma=config.gamma, lmbda=config.trace)
-        self.optimiser = torch.optim.Adam(loss.parameters(), lr=config.rate, eps=1e-5)
+        critic = [p for name, p in loss.named_parameters() if name.startswith("critic_network")]
+        others = [p for name, p in loss.named_parameters() if not name.startswith("critic_network")]
+        groups = [{"params": others}, {"params": critic, "lr": config.critic_rate}]
+        self.optimiser = torch.optim.Adam(groups, lr=config.rate, eps=1e-5)
         self.power = Power().to(next(loss.parameters()).device)
 
     def horizon(self, n: int) -> int:
@@ -108,13 +119,12 @@ class OnPolicy:
 
     @property
     def rate(self) -> float:
-        """The present step size."""
+        """The actor's present step size."""
         return self.optimiser.param_groups[0]["lr"]
 
     @rate.setter
     def rate(self, value: float) -> None:
-        for group in self.optimiser.param_groups:
-            group["lr"] = min(max(value, _SLOWEST), _FASTEST)
+        self.optimiser.param_groups[0]["lr"] = min(max(value, _SLOWEST), _FASTEST)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """One iteration.
@@ -123,16 +133,35 @@ class OnPolicy:
           batch: (n, T) steps in the order in which they were taken.
 
         Returns:
-          Means over the updates: losses, `divergence` in nats, `clipped` share, step size.
+          Means over the updates: losses, `divergence` in nats, `clipped` share, step size; NaN is what the loss does
+          not tell.
 
         Raises:
           Diverged: a loss is not finite, or the policy ran away.
         """
         steps = self._prepared(batch)
         buffer = self._filled(steps)
-        rows = [self._update(buffer.sample()) for _ in range(self.config.epochs * self.config.minibatches)]
+        rows: list[tuple[float, float, float, float]] = []
+        moved = math.nan
+        for _ in range(self.config.epochs):
+            rows += [self._update(buffer.sample()) for _ in range(self.config.minibatches)]
+            moved = fmean(row[2] for row in rows[-self.config.minibatches :])
+            if moved > _FAR * self.config.divergence:
+                break
+        self._lead(moved)
         mean = torch.tensor(rows).mean(0).tolist()
         return dict(zip(("loss", "critic_loss", "divergence", "clipped"), mean, strict=True)) | {"rate": self.rate}
+
+    def _lead(self, moved: float) -> None:
+        """The actor's next step size, from the nats that an iteration's last pass saw the policy moved by.
+
+        It changes between iterations alone: the divergence begins anew with each, so that a size that followed it from
+        update to update would soar in the first few and be next to nothing in all others.
+        """
+        if moved > _BAND * self.config.divergence:
+            self.rate /= _BAND
+        elif moved < self.config.divergence / _BAND:
+            self.rate *= _BAND
 
     def _filled(self, steps: TensorDictBase) -> ReplayBuffer:
         """A buffer of these steps; a new one each time, whose order follows from the present seed alone."""
@@ -160,19 +189,16 @@ class OnPolicy:
     def _update(self, steps: TensorDictBase) -> tuple[float, float, float, float]:
         losses = self.loss(steps)
         total = summed(losses)
-        told = [losses.get(key, torch.zeros(())).mean().to(total.device) for key in _TOLD]
-        row = torch.stack([total, *told])
-        loss, critic, divergence, clipped = row.detach().tolist()
-        if not row.isfinite().all():
+        untold = torch.full((), math.nan)  # some losses do not say how far they moved the policy
+        told = [losses.get(key, untold).mean().to(total.device) for key in _TOLD]
+        loss, critic, divergence, clipped = torch.stack([total, *told]).detach().tolist()
+        if not math.isfinite(loss):
             raise Diverged(f"the loss is not finite ({loss:g}; of the critic {critic:g}, {divergence:g} nats moved)")
         if divergence > _RUNAWAY:
             raise Diverged(f"the policy moved by {divergence:.3g} nats within an iteration, more than {_RUNAWAY:g}")
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
-        nn.utils.clip_grad_norm_(self.loss.parameters(), self.config.norm)
+        for group in self.optimiser.param_groups:
+            nn.utils.clip_grad_norm_(group["params"], self.config.norm)
         self.optimiser.step()
-        if divergence > 2 * self.config.divergence:
-            self.rate /= 1.5
-        elif divergence < self.config.divergence / 2:
-            self.rate *= 1.5
         return loss, critic, divergence, clipped

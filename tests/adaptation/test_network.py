@@ -1,5 +1,6 @@
 """The scale of observations, the advantage of knowing one's distribution, and losses that come apart."""
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -66,6 +67,26 @@ def test_an_actor_learns_what_is_rewarded(functional: bool) -> None:
     assert after[0] > before[0] + 0.1
     assert after[0] > after[1].abs()
     assert values["rate"] > 0
+
+
+@pytest.mark.parametrize("functional", [False, True])
+@pytest.mark.parametrize(("wanted", "factor"), [(1e-9, 1 / 1.5), (10.0, 1.5)])
+def test_the_actors_step_size_changes_once_an_iteration_and_the_critics_stays(
+    functional: bool, wanted: float, factor: float
+) -> None:
+    network = ActorCritic(Sizes(3, 2, 2, (16,)))
+    config = PPOConfig(divergence=wanted)
+    loss = A2CLoss(network.actor, network.critic) if functional else clipped(network.actor, network.critic, config)
+    learner = OnPolicy(loss, config)
+    values = learner.learn(acted(network, batch()))
+    told = np.isfinite(values["divergence"])
+    assert told != functional, "A2C does not say how far it moved the policy"
+    assert learner.rate == pytest.approx(config.rate * (factor if told else 1))
+    actor, critic = learner.optimiser.param_groups
+    assert critic["lr"] == config.critic_rate
+    count = {n: sum(p.numel() for p in g["params"]) for n, g in (("actor", actor), ("critic", critic))}
+    assert count["critic"] == sum(p.numel() for p in network.value.body.parameters())
+    assert count["actor"] == sum(p.numel() for p in network.gaussian.parameters())
 
 
 def test_a_loss_that_is_not_finite_changes_nothing() -> None:
