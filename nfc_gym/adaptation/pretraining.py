@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,9 @@ class Recipe:
     ppo: PPOConfig = field(default_factory=PPOConfig)
 
 
+# Of what begins with another policy's weights: small first steps, until the critic knows what the new cells mean, and
+# little reward for exploring, since the way is known. (Quadcopter Rough unlearned its goals with a gamma of 0.995.)
+ONWARD = PPOConfig(entropy=0.001, rate=1e-4)
 RECIPES: Mapping[str, Recipe] = {
     "ant": Recipe(),
     "humanoid": Recipe(explore=0.3),
@@ -67,9 +70,10 @@ RECIPES: Mapping[str, Recipe] = {
 }
 
 
-def recipe_of(environment: str) -> Recipe:
-    """What suits the robot of an environment, by its full id."""
-    return RECIPES[environment.removeprefix("nfc_gym/").split("Flat")[0].split("Rough")[0].lower()]
+def recipe_of(environment: str, onward: bool = False) -> Recipe:
+    """What suits the robot of an environment, by its full id; `onward` where weights are there to begin with."""
+    recipe = RECIPES[environment.removeprefix("nfc_gym/").split("Flat")[0].split("Rough")[0].lower()]
+    return replace(recipe, ppo=ONWARD) if onward else recipe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +157,8 @@ def pretrain(
         torch.set_num_threads(threads)
     # With its index: a collector takes "cuda" and "cuda:0" for two devices, and would keep a copy of the policy.
     place = torch.empty(0, device=device_of(device)).device
-    run = Run(training, place, threads, Record(path.with_name(path.name + ".log"), console), cluster)
+    recipe = recipe_of(training.environment, start is not None)
+    run = Run(training, place, threads, Record(path.with_name(path.name + ".log"), console), cluster, recipe)
     run.go_on(path, steps, seconds, None if start is None else load_policy(start))
     return run.policy
 
@@ -167,6 +172,7 @@ class Run:
       threads: of the physics.
       record: what is written down.
       cluster: where the simulations are; None is here.
+      recipe: default what suits the robot.
 
     Attributes:
       policy: as it is now.
@@ -174,15 +180,16 @@ class Run:
     """
 
     def __init__(
-        self, training: Training, device: torch.device, threads: int, record: Record, cluster: Cluster | None = None
-    ) -> None:
+        self, training: Training, device: torch.device, threads: int, record: Record, cluster: Cluster | None = None,
+        recipe: Recipe | None = None,
+    ) -> None:  # fmt: skip
+        self.recipe = recipe = recipe or recipe_of(training.environment)
         self.training, self.device, self.record = training, device, record
         self.threads = threads if cluster is None else 0  # in this process
         self.steps, self.elapsed = 0, 0.0
         self.started: dict[str, Any] | None = None
         self.episodes = Episodes()
         torch.manual_seed(training.seed)
-        recipe = self.recipe
         make = partial(
             training_env, training.environment, spread=training.spread, episode=recipe.episode, settings={}
         )  # fmt: skip
@@ -199,11 +206,6 @@ class Run:
         nn.init.constant_(self.network.gaussian.log_std, math.log(recipe.explore))
         self.policy = Policy(self.envs.sight, self.network)
         self.learner = OnPolicy(clipped(self.network.actor, self.network.critic, recipe.ppo), recipe.ppo)
-
-    @property
-    def recipe(self) -> Recipe:
-        """Of the robot."""
-        return recipe_of(self.training.environment)
 
     def go_on(self, path: Path, steps: int, seconds: float | None, start: Policy | None = None) -> None:
         """Train up to so many steps in all, from the state beside `path` if there is one; then judge and save."""
