@@ -4,11 +4,11 @@
                                        [--steps N] [--envs N] [--out DIR] [--json FILE] [--quick]
 
 The reference is CleanRL's `ppo_continuous_action.py`, a script that knows nothing of this package and is no part of it:
-get it from https://github.com/vwxyzjn/cleanrl, `pip install tyro tensorboard`, and say where it is. It runs as it
-stands, with its own settings, on flat places (it looks at vectors); its actor is then judged with its own scale of
-observations. What is trained here varies psi and judges nothing on the way; the reference learns in the nominal world,
-where both are judged: 64 whole episodes without exploring. With --out finished runs are kept. `--quick` is a few
-thousand steps, of this package alone where there is no script.
+get it from https://github.com/vwxyzjn/cleanrl, `pip install tyro tensorboard`, and say where it is; under Gymnasium 1
+its `TransformObservation` wants `env.observation_space` as a third argument. It runs with its own settings on flat
+places (it looks at vectors); its actor is then judged with its own scale of observations. What is trained here varies
+psi; the reference learns in the nominal world, where both are judged: 64 whole episodes without exploring. With --out
+finished runs are kept. `--quick` is a few thousand steps, of this package alone where there is no script.
 """
 
 import argparse
@@ -41,6 +41,7 @@ from nfc_gym.adaptation import pretrain
 from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.worlds import full_id, vector_env
+from nfc_gym.core.errors import InputError
 
 EPISODES = 64
 PLAIN = "Plain-v0"  # the id that the reference is given: an environment that shows one vector
@@ -83,6 +84,11 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--script {args.script}: no such file")
     if rough := [p for p in args.places if not p.endswith("Flat")]:
         parser.error(f"--places {rough[0]}: the reference looks at vectors, want flat places")
+    for place in args.places:
+        try:
+            full_id(place)
+        except InputError as error:
+            parser.error(f"--places: {error}")
     if args.quick:
         args.places, args.seeds, args.steps, args.envs = ["AntFlat"], [0], 4096, 32
     if args.script is not None:
@@ -96,10 +102,9 @@ def cell(kept: Kept, method: str, place: str, seed: int, args: argparse.Namespac
 
     def made() -> dict[str, Any]:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            given = (
-                (place, seed, args.steps, args.envs) if method == "pretrain" else (place, seed, args.steps, args.script)
-            )
-            return pool.submit({"pretrain": ours, "reference": theirs}[method], *given).result()
+            if method == "pretrain":
+                return pool.submit(ours, place, seed, args.steps, args.envs).result()
+            return pool.submit(theirs, place, seed, args.steps, args.script).result()
 
     found = kept.once(name, made)
     print(
@@ -119,7 +124,7 @@ def ours(place: str, seed: int, steps: int, envs: int) -> dict[str, Any]:
 
 
 def theirs(place: str, seed: int, steps: int, script: Path) -> dict[str, Any]:
-    """The script as it stands; afterwards its actor and its scale of observations are looked up in it."""
+    """The script, with its own settings; afterwards its actor and its scale of observations are looked up in it."""
     torch.set_num_threads(1)
     gymnasium.register(PLAIN, partial(gymnasium.make, full_id(place), context=()))
     sys.argv = [str(script), "--env-id", PLAIN, "--seed", str(seed), "--total-timesteps", str(steps), "--no-cuda"]
@@ -127,6 +132,8 @@ def theirs(place: str, seed: int, steps: int, script: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
         left = runpy.run_path(str(script), run_name="__main__")
     seconds = time.monotonic() - began
+    if not {"agent", "envs"} <= left.keys():
+        raise InputError(f"--script {script}: it leaves no `agent` and `envs` behind, as CleanRL's does")
     scale, actor = left["envs"].envs[0].get_wrapper_attr("obs_rms"), left["agent"].actor_mean
 
     def policy(observation: Any) -> NDArray[np.float32]:

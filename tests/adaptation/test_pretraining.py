@@ -1,6 +1,7 @@
 """Pretraining: a task that is learned in seconds, files, resuming, and a loss that comes apart."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import gymnasium as gym
@@ -16,7 +17,7 @@ from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.network import ActorCritic, Sizes
 from nfc_gym.adaptation.policy import Policy, taught
 from nfc_gym.adaptation.ppo import Diverged
-from nfc_gym.adaptation.pretraining import Run, Training
+from nfc_gym.adaptation.pretraining import ONWARD, Run, Training
 from nfc_gym.adaptation.record import Episodes, Record
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.worlds import vector_env
@@ -124,6 +125,7 @@ def test_rough_ground_begins_with_a_flat_policy(tmp_path: Path, jackal: Path) ->
     again = pretrain("JackalFlat", tmp_path / "p.safetensors", steps=2048, start=jackal, **SMALL)
     assert again.about["started_from"] == {"environment": "nfc_gym/JackalFlat-v0", "steps": 2048}
     assert again.network.scale.count > flat.network.scale.count
+    assert again.about["ppo"] == asdict(ONWARD) != flat.about["ppo"]
 
 
 def test_bad_input_is_named(tmp_path: Path, jackal: Path) -> None:
