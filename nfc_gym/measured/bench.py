@@ -14,7 +14,7 @@ from nfc_gym.measured.belief import Belief
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
-from nfc_gym.measured.model import compile_model, read_spec, registered
+from nfc_gym.measured.model import bare, compile_model, read_spec, registered
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.segments import Layout, servos
 from nfc_gym.measured.shooting import RolloutProblem
@@ -36,7 +36,7 @@ class Bench:
 
     Attributes:
       spec: the model as written, to save it with corrections.
-      plant: the compiled model with psi and no effects.
+      plant: the compiled model, without what is only looked at, with psi and no effects.
       states: of every log, by name.
       belief: of a posterior that calibration starts from.
       compare: calibrate from nominal values too, to say what that saved.
@@ -110,15 +110,16 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
     if dataset.mapping.segments.timestep is not None:
         spec.option.timestep = dataset.mapping.segments.timestep
     complete_inertia(spec)  # centres of mass must be free to move: psi and effects shift them
-    model = compile_model(spec, dataset.mapping.model_file)
-    known = actuator_names(model)
-    for control in dataset.mapping.controls:
-        if control.removeprefix("ctrl:") not in known:
-            raise InputError(f"{control}: the model has no such actuator; it has: {', '.join(known) or 'none'}")
     declared = list(dataset.mapping.declared)
     robot = registered(dataset.mapping.model_file)
     if robot and not declared:
         declared = parameters_from_toml(assets.path(robot).with_name("psi.toml"))
+    compile_model(spec, dataset.mapping.model_file)  # an error speaks of the model as it was given
+    model = compile_model(bare(spec, {n for p in declared for n in p.of}), dataset.mapping.model_file)
+    known = actuator_names(model)
+    for control in dataset.mapping.controls:
+        if control.removeprefix("ctrl:") not in known:
+            raise InputError(f"{control}: the model has no such actuator; it has: {', '.join(known) or 'none'}")
     plant = Plant(model, ParameterSpace(model, declared), nthread=nthread)
     return Bench(dataset, spec, plant, {log.name: estimate_states(model, log) for log in dataset.logs})
 

@@ -1,5 +1,6 @@
 """The model that a mapping names: an MJCF or URDF file beside it, or the id of a robot of ours."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 import mujoco
@@ -68,6 +69,22 @@ def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
                 if odd.size:
                     raise InputError(f"model {name}: {before}{field} holds {odd.flat[0]}; want finite numbers")
     return model
+
+
+def bare(spec: mujoco.MjSpec, named: Collection[str] = ()) -> mujoco.MjSpec:
+    """A copy of a model without what is only looked at: it moves as the model does, to the bit, and sooner.
+
+    A robot of the package has two geoms to show for each that touches, and each step would place them all.
+
+    Args:
+      spec: the model, with complete inertias.
+      named: objects that somebody asks for by name; a geom among them that is only looked at keeps all of them.
+    """
+    out = spec.copy()
+    before = {g.name for g in out.geoms}
+    out.discard_visual()
+    gone = before - {g.name for g in out.geoms}
+    return spec.copy() if gone & set(named) else out
 
 
 def _one_line(error: Exception) -> str:

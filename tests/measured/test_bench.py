@@ -3,11 +3,14 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
+from nfc_gym import assets
 from nfc_gym.measured.bench import candidates, make_bench, scales
 from nfc_gym.measured.checks import require
+from nfc_gym.measured.model import bare
 from nfc_gym.physics.effects.each import split
 
 PUSH = 20 * np.sin(0.05)  # of a servo of 10 N m/rad whose goal leads a swing of 1 rad by 0.1 rad of phase
@@ -73,3 +76,25 @@ def test_values_of_their_own_have_bounds_of_their_own(build: Build, machine: str
 def still(table: dict[str, np.ndarray]) -> None:
     """A goal for the ankle."""
     table["still"] = np.zeros_like(table["t"])
+
+
+@pytest.mark.parametrize("robot", assets.ROBOTS)
+def test_what_is_only_looked_at_changes_no_bit_of_a_motion(robot: str) -> None:
+    spec = mujoco.MjSpec.from_file(str(assets.path(robot)))
+    whole, lean = spec.compile(), bare(spec).compile()
+    assert lean.ngeom < whole.ngeom
+    ends = []
+    for model in (whole, lean):
+        rng, data = np.random.default_rng(0), mujoco.MjData(model)
+        for _ in range(200):  # long enough for all of them to land
+            data.ctrl[:] = rng.uniform(-1, 1, model.nu)
+            mujoco.mj_step(model, data)
+        ends.append(np.concatenate([data.qpos, data.qvel]))
+    np.testing.assert_array_equal(ends[0], ends[1])
+
+
+def test_a_geom_that_is_asked_for_by_name_stays() -> None:
+    spec = mujoco.MjSpec.from_file(str(assets.path("quadruped")))
+    assert "base_shell" not in [g.name for g in bare(spec).geoms]
+    assert "base_shell" in [g.name for g in bare(spec, {"base_shell"}).geoms]
+    assert "base_shell" in [g.name for g in spec.geoms]
