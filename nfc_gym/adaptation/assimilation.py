@@ -20,22 +20,17 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
 
+from nfc_gym.adaptation.assimilated import Assimilated, Box
 from nfc_gym.adaptation.linear import Linear, as_seen, cost, regressed
 from nfc_gym.adaptation.perceived import perceived_ground
-from nfc_gym.adaptation.structure import Structure, kept, structure_of
+from nfc_gym.adaptation.replaying import Segments, replayed
+from nfc_gym.adaptation.structure import Structure, structure_of
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.errors import InputError
-from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.posterior import Sampler
-from nfc_gym.envs.simulations import Simulations
-from nfc_gym.physics.effects import Effect
 from nfc_gym.simulate.machine import MOTOR, Machine
-from nfc_gym.simulate.recorded import place
 from nfc_gym.simulate.replay import told
-from nfc_gym.simulate.residuals import Given, Residuals
-from nfc_gym.simulate.roll import step
 from nfc_gym.simulate.start import disturbed, observed
 from nfc_gym.terrain import Heightfield
 
@@ -59,104 +54,6 @@ _STEPS = np.array([1.0, 0.5, 0.2, 0.05, 0.0])  # of the way to where the linear 
 _SPARSER = 10  # times that a round asks which effects are there
 _LEAST = 0.02  # variance of the prior of an effect that is not
 _SHRUNK = 0.1  # of a covariance of few draws, towards its diagonal
-_PRESENT = 0.1  # of an effect's scale, below which it is left out of the worlds that a belief stands for
-_EDGE = 1e-4  # how near to its box's bounds psi is drawn, as a share of the box
-
-
-@dataclass(frozen=True)
-class Box:
-    """Bounds of psi, and its coordinates z in which the prior is standard normal.
-
-    Attributes:
-      low, high: (d,) physical units.
-    """
-
-    low: Array
-    high: Array
-
-    def psi(self, z: Array) -> Array:
-        """(..., d) in physical units."""
-        return self.low + (self.high - self.low) * np.clip(ndtr(z), _EDGE, 1 - _EDGE)
-
-    def z(self, psi: Array) -> Array:
-        """Its inverse."""
-        return ndtri(np.clip((psi - self.low) / (self.high - self.low), _EDGE, 1 - _EDGE))
-
-
-@dataclass(frozen=True)
-class Assimilated:
-    """A belief about psi, delta_s, and the sizes of effects that the model lacks.
-
-    Attributes:
-      box: psi's.
-      mean, covariance: of z, (d + k,) and (d + k, d + k): psi's coordinates, then those of the structure.
-      delta: (s,) mean of delta_s, a control step; None says nothing of it.
-      spread: (s,) standard deviation of that mean.
-      structure: of k sizes.
-      noise: (s,) standard deviation of `proprio` as it is sensed; None says nothing of it.
-      share: of the covariance, within which draws replay what was seen about as well as the mean does.
-    """
-
-    box: Box
-    mean: Array
-    covariance: Array
-    delta: Array | None = None
-    spread: Array | None = None
-    structure: Structure = field(default_factory=Structure)
-    noise: Array | None = None
-    share: float = 1.0
-
-    def near(self) -> "Assimilated":
-        """As wide only as draws still do what was seen.
-
-        What is believed is a bent valley, and its covariance the box around it: a draw from that box, whose psi and
-        effects moreover are drawn apart, is as a rule a robot that nothing of the trajectory speaks for.
-        """
-        d = len(self.box.low)
-        apart = self.covariance.copy()
-        apart[:d, d:] = apart[d:, :d] = 0
-        return replace(self, covariance=self.share * apart, share=1.0)
-
-    def coordinates(self, n: int, rng: np.random.Generator) -> Array:
-        """(n, d + k) draws of z."""
-        return rng.multivariate_normal(self.mean, self.covariance, n, method="cholesky")
-
-    def effects(self, n: int, rng: np.random.Generator) -> list[tuple[Effect, Array]]:
-        """Effects at work and their sizes (n, k) in n worlds; what is as good as absent is left out."""
-        z = self.coordinates(n, rng)
-        found = kept(self.structure, self.structure.values(z[:, len(self.box.low) :]), _PRESENT)
-        return [(self.structure.effects[i], theta) for i, theta in found.items()]
-
-    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
-        """See `Sampler`."""
-        z = self.coordinates(n, rng)
-        psi = self.box.psi(z[:, : len(self.box.low)])
-        if self.delta is None or self.spread is None:
-            return Fidelity(psi)
-        return Fidelity(psi, self.delta + self.spread * rng.standard_normal((n, len(self.delta))))
-
-
-@dataclass(frozen=True)
-class Segments:
-    """Parts of a trajectory.
-
-    Attributes:
-      starts: (n, nq + nv), or with the actuators' states behind them (n, nq + nv + na).
-      first, second, last: (n, s) `proprio` where they start, a control step later, and where they end.
-      actions: (n, span, a).
-      earlier: (n, EARLIER, a) the actions before; the first one of the trajectory stands for what came before it.
-      maps: the ground underfoot, and others that it may as well be; none is a plane.
-      hidden: the starts are made of `proprio` alone (`start.observed`).
-    """
-
-    starts: Array
-    first: Array
-    second: Array
-    last: Array
-    actions: Array
-    earlier: Array
-    maps: list[Heightfield] = field(default_factory=list)
-    hidden: bool = False
 
 
 @dataclass
@@ -382,36 +279,3 @@ class Assimilation:
         with np.errstate(over="ignore", invalid="ignore"):
             earlier = np.tile(segments.earlier, (m, 1, 1))
             return replayed(machine, sims, starts, first, actions, given, earlier).reshape(m, n, -1)
-
-
-def replayed(
-    machine: Machine, sims: Simulations, starts: Array, first: Array, actions: Array, given: Sequence[Given] = (),
-    earlier: Array | None = None,
-) -> Array:  # fmt: skip
-    """(n, s) `proprio` after the actions (n, span, a), from `Segments.starts`; nan where simulations come apart.
-
-    Args:
-      machine, sims: n simulations, in which an episode has begun.
-      starts, first, actions, earlier: as `Segments` has them.
-      given: effects at work in them.
-    """
-    sims.batch.reset(np.arange(sims.n), sims.rest)
-    residuals = Residuals(sims, given)
-    robot, view = sims.robot, sims.view
-    view.task.update({name: np.zeros_like(value) for name, value in view.task.items()})
-    place(machine, sims, starts, first)
-    sims.batch.forward()
-    view.now = robot.derive(view)
-    for action in () if earlier is None else earlier.transpose(1, 0, 2):
-        residuals.recall(robot.actuate(action, view), machine.kind.frame_skip)
-    for action in actions.transpose(1, 0, 2):
-        view.ctrl[...] = robot.actuate(action, view)
-        residuals.command(view.ctrl)
-        step(sims, ~residuals.between, machine.kind.frame_skip)
-        for _ in range(machine.kind.frame_skip if residuals.parts else 0):
-            residuals.act()
-            step(sims, residuals.between, 1)
-        residuals.rest()
-        view.task.update(robot.advance(view, action))
-        view.before, view.now = view.now, robot.derive(view)
-    return np.concatenate(robot.proprio(view), -1)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from nfc_gym import InputError
-from nfc_gym.adaptation.assimilation import Assimilation, Box
+from nfc_gym.adaptation.assimilated import Box
+from nfc_gym.adaptation.assimilation import Assimilation
 from nfc_gym.adaptation.linear import linear_posterior
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.terrain import Heightfield

@@ -80,7 +80,7 @@ def test_every_term_of_the_reward() -> None:
     terms = ROBOT.reward(view, action)
     expected = {
         "progress": -0.5,
-        "alive": 2.0,
+        "alive": 1.0,
         "upright": 0.1 * np.cos(0.4),
         "heading": 0.5,
         "action": -0.01 * 0.04,
