@@ -1,5 +1,6 @@
 """Whether a mapping and its model fit together: actuators, joints, bodies, sensors, parameters, known fields."""
 
+import copy
 from collections.abc import Iterator
 from difflib import get_close_matches
 
@@ -10,9 +11,10 @@ from nfc_gym.measured.channels import ChannelName, parse_channel
 from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.observe import observer
+from nfc_gym.measured.stiffness import stiffness_findings
 from nfc_gym.measured.units import si_unit
 from nfc_gym.measured.yaml_marks import suggest
-from nfc_gym.physics.fields import names_of
+from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.parameters import ParameterSpace, resolve, split_field
 
 _OBJ = mujoco.mjtObj
@@ -47,6 +49,21 @@ def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]
                 yield Finding("error", where, f"axes {list(channel.axes)} where the sensor has {size} components")
     yield from _fields(mapping, model)
     yield from _steps(mapping, model)
+    if mapping.segments.mode == "rollout":
+        yield from stiffness_findings(_nominal(mapping, model), float(mapping.segments.timestep or model.opt.timestep))
+
+
+def _nominal(mapping: Mapping, model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model with its declared parameters at nominal, or as it is where they cannot be."""
+    out = copy.copy(model)
+    fields = ModelFields(out)
+    try:
+        space = ParameterSpace(model, mapping.declared)
+    except (InputError, IndexError):
+        return out
+    space.write(fields, space.nominal)
+    fields.commit()
+    return out
 
 
 def _controls(mapping: Mapping, names: dict[str, list[str]]) -> Iterator[Finding]:
