@@ -115,7 +115,8 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
     if robot and not declared:
         declared = parameters_from_toml(assets.path(robot).with_name("psi.toml"))
     compile_model(spec, dataset.mapping.model_file)  # an error speaks of the model as it was given
-    model = compile_model(bare(spec, {n for p in declared for n in p.of}), dataset.mapping.model_file)
+    named = {name for entry in (*declared, *dataset.mapping.known) for name in entry.of}
+    model = compile_model(bare(spec, named), dataset.mapping.model_file)
     known = actuator_names(model)
     for control in dataset.mapping.controls:
         if control.removeprefix("ctrl:") not in known:
