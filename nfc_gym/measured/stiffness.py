@@ -62,8 +62,8 @@ def stiffness_findings(model: mujoco.MjModel, step: float) -> Iterator[Finding]:
     yield Finding(
         "warning",
         "model",
-        f"{_list([s.joint for s in found])} would settle within {worst.settles:.2g} s by damping and servo alone, less "
-        f"than a step of {step:g} s: grip and slip there hang on the step",
+        f"{_list([s.joint for s in found])} would settle in as little as {worst.settles:.2g} s by damping and servo "
+        f"alone, against a step of {step:g} s: grip and slip there hang on the step",
         f"shorten segments.timestep to {worst.settles:.1g}, or make such joints heavier: an armature of "
         f"{worst.armature:.2g} {unit} changes nothing where their speeds are led anyway",
     )
