@@ -36,6 +36,7 @@ Array = NDArray[np.float64]
 _AT_HALF = 8  # iterations of a fit at half the step, with the slopes of the whole one
 _CHORD = 10  # free parameters beyond which a candidate's refit reuses the Jacobian of the model to beat
 _EDGE = 1e-2  # of a parameter's range: nearer to a bound than this is at it
+HOPE = 0.25  # of the gain that a law must reach: what a cheap look must promise for a dear one to be worth its time
 _ALIKE = 0.1  # of a parameter's effect on the motion: what must remain when all others imitate it
 
 
@@ -146,13 +147,17 @@ class Arena:
         return self._refit(plant, start, 10, self.current.jacobian, quick=self.fit_data.problem.costly)
 
     def _refit(self, plant: Plant, start: Array, rounds: int, known: Array, quick: bool = False) -> Judged:
-        """Fit and judge; `known` (S, m, j) is the Jacobian of the first j free parameters.
+        """Fit and judge."""
+        return self.judge(self._fit(plant, start, rounds, known, quick))
+
+    def _fit(self, plant: Plant, start: Array, rounds: int, known: Array, quick: bool = False) -> Fit:
+        """Fit; `known` (S, m, j) is the Jacobian of the first j free parameters.
 
         With few of them a full Jacobian costs little; with many, or for a quick look, they keep the one that they have
         (the chord method).
         """
         chord = known if quick or known.shape[-1] > _CHORD else None
-        return self.judge(fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord))
+        return fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord)
 
     def enter_beside(self, leader: Judged, pick: Screened) -> Judged:
         """Fit a screened candidate in a leading one's place, also from where the leader's fit took all the rest."""
@@ -170,7 +175,10 @@ class Arena:
         return rows[int(loss(white).sum(-1).argmin())]
 
     def enter_apart(self, start: Fit, effect: Effect) -> Judged | None:
-        """Fit one of a fitted model's effects with values of its own at each place; None where there is but one."""
+        """Fit one of a fitted model's effects with values of its own at each place.
+
+        None where there is but one place, or where that does hardly better than the one value.
+        """
         parts = split(effect, start.plant)
         if parts is None:
             return None
@@ -181,7 +189,8 @@ class Arena:
         self.say(f"refitting {each.id} with values of its own at each place")
         plant = self.current.plant.with_effects([*others, each])
         x = np.concatenate([psi, *(of[id(e)] for e in others), of[id(effect)][copies]])
-        return self._refit(plant, x, 8, _slopes_of_others(start, effect))
+        found = self._fit(plant, x, 8, _slopes_of_others(start, effect))
+        return self.judge(found) if self.pays(found, start) else None
 
     def without(self, effect: Effect) -> "Arena":
         """The same arena with the model to beat less one of its effects, refitted."""
@@ -194,14 +203,18 @@ class Arena:
 
     def enter_again(self, other: Judged) -> Judged:
         """Go on with the fit of a candidate that comes from another arena."""
+        return self.judge(self.again(other))
+
+    def again(self, other: Judged) -> Fit:
+        """The fit of a candidate that comes from another arena, gone on with here."""
         self.say(f"judging {self.label(other)}")
         plant, before = other.fitted.plant, self.current.plant.effects
         added = plant.effects[: len(before)] == before
         known = self.current.jacobian if added else np.zeros((*self.current.white.shape, 0))
-        return self._refit(plant, other.fitted.x, 8, known)
+        return self._fit(plant, other.fitted.x, 8, known)
 
-    def enter_both(self, one: Judged, other: Judged) -> Judged:
-        """Fit what two candidates add together, from where their own fits ended."""
+    def enter_both(self, one: Judged, other: Judged) -> Judged | None:
+        """Fit what two candidates add together, from where their own fits ended; None where one does as well alone."""
         effects, thetas = [], []
         for j in (one, other):
             added = {id(e) for e in self.new(j)}
@@ -209,14 +222,36 @@ class Arena:
                 if id(e) in added:
                     effects.append(e)
                     thetas.append(theta)
-        return self.enter_at(effects, thetas)
+        found = self._together(effects, thetas)
+        return self.judge(found) if all(self.pays(found, j.fitted) for j in (one, other)) else None
 
     def enter_at(self, effects: Sequence[Effect], thetas: Sequence[Array]) -> Judged:
         """Fit laws together with everything fitted so far, from values (k,) of theirs."""
+        return self.judge(self._together(effects, thetas))
+
+    def _together(self, effects: Sequence[Effect], thetas: Sequence[Array]) -> Fit:
         self.say(f"refitting {' and '.join(e.id for e in effects)} together")
         current = self.current
         plant = current.plant.with_effects([*current.plant.effects, *effects])
-        return self._refit(plant, np.concatenate([current.x, *thetas]), 10, current.jacobian)
+        return self._fit(plant, np.concatenate([current.x, *thetas]), 10, current.jacobian)
+
+    def drop(self, fitted: Fit, than: Fit) -> float:
+        """By how much the loss of one model is below another's, on both sets of logs, under the common metric.
+
+        What a judgement by metrics of their own costs a hundred times as much to say.
+        """
+        on_select = [float(losses(self.select.problem, self.on, f).sum()) for f in (than, fitted)]
+        on_fit = [
+            float(loss(self.under.whiten(fitted_residual(self.fit_data.problem, f))).sum()) for f in (than, fitted)
+        ]
+        return sum(before - after for before, after in (on_select, on_fit))
+
+    def pays(self, fitted: Fit, than: Fit) -> bool:
+        """Whether a fit may be worth the parameters that it has more than another: by what the common metric says.
+
+        Where every model is judged by the one metric, the judgement itself costs no more and is asked at once.
+        """
+        return not self.own or self.drop(fitted, than) > HOPE * self.cost(len(fitted.x) - len(than.x))
 
     def judge(self, fitted: Fit) -> Judged:
         """Compare a fitted model with the one to beat."""
@@ -281,7 +316,11 @@ class Arena:
 
     def promises(self, found: Screened) -> float:
         """What a screened candidate would gain on both sets of logs if screening were right."""
-        return found.gain * self._numbers / max(int(self.fit_data.problem.mask.sum()), 1)
+        return self.on_both(found.gain)
+
+    def on_both(self, gain: float) -> float:
+        """What a gain on the fit logs would be on both sets of logs."""
+        return gain * self._numbers / max(int(self.fit_data.problem.mask.sum()), 1)
 
     @property
     def _numbers(self) -> int:

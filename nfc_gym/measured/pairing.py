@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from nfc_gym.measured.arena import Arena
+from nfc_gym.measured.arena import HOPE, Arena
 from nfc_gym.measured.contest import Judged, fitted_residual
 from nfc_gym.measured.screen import Screen
 
@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 def promising(arena: Arena, pool: Sequence[Judged], most: int) -> list[tuple[Judged, Judged]]:
     """The pairs of fitted candidates of different families that promise most together, best first.
+
+    A pair that promises next to nothing of what the second law would have to gain is none.
 
     Args:
       arena: whose model to beat they would join.
@@ -32,13 +34,23 @@ def promising(arena: Arena, pool: Sequence[Judged], most: int) -> list[tuple[Jud
         for i, k in combinations(range(len(pool)), 2)
         if arena.new(pool[i])[0].family != arena.new(pool[k])[0].family
     ]
-    if len(pairs) <= most:
-        return [(pool[i], pool[k]) for i, k in pairs]
+    if not pairs:
+        return []
     screen = Screen(arena.fit_data.problem, arena.under, arena.current)
     change = _changes(screen, pool)
-    # A fit may go beyond what it did alone, or not so far; it does not turn back on it.
-    left = {pair: float(nnls(change[:, pair], -screen.projected)[1]) for pair in pairs}
-    return [(pool[i], pool[k]) for i, k in sorted(pairs, key=left.__getitem__)[:most]]
+    numbers = [sum(len(e.params) for e in arena.new(j)) for j in pool]
+
+    def left(*of: int) -> float:
+        """Loss beside some candidates. A fit may go beyond what it did alone, or not so far; it does not turn back."""
+        return float(nnls(change[:, of], -screen.projected)[1]) ** 2
+
+    alone, both = [left(i) for i in range(len(pool))], {pair: left(*pair) for pair in pairs}
+
+    def hopeful(pair: tuple[int, int]) -> bool:
+        better, other = sorted(pair, key=alone.__getitem__)
+        return arena.on_both(alone[better] - both[pair]) > HOPE * arena.cost(numbers[other])
+
+    return [(pool[i], pool[k]) for i, k in sorted(filter(hopeful, pairs), key=both.__getitem__)[:most]]
 
 
 def _changes(screen: Screen, pool: Sequence[Judged]) -> Array:

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
-from nfc_gym.measured.arena import Arena, contains
+from nfc_gym.measured.arena import HOPE, Arena, contains
 from nfc_gym.measured.contest import Judged, mechanism, shortlist
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.pairing import promising
@@ -22,7 +22,6 @@ _FINALISTS = 4  # candidates that are judged again under the sharper metric
 _SHARP = 0.1  # nats a number beyond the noise, below which the metric of the model to beat is sharp enough
 _FAR = 0.5  # of the best first gain: who gains less is beaten for good, and ranked by it
 _FAINT = 0.02  # nats a number beyond the noise, below which two laws have nothing to mend together
-_HOPE = 0.25  # of the gain that a law must reach: what screening must promise for a refit to be worth its time
 _RIVAL, _DUELS = 0.5, 2  # of the best gain: who comes so near meets the best again at half the step; how many do
 _BY_PSI = 0.1  # of a candidate's gain, beyond which its psi alone becomes the model to beat
 _ALIKE = 3  # families that may explain the data alike for one of them to be claimed
@@ -103,7 +102,7 @@ class Contest:
         arena = self.arena
         chance = self.screen.chance(self.screened, arena.blocks[0], arena.rng)
         picks = shortlist(self.screened, self.short)
-        hopeful = [s for s in picks if arena.promises(s) > _HOPE * arena.asked(s, self.worth)]
+        hopeful = [s for s in picks if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
         # The report names the nearest even where there is no hope.
         entered = sorted((arena.enter([s]) for s in hopeful or picks[:1]), key=lambda j: -j.total)
         first = [j for j in entered if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
@@ -111,12 +110,12 @@ class Contest:
         if not first or (arena.leftover < _SHARP and all(j.total < 0 for j in first)):
             ranking = [arena.row(j) for j in entered]
             return Round([], 0.0, ranking, reason="no candidate reduces the misfit more than chance does"), None
-        judged = self._final(first)
+        judged, lost = self._final(first)
         arena = self.arena
         far = _FAR * max(j.total for j in first)
-        beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in judged)]
+        beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in (*judged, *lost))]
         beaten = [arena.judge(j.fitted) if j.total > far else j for j in beaten]
-        outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *beaten]])
+        outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *beaten, *lost]])
         believed = [j for j in judged if self._believed(j)]
         pairs = self._pairs(judged, entered) if arena.leftover > (_LEFT if believed else _FAINT) else []
         outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
@@ -154,14 +153,20 @@ class Contest:
         arena.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best
 
-    def _final(self, first: list[Judged]) -> list[Judged]:
-        """The leading candidates, judged again in a sharper arena, which takes the place of the first; best first."""
+    def _final(self, first: list[Judged]) -> tuple[list[Judged], list[Judged]]:
+        """The leading candidates, judged again in a sharper arena, which takes the place of the first; best first.
+
+        Beside them those of which a fit there was enough to see that they do not come near the best, as they were.
+        """
         arena = self.arena
         leaders = sorted(first, key=lambda j: arena.unexplained(j.fitted))
         arena.say(f"judging again under what {arena.label(leaders[0])} leaves unexplained")
         finalists = list({id(j): j for j in (*first[: _FINALISTS // 2], *leaders)}.values())[:_FINALISTS]
         self.arena = arena = arena.sharper(leaders[0].fitted)
-        judged = [arena.enter_again(j) for j in finalists]
+        fits = list(map(arena.again, finalists))
+        near = self._near(fits)
+        judged = [arena.judge(f) for f, yes in zip(fits, near, strict=True) if yes]
+        lost = [j for j, yes in zip(finalists, near, strict=True) if not yes]
         judged += self._apart(judged)
         judged.sort(key=lambda j: -j.total)
         if (better := self._psi_alone(judged[0])) is not None:
@@ -169,7 +174,15 @@ class Contest:
             arena.say("the candidate's psi alone does better than the model before it: judging against that")
             self.arena = arena = arena.facing(better)
             judged = sorted((arena.judge(j.fitted) for j in judged), key=lambda j: -j.total)
-        return judged
+        return judged, lost
+
+    def _near(self, fits: Sequence[Fit]) -> list[bool]:
+        """Which of fitted candidates come within reach of the best; all, where judging them costs little."""
+        arena = self.arena
+        if not arena.own:
+            return [True] * len(fits)
+        drops = [arena.drop(f, arena.current) for f in fits]
+        return [d >= _FAR * max(drops) or max(drops) <= 0 for d in drops]
 
     def _mimics(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
         """Fits of what does nearly the same as the law about to be accepted, and was not asked in full.
@@ -290,7 +303,8 @@ class Contest:
         for j in (*judged, *entered):
             if len(j.fitted.plant.effects) > len(arena.current.plant.effects) and arena.plausible(j):
                 pool.setdefault(mechanism(arena.new(j)[0]), j)
-        pairs = [arena.enter_both(a, b) for a, b in promising(arena, list(pool.values()), _PAIRED)]
+        fitted = [arena.enter_both(a, b) for a, b in promising(arena, list(pool.values()), _PAIRED)]
+        pairs = [p for p in fitted if p is not None]
         gain = max((j.total for j in judged if arena.plausible(j)), default=0.0)
         return sorted((p for p in pairs if p.total > gain), key=lambda j: -j.total)
 
@@ -304,6 +318,8 @@ class Contest:
         if not self.rough or plant.effects[: len(current.plant.effects)] != current.plant.effects:
             return None
         other = fit(arena.fit_data.problem, arena.under, current.plant, best.fitted.x[: len(current.x)], 10)
+        if not arena.pays(other, current):
+            return None
         gained = arena.judge(other)
         share = _BY_PSI * max(float(best.fit_gains.sum() + best.gains.sum()), 0.0)
         return other if gained.gain + float(gained.fit_gains.sum()) > share > 0 else None

@@ -156,6 +156,21 @@ def test_by_a_metric_of_its_own_a_model_is_refitted_and_pays_for_its_slack() -> 
     np.testing.assert_allclose(found.white, under.whiten(problem.residual(None, found.x[None]))[0], atol=1e-6)
 
 
+@pytest.mark.parametrize(("bend", "pays"), [(0.002, False), (0.02, True)])
+def test_a_slope_that_the_data_hardly_show_is_not_worth_a_judgement(bend: float, pays: bool) -> None:
+    """A slope costs the logarithm of 960 numbers, and must promise a quarter of that."""
+    contest, problem = arena(bend)
+    straight, bent = (
+        stand(problem, contest.under, m.plant, m.x) for m in (contest.current, model(problem, [0.0, bend]))
+    )
+    contest.current, contest.own = straight, True
+    assert contest.cost(1) == pytest.approx(np.log(960), rel=0.2)  # the loss counts outliers less than their squares
+    assert contest.drop(bent, straight) == pytest.approx(-contest.drop(straight, bent))
+    assert contest.pays(bent, straight) == pays
+    contest.own = False  # judging costs as much as asking whether to
+    assert contest.pays(bent, straight)
+
+
 class Hung(Payload):
     """A lump whose body is 0.2 m across, about a middle of its own."""
 

@@ -19,20 +19,26 @@ class Wells(Problem):
     Models beyond zero expect `loud` times the noise of the others.
     """
 
-    def __init__(self, tilt: float, loud: float = 1.0, rough: bool = True) -> None:
+    def __init__(self, tilt: float, loud: float = 1.0, rough: bool = True, blocks: int = 10) -> None:
         self.tilt, self.loud, self.rough = tilt, loud, rough
-        self.mask = np.ones((10, 2), bool)
-        self.log_of, self.time_of, self.names = np.zeros(10, int), np.arange(10.0), ("log",)
+        self.mask = np.ones((blocks, 2), bool)
+        self.log_of, self.time_of, self.names = np.zeros(blocks, int), np.arange(float(blocks)), ("log",)
+        self.asked: list[int] = []
         self.columns = Columns(("a", "b"), ("1", "1"), np.zeros(2), ("joint:j",) * 2)
 
     def residual(self, plant: Any, x: np.ndarray) -> np.ndarray:
         depth = np.stack([x[:, 0] ** 2 - 1, self.tilt * (x[:, 0] + 1)], -1)
-        return np.repeat(depth[:, None], 10, 1)
+        return np.repeat(depth[:, None], len(self), 1)
 
     def covariance(self, plant: Any, x: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(0.1**2 * (self.loud if x[0] > 0 else 1.0) ** 2 * np.eye(2), (10, 2, 2))
+        self.asked.append(len(self))
+        return np.broadcast_to(0.1**2 * (self.loud if x[0] > 0 else 1.0) ** 2 * np.eye(2), (len(self), 2, 2))
 
-    def take(self, index): ...  # type: ignore[override]
+    def take(self, index: np.ndarray) -> "Wells":
+        out = Wells(self.tilt, self.loud, self.rough, len(index))
+        out.asked = self.asked
+        return out
+
     def synthetic(self, plant, x, rng): ...  # type: ignore[override]
 
 
@@ -60,6 +66,19 @@ def test_the_likeliest_is_not_the_one_with_the_smallest_errors(loud: float, end:
     problem = Wells(0.01, loud)
     under, exact = stood(problem, -1.0)
     assert hollows(problem, under, np.zeros(2), exact, 0, (np.array([0.9]),)).x == pytest.approx(end, abs=0.02)
+
+
+def test_who_is_far_behind_on_some_of_the_blocks_is_not_asked_of_all() -> None:
+    problem = Wells(0.1, blocks=36)
+    under, shallow = stood(problem, 1.0)
+    found = hollows(problem, under, np.zeros(2), shallow, 0, (np.array([-0.8]),))
+    assert found.x == pytest.approx(-1.0, abs=0.02)
+    assert set(problem.asked[1:]) == {12}  # the first was the metric's
+    assert found.sigma is None
+    even = Wells(0.0, blocks=36)  # two hollows alike: neither is lost early
+    under, one = stood(even, 1.0)
+    hollows(even, under, np.zeros(2), one, 0, (np.array([-0.8]),))
+    assert even.asked.count(36) == 3
 
 
 def test_where_nothing_touches_the_fit_at_hand_is_the_answer() -> None:

@@ -12,18 +12,20 @@ from nfc_gym.measured.rounds import Contest
 
 
 def model(white: list[float], family: str = "") -> Any:
-    effects = [SimpleNamespace(family=family)] if family else []
+    effects = [SimpleNamespace(family=family, params=(None,))] if family else []
     plant: Any = SimpleNamespace(white=np.array(white)[None, None], effects=effects)
     return SimpleNamespace(fitted=Fit(plant, np.zeros(1), plant.white[0], np.zeros((1, len(white), 0))))
 
 
-def arena(white: list[float]) -> Any:
+def arena(white: list[float], price: float = 0.0) -> Any:
     problem = SimpleNamespace(residual=lambda plant, x: plant.white)
     return SimpleNamespace(
         fit_data=SimpleNamespace(problem=problem),
         under=SimpleNamespace(whiten=lambda residual: residual),
         current=model(white).fitted,
         new=lambda j: j.fitted.plant.effects,
+        on_both=lambda gain: gain,
+        cost=lambda parameters: parameters * price,
     )
 
 
@@ -49,7 +51,15 @@ def test_a_pair_has_two_families_and_does_not_undo_itself() -> None:
     )
     pairs = promising(arena([1.0, 1.0, 1.0]), [one, same, back, other], 1)
     assert [tuple(map(id, pair)) for pair in pairs] == [(id(same), id(other))]
-    assert len(promising(arena([1.0, 1.0, 1.0]), [one, same, back], 3)) == 2
+    assert len(promising(arena([1.0, 1.0, 1.0]), [one, same, back], 3)) == 0
+    assert promising(arena([1.0, 1.0, 1.0]), [one], 3) == []
+
+
+@pytest.mark.parametrize(("price", "tried"), [(0.5, True), (5.0, False)])
+def test_a_pair_must_promise_some_of_what_the_second_law_costs(price: float, tried: bool) -> None:
+    """The second law takes a loss of one away beside the first: more than a quarter of 0.5, less than one of 5."""
+    one, other = model([0.0, 0.0, 1.0], "lag"), model([1.0, 1.0, 0.0], "wind")
+    assert bool(promising(arena([1.0, 1.0, 1.0], price), [one, other], 3)) == tried
 
 
 def standing(leftover: float, before: float = 0.0) -> Any:
