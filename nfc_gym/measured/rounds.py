@@ -114,7 +114,6 @@ class Contest:
         arena = self.arena
         far = _FAR * max(j.total for j in first)
         beaten = [j for j in first if not any(arena.label(j) == arena.label(k) for k in (*judged, *lost))]
-        beaten = [arena.judge(j.fitted) if j.total > far else j for j in beaten]
         outcome = Round([], 0.0, [arena.row(j) for j in [*judged, *beaten, *lost]])
         believed = [j for j in judged if self._believed(j)]
         pairs = self._pairs(judged, entered) if arena.leftover > (_LEFT if believed else _FAINT) else []
@@ -135,6 +134,7 @@ class Contest:
             judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
             outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in duel])
             best = self._simplest(believed := [j for j in judged if self._believed(j)] or [best])
+        beaten = [arena.judge(j.fitted) for j in beaten if j.total > far]
         alike = self._alike([*judged, *beaten], best, believed[0])
         if len({i.partition(":")[0] for i in alike}) > _ALIKE:
             # So many causes that do alike are no finding: each would be named for want of the others.
@@ -177,12 +177,15 @@ class Contest:
         return judged, lost
 
     def _near(self, fits: Sequence[Fit]) -> list[bool]:
-        """Which of fitted candidates come within reach of the best; all, where judging them costs little."""
+        """Which of fitted candidates are the best or come near it and may pay; all, where judging them costs little."""
         arena = self.arena
         if not arena.own:
             return [True] * len(fits)
         drops = [arena.drop(f, arena.current) for f in fits]
-        return [d >= _FAR * max(drops) or max(drops) <= 0 for d in drops]
+        most = max(drops)
+        return [
+            d == most or (d >= _FAR * most and arena.pays(f, arena.current)) for f, d in zip(fits, drops, strict=True)
+        ]
 
     def _mimics(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
         """Fits of what does nearly the same as the law about to be accepted, and was not asked in full.

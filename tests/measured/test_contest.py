@@ -317,3 +317,21 @@ def test_a_law_and_its_special_case_do_not_meet_again() -> None:
     plain, wider, other = rated("coulomb", 100.0), rated("stribeck", 99.0), rated("armature", 98.0)
     assert contest._rivals(plain, [plain, wider, other]) == [other]
     assert contest._rivals(wider, [wider, plain, other]) == [other]
+
+
+@pytest.mark.parametrize(
+    ("own", "drops", "near"),
+    [
+        (True, [100.0, 49.0, 51.0], [True, False, True]),
+        (True, [3.0, 2.0, -1.0], [True, False, False]),  # none of them pays: the best alone is asked in full
+        (True, [-5.0, -9.0], [True, False]),
+        (False, [100.0, 1.0], [True, True]),
+    ],
+)
+def test_only_who_comes_near_the_best_is_judged_by_noise_of_its_own(own: bool, drops: list, near: list) -> None:
+    arena: Any = SimpleNamespace(
+        own=own, current=None, fit_data=SimpleNamespace(problem=SimpleNamespace(rough=True)),
+        drop=lambda fitted, than: fitted, pays=lambda fitted, than: fitted > 10.0,
+    )  # fmt: skip
+    contest = Contest(arena, SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
+    assert contest._near(drops) == near
