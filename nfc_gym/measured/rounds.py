@@ -91,6 +91,7 @@ class Contest:
     ) -> None:
         self.arena, self.screen, self.screened, self.short, self.worth = arena, screen, screened, short, worth
         self.pool = {e.id: e for e in pool}
+        self._known = {s.effect.id: s for s in screened}
         self.rough = arena.fit_data.problem.rough
 
     def hold(self) -> tuple[Round, Judged | None]:
@@ -190,17 +191,29 @@ class Contest:
     def _mimics(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
         """Fits of what does nearly the same as the law about to be accepted, and was not asked in full.
 
-        A first look may lose the right one of two laws that straight lines cannot tell apart.
+        A first look may lose the right one of two laws that straight lines cannot tell apart. Where bodies touch, those
+        lines are too rough to show the likeness of laws that are kin.
         """
         arena, new = self.arena, self.arena.new(best)
-        by_id = {s.effect.id: s for s in self.screened}
         asked = {arena.label(j) for j in judged} | {e.id for e in new}
         added = len(best.fitted.plant.effects) > len(arena.current.plant.effects)
-        if len(new) != 1 or new[0].id not in by_id or not added:
+        if len(new) != 1 or new[0].id not in self._known or not added:
             return []
-        one = by_id[new[0].id]
+        names = [f"{family}:{new[0].place}" for family in new[0].kin]
+        kin = [s for name in names if name not in asked and (s := self._screened(name)) is not None]
+        asked |= {s.effect.id for s in kin}
         others = [s for s in self.screened if s.effect.id not in asked]
-        return [arena.enter_beside(best, s) for s in mimics(one, others, self.screen.projected)]
+        like = mimics(self._known[new[0].id], others, self.screen.projected)
+        return [arena.enter_beside(best, s) for s in (*kin, *like)]
+
+    def _screened(self, name: str) -> Screened | None:
+        """A candidate as screening has it; None where there is none of that id.
+
+        In a large pool it may have been left out of the screening, and is screened now.
+        """
+        if name not in self._known and name in self.pool:
+            self._known[name] = self.screen.try_one(self.pool[name])
+        return self._known.get(name)
 
     def _rivals(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
         """Where bodies touch, the leading candidates of other families that come near the law about to be accepted.
@@ -351,21 +364,10 @@ class Contest:
         return next((j for j in rivals if arena.nearer(j, chosen)), chosen)
 
     def _plainer(self, law: Effect) -> list[list[Screened]]:
-        """The sets of plainer laws that a law contains, screened at its place.
-
-        In a large pool they may have been left out of the screening, one by one, for all that they do together.
-        """
-        by_id = {s.effect.id: s for s in self.screened}
-
-        def part(family: str) -> Screened | None:
-            name = f"{family}:{law.place}"
-            if name not in by_id and name in self.pool:
-                by_id[name] = self.screen.try_one(self.pool[name])
-            return by_id.get(name)
-
+        """The sets of plainer laws that a law contains, screened at its place."""
         out = []
         for families in law.simpler:
-            parts = [p for p in map(part, families) if p is not None]
+            parts = [p for f in families if (p := self._screened(f"{f}:{law.place}")) is not None]
             if isinstance(law, Each):
                 apart = [split(p.effect, self.screen.current.plant) for p in parts]
                 parts = [self.screen.try_one(a[0]) for a in apart if a is not None]

@@ -238,7 +238,7 @@ def test_plainer_laws_are_tried_though_screening_left_them_out() -> None:
 
 
 def candidate(name: str, columns: list[list[float]]) -> Screened:
-    effect: Any = SimpleNamespace(id=name)
+    effect: Any = SimpleNamespace(id=name, place=name, kin=())
     return Screened(effect, 1.0, np.zeros(1), np.zeros(1), np.array(columns, float).reshape(-1, 4).T)
 
 
@@ -253,25 +253,44 @@ def test_likeness_asks_what_the_other_could_do_of_what_the_one_does() -> None:
     assert likeness(first, candidate("e", []), residual) == 0.0
 
 
-def test_what_does_the_same_as_the_best_is_asked_before_the_best_is_believed() -> None:
-    """Whoever was refitted in full already is not asked again, and of many that do the same the two nearest are."""
-    lag, named = candidate("lag", [[1, 0.1, 0, 0]]), [candidate("far", [[0, 1, 0, 0]])]
-    near = [candidate(f"near_{k}", [[1, 0.1 + 0.01 * k, 0, 0]]) for k in range(4)]
-    current = SimpleNamespace(plant=SimpleNamespace(effects=[]))
+def asking(screened: list[Screened], pool: list[Any] = []) -> Contest:  # noqa: B006 (never written to)
+    """A contest whose answer to a candidate that is fitted beside the best is its id."""
     arena: Any = SimpleNamespace(
         fit_data=SimpleNamespace(problem=SimpleNamespace(rough=True)),
-        current=current,
+        current=SimpleNamespace(plant=SimpleNamespace(effects=[])),
         new=lambda j: j.fitted.plant.effects,
         label=lambda j: j.fitted.plant.effects[0].id,
         enter_beside=lambda best, pick: pick.effect.id,
     )
-    screen: Any = SimpleNamespace(projected=np.array([1.0, 0.0, 0.0, 0.0]))
-    contest = Contest(arena, screen, [*named, *near[::-1], lag], 8, 0.02)
-    best, asked = (
-        Judged(SimpleNamespace(plant=SimpleNamespace(effects=[s.effect])), np.zeros(1), np.zeros(1), 1.0, 1.0)  # type: ignore[arg-type]
-        for s in (lag, near[1])
+    screen: Any = SimpleNamespace(
+        projected=np.array([1.0, 0.0, 0.0, 0.0]), try_one=lambda e: replace(candidate("new", [[0, 0, 1, 0]]), effect=e)
     )
+    return Contest(arena, screen, screened, 8, 0.02, pool)
+
+
+def refitted(effect: Any) -> Judged:
+    return Judged(SimpleNamespace(plant=SimpleNamespace(effects=[effect])), np.zeros(1), np.zeros(1), 1.0, 1.0)  # type: ignore[arg-type]
+
+
+def test_what_does_the_same_as_the_best_is_asked_before_the_best_is_believed() -> None:
+    """Whoever was refitted in full already is not asked again, and of many that do the same the two nearest are."""
+    lag, named = candidate("lag", [[1, 0.1, 0, 0]]), [candidate("far", [[0, 1, 0, 0]])]
+    near = [candidate(f"near_{k}", [[1, 0.1 + 0.01 * k, 0, 0]]) for k in range(4)]
+    contest = asking([*named, *near[::-1], lag])
+    best, asked = (refitted(s.effect) for s in (lag, near[1]))
     assert contest._mimics(best, [best, asked]) == ["near_0", "near_2"]
+
+
+def test_a_shifted_centre_of_mass_is_not_believed_before_a_load_was_asked() -> None:
+    """Straight lines show no likeness, and a thinned screening left the load out: it is asked all the same."""
+    shift, load, elsewhere = (
+        FAMILIES[f]((body,)) for f, body in (("com_shift", "torso"), ("payload", "torso"), ("payload", "foot"))
+    )
+    screened = [replace(candidate("shift", [[1, 0, 0, 0]]), effect=shift)]
+    best = refitted(shift)
+    assert asking(screened, [shift, load, elsewhere])._mimics(best, [best]) == ["payload:torso"]
+    assert asking(screened, [shift, load, elsewhere])._mimics(best, [best, refitted(load)]) == []
+    assert asking(screened, [shift, elsewhere])._mimics(best, [best]) == []
 
 
 def rated(family: str, total: float, where: tuple[str, ...] = ("all",)) -> Judged:

@@ -139,6 +139,8 @@ class Effect(ABC):
     simpler: ClassVar[tuple[tuple[str, ...], ...]] = ()
     # Families that are special cases of this law at the same place: beside them it is no further alternative.
     covers: ClassVar[tuple[str, ...]] = ()
+    # Families that do nearly the same at the same place once psi takes up the rest: asked before this law is believed.
+    kin: ClassVar[tuple[str, ...]] = ()
     # Model fields that `modulate` writes to.
     MODULATES: ClassVar[tuple[str, ...]] = ()
     # Whether the hidden state of `action` outlives the history before a segment: it then begins where the log does.

@@ -198,6 +198,7 @@ class ComShift(Moved):
 
     family = "com_shift"
     summary = "Centre of mass shifted"
+    kin = ("payload",)  # what is left of a load whose weight a mass of psi has taken up
     PARAMS = tuple(Param(axis, "m", -0.5, 0.5, probes=(0.01,), resolution=2e-4) for axis in "xyz")
 
     def bind(self, model: mujoco.MjModel) -> None:
