@@ -106,6 +106,10 @@ class Contest:
         hopeful = [s for s in picks if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
         # The report names the nearest even where there is no hope.
         entered = sorted((arena.enter([s]) for s in hopeful or picks[:1]), key=lambda j: -j.total)
+        shared = self._shared(entered)
+        lucky = chance.get(arena.label(entered[0]), 0.0) if entered else 0.0
+        chance = {arena.label(j): lucky for j in shared} | chance
+        entered = sorted([*entered, *shared], key=lambda j: -j.total)
         first = [j for j in entered if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
         # Where the metric is as sharp as the noise already, the second look shows what the first has shown.
         if not first or (arena.leftover < _SHARP and all(j.total < 0 for j in first)):
@@ -153,6 +157,23 @@ class Contest:
             rivals += [i for i in known_as(effect, best.fitted, self.pool) if i not in rivals]
         arena.say(f"accepted {', '.join(outcome.accepted)}")
         return outcome, best
+
+    def _shared(self, entered: Sequence[Judged]) -> list[Judged]:
+        """Where bodies touch, the leading law of one place at the sets of like places that it belongs to.
+
+        A limit that all drives share is reached now by one and now by another, and straight lines from its realistic
+        size may show nothing of it. What promises enough at some share of that size is fitted.
+        """
+        arena = self.arena
+        new = arena.new(entered[0]) if self.rough and entered else []
+        if len(new) != 1 or len(new[0].where) > 1:
+            return []
+        asked = {arena.label(j) for j in entered}
+        wider = [e for e in self.pool.values() if e.family == new[0].family and set(new[0].where) < set(e.where)]
+        found = [
+            self.screen.scout(s, arena.rng, draws=0) for e in wider if e.id not in asked and (s := self._screened(e.id))
+        ]
+        return [arena.enter([s]) for s in found if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
 
     def _final(self, first: list[Judged]) -> tuple[list[Judged], list[Judged]]:
         """The leading candidates, judged again in a sharper arena, which takes the place of the first; best first.

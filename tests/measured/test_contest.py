@@ -293,6 +293,24 @@ def test_a_shifted_centre_of_mass_is_not_believed_before_a_load_was_asked() -> N
     assert asking(screened, [shift, elsewhere])._mimics(best, [best]) == []
 
 
+def test_the_leading_law_of_one_place_is_tried_where_like_places_share_it() -> None:
+    """Only sets that hold the place, were not asked and promise enough are fitted; nothing is where nothing touches."""
+    law = FAMILIES["saturation"]
+    one, both, three, other = (law(w) for w in (("a",), ("a", "b"), ("a", "b", "c"), ("b", "c")))
+    pool = [one, both, three, other, FAMILIES["gain"](("a", "b"))]
+    contest = asking([], pool)
+    arena, screen = contest.arena, contest.screen
+    gains = {both.id: 100.0, three.id: 1.0}
+    arena.promises, arena.asked = (lambda s: s.gain), (lambda s, worth: 100.0)  # type: ignore[method-assign]
+    arena.rng, arena.enter = np.random.default_rng(0), lambda picks: picks[0].effect.id  # type: ignore[assignment]
+    screen.scout = lambda s, rng, draws: replace(s, gain=gains[s.effect.id])  # type: ignore[method-assign]
+    assert contest._shared([refitted(one), refitted(other)]) == [both.id]
+    assert contest._shared([refitted(one), refitted(both)]) == []
+    assert contest._shared([refitted(both)]) == []
+    contest.rough = False
+    assert contest._shared([refitted(one)]) == []
+
+
 def rated(family: str, total: float, where: tuple[str, ...] = ("all",)) -> Judged:
     own = FAMILIES[family]
     effect = SimpleNamespace(
