@@ -63,17 +63,17 @@ class ForwardProblem(InstantProblem):
         batch.ctrl[...] = np.concatenate([u for u, _ in commands], 1).reshape(count * samples, -1)
         batch.act[...] = np.concatenate([a for _, a in commands], 1).reshape(count * samples, -1)
         sensordata = batch.bind("sensordata")  # bound before the call that fills it
-        batch.forward()
         exogenous = {k: np.tile(np.concatenate([t.exogenous[k] for t in tracks]), count) for k in tracks[0].exogenous}
         thetas = plant.split(rows)[1]
         pushing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "force")]
         if pushing:
+            filled = set()  # what the last call filled: a view that is bound later waits for the next one
 
             def derived(name: str) -> Array:
-                fresh = name not in batch._bound
                 values = batch.bind(name)
-                if fresh:
+                if name not in filled:
                     batch.forward()
+                    filled.update(batch._bound)
                 return values
 
             ctx = Context(
@@ -86,7 +86,7 @@ class ForwardProblem(InstantProblem):
                 ctx.memory = trace(effect, ctx, theta, order) if overrides(effect, "follow") else None
                 effect.force(ctx, theta, out)
             batch.qfrc_applied[...], batch.xfrc_applied[...] = out.qfrc, out.xfrc
-            batch.forward()
+        batch.forward()
         sensed = sensordata.reshape(count, samples, -1)
         return self._read(plant, x, sensed, lengths, tracks[0].dt)
 

@@ -14,6 +14,7 @@ from nfc_gym.measured.metric import metric
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem, finer, interpolate
 from nfc_gym.measured.states import estimate_states
+from nfc_gym.physics.effects import FAMILIES
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -281,6 +282,21 @@ def test_forward_problem_reads_the_accelerometer_of_the_closed_form(rotating: bo
     residual = problem.residual(plant, np.array([[2.0]]))[0]
     acc = np.array([g == "sensor acc" for g in problem.columns.group])
     assert (residual[:, acc] ** 2).mean() == pytest.approx(1e-4, rel=0.2)
+
+
+def test_forward_problem_pushes_by_laws_that_read_the_state() -> None:
+    """A body that climbs at 0.3 m/s against air: its accelerometer reads (thrust - c v) / m."""
+    model = mujoco.MjModel.from_xml_string(BODY)
+    space = ParameterSpace(model, [Parameter("mass", "body_mass", ("base",), "kg", 1, 4)])
+    drag, quadratic = (FAMILIES[f](("base",)) for f in ("drag_linear", "drag_quadratic"))
+    plant = Plant(model, space, [drag, quadratic], nthread=1)
+    log = flight(False)
+    problem = ForwardProblem(model, [log], [estimate_states(model, log)], 0.25)
+    x = np.array([[2.0, *(2.0 * np.ones(3)), *np.zeros(3)], [2.0, *np.zeros(3), *(5.0 * np.ones(3))]])
+    predicted = problem.evaluate(plant, x, problem.tracks)[0]
+    for row, force in zip(predicted, (2.0 * 0.3, 5.0 * 0.3**2), strict=True):
+        wanted = (log.controls["ctrl:thrust"] - force) / 2.0
+        np.testing.assert_allclose(row[20:-20, 2], wanted[20:-20], rtol=1e-4)  # at its ends a log's speed is a guess
 
 
 @pytest.mark.parametrize(("kind", "word"), [(InverseProblem, "force:<actuator>"), (ForwardProblem, "sensor:<name>")])

@@ -15,7 +15,7 @@ from nfc_gym.measured.screen import Screen, ladder
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
-from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects import FAMILIES, build
 from nfc_gym.physics.effects.each import split
 from nfc_gym.physics.effects.inertial import ComShift, Payload
 from nfc_gym.physics.effects.joint import SpringOffset
@@ -170,3 +170,5 @@ def test_springs_with_values_of_their_own_are_screened() -> None:
     found = screen.try_one(apart[0])
     assert found.columns.shape[1] == 4
     assert found.gain > 0
+    # Drives of one make on one battery follow it alike.
+    assert split(FAMILIES["supply_sag"](("a", "b")), screen.current.plant) is None

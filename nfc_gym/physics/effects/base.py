@@ -141,6 +141,8 @@ class Effect(ABC):
     covers: ClassVar[tuple[str, ...]] = ()
     # Families that do nearly the same at the same place once psi takes up the rest: asked before this law is believed.
     kin: ClassVar[tuple[str, ...]] = ()
+    # Whether values of its own at each of several places make sense.
+    divisible: ClassVar[bool] = True
     # Model fields that `modulate` writes to.
     MODULATES: ClassVar[tuple[str, ...]] = ()
     # Whether the hidden state of `action` outlives the history before a segment: it then begins where the log does.

@@ -207,6 +207,7 @@ class SupplySag(_OnCommand):
         Param("exponent", "1", -1.0, 4.0, probes=(1.0, 2.0), resolution=0.02),
         Param("reference", "V", 1e-3, 1e4, probes=(12.0,), shape=True),
     )
+    divisible = False  # drives of one make on one battery; one that gives less than the others has lost force
     signal = "exo:supply"
 
     @property

@@ -135,7 +135,7 @@ def each(members: Sequence[Effect]) -> Each:
 
 def split(effect: Effect, plant: "Plant") -> tuple[Effect, NDArray[np.intp]] | None:
     """A tied effect of several places as `Each`, and the old parameter each new one starts from; None if it cannot."""
-    if isinstance(effect, Each | Conditioned) or len(effect.where) < 2 or effect.generic:
+    if isinstance(effect, Each | Conditioned) or len(effect.where) < 2 or effect.generic or not effect.divisible:
         return None
     # What bounds all joints alike is no bound of one: a knee carries more than the typical joint of a leg.
     own = [e.params for e in effect.singles] or [effect.params] * len(effect.where)
