@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from nfc_gym.measured.arena import HOPE, Arena
+from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import Judged, fitted_residual
 from nfc_gym.measured.screen import Screen
+from nfc_gym.measured.yardstick import HOPE
 
 Array = NDArray[np.float64]
 

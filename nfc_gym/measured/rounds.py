@@ -3,11 +3,12 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
-from nfc_gym.measured.arena import HOPE, Arena, contains
+from nfc_gym.measured.arena import Arena, contains
 from nfc_gym.measured.contest import Judged, mechanism, shortlist
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.pairing import promising
 from nfc_gym.measured.screen import Screen, Screened, mimics
+from nfc_gym.measured.yardstick import HOPE
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each, split
 
@@ -127,18 +128,7 @@ class Contest:
         if not believed:
             outcome.reason = f"the best candidate, {arena.label(judged[0])}, gains no more on unseen logs than chance"
             return outcome, None
-        best = self._simplest(believed)
-        if mimics := self._mimics(best, judged):
-            judged = sorted([*judged, *mimics], key=lambda j: -j.total)
-            outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in mimics])
-            best = self._simplest(believed := [j for j in judged if self._believed(j)])
-        if rivals := self._rivals(best, judged):
-            duel = self._at_half([best, *rivals])
-            # Their families' other forms were judged at the whole step alone, and lost to these there.
-            families = {arena.new(j)[0].family for j in duel}
-            judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
-            outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in duel])
-            best = self._simplest(believed := [j for j in judged if self._believed(j)] or [best])
+        best, judged, believed = self._challenged(outcome, judged, believed)
         beaten = [arena.judge(j.fitted) for j in beaten if j.total > far]
         alike = self._alike([*judged, *beaten], best, believed[0])
         if len({i.partition(":")[0] for i in alike}) > _ALIKE:
@@ -174,6 +164,30 @@ class Contest:
             self.screen.scout(s, arena.rng, draws=0) for e in wider if e.id not in asked and (s := self._screened(e.id))
         ]
         return [arena.enter([s]) for s in found if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
+
+    def _challenged(
+        self, outcome: Round, judged: list[Judged], believed: list[Judged]
+    ) -> tuple[Judged, list[Judged], list[Judged]]:
+        """The law to accept, when the one about to be accepted has met who may be the right one in its place.
+
+        First what does nearly the same, then, where bodies touch, its rivals at half the physics step.
+
+        Returns:
+          The law, all that were judged, and those of them that are believed; the outcome's ranking has the new ones.
+        """
+        arena, best = self.arena, self._simplest(believed)
+        if mimics := self._mimics(best, judged):
+            judged = sorted([*judged, *mimics], key=lambda j: -j.total)
+            outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in mimics])
+            best = self._simplest(believed := [j for j in judged if self._believed(j)])
+        if rivals := self._rivals(best, judged):
+            duel = self._at_half([best, *rivals])
+            # Their families' other forms were judged at the whole step alone, and lost to these there.
+            families = {arena.new(j)[0].family for j in duel}
+            judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
+            outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in duel])
+            best = self._simplest(believed := [j for j in judged if self._believed(j)] or [best])
+        return best, judged, believed
 
     def _final(self, first: list[Judged]) -> tuple[list[Judged], list[Judged]]:
         """The leading candidates, judged again in a sharper arena, which takes the place of the first; best first.
