@@ -13,7 +13,7 @@ from nfc_gym.measured.arena import Arena, contains
 from nfc_gym.measured.contest import mechanism
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import taken
-from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.screen import Screen
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.base import Effect

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.search import State
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import split

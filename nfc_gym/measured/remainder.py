@@ -11,7 +11,7 @@ from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.laws import Scanned, scan
-from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.screen import Screen
 from nfc_gym.physics.effects.law import Law
 

@@ -19,8 +19,9 @@ from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.merging import merged
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.owned import Data
+from nfc_gym.measured.ranking import Round, known_as
 from nfc_gym.measured.remainder import CLEARLY, SILENT, LawSearch, Remainder
-from nfc_gym.measured.rounds import Contest, Round, known_as
+from nfc_gym.measured.rounds import Contest
 from nfc_gym.measured.screen import Screen, Screened
 from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.sparser import sparser

@@ -13,7 +13,7 @@ from nfc_gym.measured.contest import bootstrap, clusters
 from nfc_gym.measured.fit import Fit, uncertainty
 from nfc_gym.measured.metric import metric, taken
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.ranking import Round
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import Each
 from nfc_gym.physics.rollout import Plant

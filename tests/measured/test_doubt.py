@@ -6,7 +6,7 @@ from hinge import DRY, FRICTION, SPRING, arena, pool
 from nfc_gym.measured import doubt
 from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.doubt import doubted
-from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.ranking import Round
 from nfc_gym.physics.effects import build
 
 RIVALS = ("damping_poly:hinge", "armature:hinge", "external_force:hinge")

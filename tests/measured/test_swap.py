@@ -8,7 +8,7 @@ import pytest
 from hinge import DRY, FRICTION, LAGGING, SCALES, SPRING, VISCOUS, arena, given, pool
 
 from nfc_gym.measured.lookout import Lookout
-from nfc_gym.measured.rounds import Round
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.search import Options, Search, _met
 from nfc_gym.measured.swap import Swap, swapped
 from nfc_gym.physics.effects import build

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.remainder import Remainder
-from nfc_gym.measured.rounds import Round
 from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
