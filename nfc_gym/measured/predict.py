@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,15 +45,17 @@ def predict(
     if out.is_dir():
         raise InputError(f"{out} is a folder: name the file to write in it, as --out {out / 'predicted.npz'}")
     require_writable(out.parent)
+    mujoco.set_mju_user_warning(lambda message: None)  # what comes apart is an error here, said once
     dataset = require(mapping)[0]
     bench = make_bench(dataset)
     models = _models(bench, dataset, fit, stage)
     results: dict[str, Array] = {}
+    of = "the nominal model" if fit is None or stage == "nominal" else f"the {stage} model of fit.json"
     for fold in dataset.folds:
         logs = [log for log in dataset.logs if len(dataset.folds) == 1 or fold.splits[log.name] == "verify"]
         if logs:
             plant, x = models[fold.name]
-            results |= _predict(bench, plant, x, logs, mode, restart)
+            results |= _predict(bench, plant, x, logs, mode, restart, of)
     joined = _join(results)
     out.parent.mkdir(parents=True, exist_ok=True)
     with replacing(out) as part, open(part, "wb") as handle:
@@ -95,10 +98,10 @@ def _read_fit(file: Path, stage: str, plant: Plant) -> tuple[Plant, Array]:
 
 
 def _predict(
-    bench: Bench, plant: Plant, x: Array, logs: list[Log], mode: str, restart: float | None
+    bench: Bench, plant: Plant, x: Array, logs: list[Log], mode: str, restart: float | None, of: str
 ) -> dict[str, Array]:
     if mode == "rollout":
-        return {log.name: _roll(bench, plant, x, log, restart) for log in logs}
+        return {log.name: _roll(bench, plant, x, log, restart, of) for log in logs}
     kind = InverseProblem if mode == "inverse" else ForwardProblem
     states = [bench.states[log.name] for log in logs]
     problem = kind(bench.plant.model, logs, states, bench.dataset.mapping.segments.length)
@@ -106,8 +109,8 @@ def _predict(
     return {log.name: v[0][:, 0] if v.shape[-1] == 1 else v[0] for log, v in zip(logs, values, strict=True)}
 
 
-def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None) -> Array:
-    """One open-loop roll-out of a log, or pieces of `restart` seconds, at the log's own samples."""
+def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None, of: str) -> Array:
+    """One open-loop roll-out of a log, or pieces of `restart` seconds, at the log's own samples; `of` names the model."""
     mapping = bench.dataset.mapping
     dt = float(plant.model.opt.timestep)
     if restart is not None and not restart >= max(dt, log.interval):
@@ -133,8 +136,7 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None)
         values, traj = problem.predict(plant, x[None], problem.segments, problem.observers)
         if not traj.stable.all():
             raise InputError(
-                f"log {log.name!r}: the simulation is unstable with this model; "
-                "shorten segments.timestep or use --restart"
+                f"log {log.name!r}: the simulation is unstable with {of}; shorten segments.timestep or use --restart"
             )
         step = (part.time / dt)[None]
         columns = [interpolate(v, step, o.quaternion)[0, 0] for v, o in zip(values, problem.observers, strict=True)]

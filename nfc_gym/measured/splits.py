@@ -115,7 +115,9 @@ def _matches(entry: LogEntry, folder: Path) -> list[Path]:
     base = Path(pattern.anchor) if pattern.is_absolute() else folder
     relative = str(pattern.relative_to(pattern.anchor)) if pattern.is_absolute() else entry.path
     try:
-        matches = sorted(p for p in base.glob(relative) if is_log(p))
+        # "." is no glob, but the folder itself may be a log.
+        candidates = base.glob(relative) if Path(relative).parts else [base]
+        matches = sorted(p for p in candidates if is_log(p))
     except (ValueError, NotImplementedError) as e:
         raise InputError(f"logs: {entry.path!r} is no path or glob: {e}") from None
     if not matches:

@@ -324,7 +324,8 @@ class _Run:
             signals = self._exogenous(-segments.history)
             for k in range(lead.shape[1]):
                 acting.command(self._tile(lead[:, k]), signals, step)
-            acting.settle_quick()
+            if lead.shape[1]:  # a log may begin no sooner than the history does
+                acting.settle_quick()
         model = self.plant.model
         tracking = past is not None and bool(acting.tracking)
         longest = longest_delay(model)

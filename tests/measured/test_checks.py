@@ -139,6 +139,8 @@ def test_a_doubtful_log_is_a_warning(build: Build, spoil: Any, words: list[str])
         (("column: q, unit: rad,", "column: q, unit: m,"), ["joint 'hinge' turns, but the unit is 'm'"]),
         (("length: 0.4", "length: 5"), ["as long as the longest horizon, 5 s", "shorten"]),
         (('"*.npz"', '"*.csv"'), ["no file matches '*.csv'", "run_0.npz"]),
+        (('"*.npz"', "."), ["no file matches '.'", "run_0.npz"]),
+        (('"*.npz"', "./"), ["no file matches './'", "run_0.npz"]),
     ],
 )
 def test_a_mapping_that_does_not_fit_model_or_logs(build: Build, edit: tuple[str, str], words: list[str]) -> None:

@@ -346,7 +346,7 @@ def test_a_model_that_blows_up_is_named(closed: Closed, tmp_path: Path) -> None:
     wild = wild.replace('<motor name="motor" joint="hinge"/>', '<position name="motor" joint="hinge" kp="1e9"/>')
     (tmp_path / "arm.xml").write_text(wild)
     mapping.write_text(mapping.read_text().replace("unit: Nm", "unit: rad"))
-    with pytest.raises(InputError, match=r"log '.*': the simulation is unstable with this model"):
+    with pytest.raises(InputError, match=r"log '.*': the simulation is unstable with the nominal model"):
         predict(mapping, None, "rollout", "nominal", tmp_path / "p.npz")
     with pytest.raises(InputError, match=r"arm\.xml: the simulation is unstable on every segment .* step of 0\.005 s"):
         close_loop(mapping, tmp_path / "out", jobs=1)

@@ -172,6 +172,15 @@ def test_thermal_heat_begins_where_the_log_does() -> None:
     assert abs(settled / whole.qvel[0, 0, -1, 0] - 1) > 0.1
 
 
+def test_thermal_heat_of_a_log_that_begins_with_its_history() -> None:
+    """With nothing commanded before the history the drive's heat settles at the history's first command."""
+    effect, theta = make("thermal", "push", {"fade": 0.5, "time_constant": 2.0, "reference": 1.0})
+    still = np.zeros((1, 51, 1))
+    seg = Segments(DT, 50, np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 150, 1)), past=Past.given(still, still))
+    found = plant_of(MODEL, effect).shoot(theta[None], seg)
+    assert found.qvel[0, 0, -1, 0] == run(RAIL, effect, theta, 100, ctrl=[1.0], history=50).qvel[0, 0, -1, 0]
+
+
 def test_generic_memory_stands_for_laws_it_does_not_know() -> None:
     """A Bouc-Wen joint (n = 2, sigma = 0.6) led through turns: memory explains it, a function of place does not."""
     x = np.concatenate([np.linspace(0, 0.3, 300), np.linspace(0.3, -0.2, 500), np.linspace(-0.2, 0.25, 450)])
