@@ -110,7 +110,7 @@ def _predict(
 
 
 def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None, of: str) -> Array:
-    """One open-loop roll-out of a log, or pieces of `restart` seconds, at the log's own samples; `of` names the model."""
+    """One open-loop roll-out of a log by the model `of`, or pieces of `restart` seconds, at the log's own samples."""
     mapping = bench.dataset.mapping
     dt = float(plant.model.opt.timestep)
     if restart is not None and not restart >= max(dt, log.interval):
