@@ -250,7 +250,6 @@ class _Run:
         self.qpos[...], self.qvel[...] = q, v
         self.acting = Acting(model, plant.effects, self.thetas, self.fields, self.batch, segments.dt)
         self.reads = {s for e in plant.effects for s in e.signals}
-        self.contacts, self.touched = self.batch.bind("ncon"), np.zeros(len(rows), bool)
         if sensors:
             self.batch.bind("sensordata")
 
@@ -292,29 +291,59 @@ class _Run:
 
     def roll(self) -> Trajectory:
         """Step through all segments at once."""
-        model, batch, steps = self.plant.model, self.batch, self.segments.steps
-        rows = batch.nsim
         self._remember()
-        qpos, qvel = np.empty((steps + 1, rows, model.nq)), np.empty((steps + 1, rows, model.nv))
-        sensed = np.empty((steps + 1, rows, model.nsensordata)) if self.sensors else None
         if self.segments.settle:
             start = self.qpos.copy()
             for k in range(self.segments.settle):
                 self._advance(0, first=k == 0)
             self.qpos[...] = start
-            batch.qacc_warmstart[...] = 0
+            self.batch.qacc_warmstart[...] = 0
             self.acting.derived.clear()
+        return self._in_turns() if self._watched() else self._at_once()
+
+    def _watched(self) -> bool:
+        """Whether something in Python must see the state, or write to the model, before every step."""
+        return bool(self.acting.acts or self.segments.servo or self.varying)
+
+    def _in_turns(self) -> Trajectory:
+        """Step by step, with hooks in between."""
+        model, batch, steps = self.plant.model, self.batch, self.segments.steps
+        rows, contacts = batch.nsim, batch.bind("ncon")
+        touched = np.zeros(rows, bool)
+        qpos, qvel = np.empty((steps + 1, rows, model.nq)), np.empty((steps + 1, rows, model.nv))
+        sensed = np.empty((steps + 1, rows, model.nsensordata)) if self.sensors else None
         for k in range(steps):
             qpos[k], qvel[k] = self.qpos, self.qvel
             self._advance(k, first=k == 0)
-            self.touched |= self.contacts > 0
+            touched |= contacts > 0
             if sensed is not None:
                 sensed[k] = batch.sensordata
         qpos[steps], qvel[steps] = self.qpos, self.qvel
         if sensed is not None:
             batch.forward()
             sensed[steps] = batch.sensordata
-        return self._result(qpos, qvel, sensed)
+        parts = (a if a is None else a.swapaxes(0, 1) for a in (qpos, qvel, sensed))
+        return self._result(*parts, touched)
+
+    def _at_once(self) -> Trajectory:
+        """All steps in one call of the engine, which takes the commands of all: a fifth faster, and the same bits."""
+        batch, steps = self.batch, self.segments.steps
+        begin = {"qpos": self.qpos.copy(), "qvel": self.qvel.copy()}
+        if self.acting.commanding:
+            ctrl = np.empty((batch.nsim, steps, self.plant.model.nu))
+            for k in range(steps):
+                ctrl[:, k] = self._command(k, self._exogenous(k))
+        else:
+            ctrl = self._tile(self.segments.ctrl[:, self.segments.history :])
+        self._settle(ctrl[:, 0])
+        record = (*begin, "ncon", *(["sensordata"] if self.sensors else []))
+        found = batch.rollout(steps, ctrl, record=record)
+        q, v = (np.concatenate([first[:, None], found[name]], 1) for name, first in begin.items())
+        sensed = None
+        if self.sensors:  # after a step sensors read what they did before it
+            batch.forward()
+            sensed = np.concatenate([found["sensordata"], batch.sensordata[:, None]], 1)
+        return self._result(q, v, sensed, (found["ncon"] > 0).any(1))
 
     def _remember(self) -> None:
         """Lead the hidden states through what was commanded and measured before the starts."""
@@ -354,31 +383,36 @@ class _Run:
 
     def _advance(self, k: int, first: bool) -> None:
         """One physics step under the command of step k."""
-        model, batch, exogenous = self.plant.model, self.batch, self._exogenous(k)
+        batch, exogenous = self.batch, self._exogenous(k)
         for bound, values in self.varying:
             write_field(self.fields, bound, self._tile(values[:, self.segments.history + k]))
         self.ctrl[...] = self._serve(k, self._command(k, exogenous), self.qpos, self.qvel)
-        # Without a history actuator states begin settled.
-        if first and self.segments.history == 0 and self.segments.settle == 0:
-            self.activations.advance(self.ctrl, self.act, settle=True)
-            if longest_delay(model):
-                fill_delays(model, [self.ctrl], batch.bind("history"))
+        if first:
+            self._settle(self.ctrl)
         if self.acting.pushing:
             batch.qfrc_applied[...] = 0
             batch.xfrc_applied[...] = 0
         self.acting.push(self.ctrl, exogenous)
         batch.step()
 
-    def _result(self, qpos: Array, qvel: Array, sensed: Array | None) -> Trajectory:
+    def _settle(self, ctrl: Array) -> None:
+        """Without a history actuators' states begin settled at the first command (rows, nu)."""
+        if self.segments.history == 0 and self.segments.settle == 0:
+            self.activations.advance(ctrl, self.act, settle=True)
+            if longest_delay(self.plant.model):
+                fill_delays(self.plant.model, [ctrl], self.batch.bind("history"))
+
+    def _result(self, qpos: Array, qvel: Array, sensed: Array | None, touched: NDArray[np.bool_]) -> Trajectory:
+        """Of arrays (rows, K + 1, n), and (rows,)."""
         stable = (
-            np.isfinite(qpos).all((0, 2)) & np.isfinite(qvel).all((0, 2)) & (self.batch.warning[..., 1].sum(-1) == 0)
+            np.isfinite(qpos).all((1, 2)) & np.isfinite(qvel).all((1, 2)) & (self.batch.warning[..., 1].sum(-1) == 0)
         )
-        size = len(self.segments)
+        lead = self.count, len(self.segments)
 
         def shape(a: Array) -> Array:
-            return np.ascontiguousarray(a.reshape(len(a), self.count, size, -1).transpose(1, 2, 0, 3))
+            return np.ascontiguousarray(a).reshape(*lead, *a.shape[1:])
 
         return Trajectory(
             shape(qpos), shape(qvel), None if sensed is None else shape(sensed),
-            stable.reshape(self.count, size), self.touched.reshape(self.count, size),
+            stable.reshape(lead), touched.reshape(lead),
         )  # fmt: skip
