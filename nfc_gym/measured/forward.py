@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
+from mujoco.batch import MODEL_FIELDS, Batch
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
@@ -53,17 +53,21 @@ class ForwardProblem(InstantProblem):
         count = len(x)
         lengths = [len(t.time) for t in tracks]
         samples = sum(lengths)
-        batch = Batch(plant.model, count * samples, plant.nthread)
-        fields = ModelFields(batch, plant.model)
-        rows = np.repeat(x, samples, 0)
-        plant.write(fields, rows)
-        fields.commit()
-        join = lambda name: np.tile(np.concatenate([getattr(t, name) for t in tracks]), (count, 1))  # noqa: E731
+        # What remembers must be led through every sample.
+        whole = any(overrides(e, hook) for e in plant.effects for hook in ("follow", "sense"))
+        every = [np.ones(len(t.time), bool) if whole or t.wanted is None else t.wanted for t in tracks]
+        kept = np.flatnonzero(np.concatenate(every))
+        batch = Batch(plant.model, count * len(kept), plant.nthread)
+        fields = _written(batch, plant, x)
+        rows = np.repeat(x, len(kept), 0)
+        join = lambda name: np.tile(np.concatenate([getattr(t, name) for t in tracks])[kept], (count, 1))  # noqa: E731
         batch.qpos[...], batch.qvel[...] = join("qpos"), join("qvel")
-        batch.ctrl[...] = np.concatenate([u for u, _ in commands], 1).reshape(count * samples, -1)
-        batch.act[...] = np.concatenate([a for _, a in commands], 1).reshape(count * samples, -1)
+        batch.ctrl[...] = np.concatenate([u for u, _ in commands], 1)[:, kept].reshape(len(rows), -1)
+        batch.act[...] = np.concatenate([a for _, a in commands], 1)[:, kept].reshape(len(rows), -1)
         sensordata = batch.bind("sensordata")  # bound before the call that fills it
-        exogenous = {k: np.tile(np.concatenate([t.exogenous[k] for t in tracks]), count) for k in tracks[0].exogenous}
+        exogenous = {
+            k: np.tile(np.concatenate([t.exogenous[k] for t in tracks])[kept], count) for k in tracks[0].exogenous
+        }
         thetas = plant.split(rows)[1]
         pushing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "force")]
         if pushing:
@@ -87,7 +91,8 @@ class ForwardProblem(InstantProblem):
                 effect.force(ctx, theta, out)
             batch.qfrc_applied[...], batch.xfrc_applied[...] = out.qfrc, out.xfrc
         batch.forward()
-        sensed = sensordata.reshape(count, samples, -1)
+        sensed = np.zeros((count, samples, sensordata.shape[-1]))
+        sensed[:, kept] = sensordata.reshape(count, len(kept), -1)
         return self._read(plant, x, sensed, lengths, tracks[0].dt)
 
     def _read(self, plant: Plant, x: Array, sensed: Array, lengths: Sequence[int], dt: float) -> list[Array]:
@@ -103,6 +108,22 @@ class ForwardProblem(InstantProblem):
                 columns.append(o.pick(values))
             out.append(np.concatenate(columns, -1))
         return out
+
+
+def _written(batch: Batch, plant: Plant, x: Array) -> ModelFields:
+    """Fields of a batch, with the same number of rows in turn for each parameter vector (P, size).
+
+    Each vector is written into one model, from which MuJoCo derives its constants, and not into every row.
+    """
+    few = Batch(plant.model, len(x), 1)
+    fields = ModelFields(few, plant.model)
+    plant.write(fields, x)
+    fields.commit()
+    for name in MODEL_FIELDS:
+        values = few.expanded(name)
+        if values is not None:
+            batch.expand(name)[...] = np.repeat(values, batch.nsim // len(x), 0)
+    return ModelFields(batch, plant.model)
 
 
 def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[tuple[Array, Array]]:

@@ -7,7 +7,7 @@ they are what a machine offers that measures forces, or whose states are known w
 import copy
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -28,7 +28,10 @@ _AT_ONCE = 200_000  # samples of all tracks under all parameter vectors
 
 @dataclass(frozen=True)
 class Track:
-    """One log thinned to every `stride`-th sample: what the model is evaluated at, and what it is compared with."""
+    """One log thinned to every `stride`-th sample: what the model is evaluated at, and what it is compared with.
+
+    `wanted` (T,) says at which samples a prediction is asked for; None is all, and a problem may give more.
+    """
 
     name: str
     time: Array
@@ -43,6 +46,7 @@ class Track:
     mask: NDArray[np.bool_]
     noise: Array
     condition: str = ""
+    wanted: NDArray[np.bool_] | None = None
 
 
 def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[str], stride: int) -> Track:
@@ -152,7 +156,7 @@ class InstantProblem(Problem):
     def residual(self, plant: Plant, x: Array) -> Array:
         """See `Problem`."""
         needed = np.unique(self.log_of)
-        predicted = self.along(plant, x, [self.tracks[i] for i in needed])
+        predicted = self.along(plant, x, [replace(self.tracks[i], wanted=self._wanted(i)) for i in needed])
         out = np.zeros((len(x), *self.mask.shape))
         for i, values in zip(needed, predicted, strict=True):
             t = self.tracks[i]
@@ -161,6 +165,13 @@ class InstantProblem(Problem):
                 error = self.smoothed(np.where(np.isfinite(t.measured), t.measured, 0) - values[p])
                 out[p, where] = error[self.rows[where]].reshape(len(where), -1)
         return np.where(self.mask, out, 0.0)
+
+    def _wanted(self, log: int) -> NDArray[np.bool_]:
+        """Samples of a track that its blocks are smoothed from."""
+        reach = max(1, self.smooth // self.stride)
+        read = np.zeros(len(self.tracks[log].time))
+        read[self.rows[self.log_of == log]] = 1.0
+        return np.convolve(read, np.ones(2 * reach + 1))[reach : reach + len(read)] > 0.5
 
     def covariance(self, plant: Plant, x: Array) -> Array:
         """Sensor noise alone: what the differentiated motion adds is unknown and lands in the unexplained variance."""

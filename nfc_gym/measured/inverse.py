@@ -1,7 +1,7 @@
 """Inverse problems: the actuator forces that a measured motion needs, against measured ones."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, cached_property
 
 import mujoco
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.instant import InstantProblem, Track
+from nfc_gym.measured.recent import Recent
 from nfc_gym.physics.effects.base import Context, Effect, Forces, actuator_names, overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import resolve, write_field
@@ -20,6 +21,7 @@ from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 _NO_CUT = 1e10  # dry friction, N or N m, that no motion overcomes
+_WALKED = 200_000_000  # bytes of inverse dynamics that a problem remembers
 _LOAD_PASSES = 3  # friction that depends on the actuator's load, and a load that includes the friction: iterations
 
 
@@ -35,6 +37,11 @@ class InverseProblem(InstantProblem):
             )
         self.actuators = [actuator_names(model).index(c.removeprefix("force:")) for c in found]
         return found
+
+    @cached_property
+    def _walked(self) -> Recent:
+        """Inverse dynamics along tracks, which most candidates' fits ask for at the same psi."""
+        return Recent(_WALKED)
 
     def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str]]:
         """One column an actuator."""
@@ -53,13 +60,13 @@ class InverseProblem(InstantProblem):
         for dt in dict.fromkeys(t.dt for t in tracks):
             of = [i for i, t in enumerate(tracks) if t.dt == dt]
             alike = [tracks[i] for i in of]
-            parts = [actuator_forces(plant, x[some], alike) for some in self.turns(len(x), alike)]
+            parts = [actuator_forces(plant, x[some], alike, self._walked) for some in self.turns(len(x), alike)]
             for i, forces in zip(of, zip(*parts, strict=True), strict=True):
                 out[i] = np.concatenate(forces)[..., self.actuators]
         return out
 
 
-def actuator_forces(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
+def actuator_forces(plant: Plant, x: Array, tracks: Sequence[Track], walked: Recent | None = None) -> list[Array]:
     """Forces of joint actuators that measured motions need, at parameter vectors.
 
     Generalised forces come from `mj_inverse`, less what force effects add; dry friction that depends on the actuator's
@@ -68,20 +75,25 @@ def actuator_forces(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Arr
     Args:
       plant: the machine.
       x: (P, size).
-      tracks: of one step dt.
+      tracks: of one step dt; those of one name are the same track.
+      walked: remembers inverse dynamics from call to call.
 
     Returns:
       (P, T, nu) for each track.
     """
     psi, thetas = plant.split(x)
-    edits = [theta for e, theta in zip(plant.effects, thetas, strict=True) if overrides(e, "model")]
-    same = [row.tobytes() for row in np.concatenate([psi, *edits], -1)]  # parameter vectors of one and the same model
+    walked = Recent(_WALKED) if walked is None else walked
+    edits = [(e, theta) for e, theta in zip(plant.effects, thetas, strict=True) if overrides(e, "model")]
+    editing = tuple(e for e, _ in edits)
+    # Parameter vectors of one and the same model.
+    same = [row.tobytes() for row in np.concatenate([psi, *(theta for _, theta in edits)], -1)]
     parts: list[_Needed] = []
     for t in tracks:
         motions: dict[bytes, _Motion] = {}
         for key, row in zip(same, x, strict=True):
             if key not in motions:
-                motions[key] = _Motion(plant, row, t)
+                question = t.name, plant.model, plant.space, editing, key
+                motions[key] = _Motion(plant, row, t, lambda walk, asked=question: walked(asked, walk))
             parts.append(_Needed(plant, row, motions[key]))
     if any(overrides(e, "force") for e in plant.effects):
         _push(plant, x, tracks, parts)
@@ -161,10 +173,13 @@ class _Needed:
 
 
 class _Motion:
-    """Inverse dynamics of one model along a track, with the derived fields that effects may read."""
+    """Inverse dynamics of one model along a track, with the derived fields that effects may read.
 
-    def __init__(self, plant: Plant, x: Array, t: Track) -> None:
-        self.model, self.track = copy.copy(plant.model), t
+    `known` is handed what would work them out, (4, T, nv) as `_walk` gives them, and may know them already.
+    """
+
+    def __init__(self, plant: Plant, x: Array, t: Track, known: Callable[[Callable[[], Array]], Array]) -> None:
+        self.model, self.track, self._known = copy.copy(plant.model), t, known
         self._fields: dict[str, Array] = {}
         fields = ModelFields(self.model, plant.model)
         for (name, of), values in t.known.items():
@@ -175,14 +190,21 @@ class _Motion:
 
     @cached_property
     def _solved(self) -> tuple[Array, Array]:
-        """(T, nv) each: generalised forces without dry friction, and the friction that would hold each joint.
+        """(T, nv) each: generalised forces without dry friction, and the friction that would hold each joint."""
+        free, holding, bias, passive = self._known(self._walk)
+        self._fields |= {"qfrc_bias": bias, "qfrc_passive": passive}
+        return free + holding, holding
+
+    def _walk(self) -> Array:
+        """(4, T, nv): forces that are needed, friction that would hold each joint, `qfrc_bias` and `qfrc_passive`.
 
         MuJoCo's friction of a joint is the force that would hold it, cut at `frictionloss`, and in inverse dynamics no
         joint's depends on another's: one pass with no cut tells what is needed under any.
         """
         m, t = self.model, self.track
         d = mujoco.MjData(m)
-        free, holding, bias, passive = (np.zeros((len(t.time), m.nv)) for _ in range(4))
+        out = np.zeros((4, len(t.time), m.nv))
+        free, holding, bias, passive = out
         # Each look at a field of `MjData` makes a new view, which costs as much as the dynamics of a small machine.
         qpos, qvel, qacc = d.qpos, d.qvel, d.qacc
         needed, its_bias, its_passive = d.qfrc_inverse, d.qfrc_bias, d.qfrc_passive
@@ -194,8 +216,7 @@ class _Motion:
                 holding[k] = d.efc_force[d.ne : d.ne + m.nv]
             free[k], bias[k], passive[k] = needed, its_bias, its_passive
         m.dof_frictionloss[:] = self.friction
-        self._fields |= {"qfrc_bias": bias, "qfrc_passive": passive}
-        return free + holding, holding
+        return out
 
     def inverse(self, friction: Array) -> Array:
         """(T, nv) generalised forces with dry friction (nv,) or (T, nv)."""
