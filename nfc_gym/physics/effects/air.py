@@ -45,6 +45,7 @@ class BodyMotion:
 
     def __init__(self, model: mujoco.MjModel, body: int) -> None:
         self.body, self.root, self.hull = body, int(model.body_rootid[body]), hull(model, body)
+        self._at = self.hull.tolist()
         joint = int(model.body_jntadr[body])
         self.free = joint >= 0 and int(model.jnt_type[joint]) == _FREE
         if self.free:
@@ -72,7 +73,7 @@ class BodyMotion:
     def _of_joint(self, ctx: Context) -> tuple[Parts, Parts]:
         """The joint's velocity in the world, and what turning about it adds, along the body's axes."""
         x, y, z, *turning = components(ctx.v[..., self.rates])
-        return (x, y, z), cross_parts(turning, self.hull.tolist())
+        return (x, y, z), cross_parts(turning, self._at)
 
     def _derived(self, ctx: Context) -> Parts:
         spatial = ctx.data("cvel")[..., self.body, :]
@@ -91,7 +92,10 @@ class BodyMotion:
 
     def _lever(self, ctx: Context) -> Array | None:
         """(..., 3) way from the centre of mass to the hull, in the world; None where they are one."""
-        away = self.hull - ctx.nominal("body_ipos")[..., self.body, :]
+        centre = ctx.nominal("body_ipos")[..., self.body, :]
+        if centre.ndim == 1 and centre.tolist() == self._at:  # a single robot asks at every step: a sixth of the time
+            return None
+        away = self.hull - centre
         return joined(rotate_parts(self.quat(ctx), components(away))) if away.any() else None
 
 
