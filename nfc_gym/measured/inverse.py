@@ -1,7 +1,7 @@
 """Inverse problems: the actuator forces that a measured motion needs, against measured ones."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache, cached_property
 
 import mujoco
@@ -83,17 +83,14 @@ def actuator_forces(plant: Plant, x: Array, tracks: Sequence[Track], walked: Rec
     """
     psi, thetas = plant.split(x)
     walked = Recent(_WALKED) if walked is None else walked
-    edits = [(e, theta) for e, theta in zip(plant.effects, thetas, strict=True) if overrides(e, "model")]
-    editing = tuple(e for e, _ in edits)
-    # Parameter vectors of one and the same model.
-    same = [row.tobytes() for row in np.concatenate([psi, *(theta for _, theta in edits)], -1)]
+    edits = [theta for e, theta in zip(plant.effects, thetas, strict=True) if overrides(e, "model")]
+    same = [row.tobytes() for row in np.concatenate([psi, *edits], -1)]  # parameter vectors of one and the same model
     parts: list[_Needed] = []
     for t in tracks:
         motions: dict[bytes, _Motion] = {}
         for key, row in zip(same, x, strict=True):
             if key not in motions:
-                question = t.name, plant.model, plant.space, editing, key
-                motions[key] = _Motion(plant, row, t, lambda walk, asked=question: walked(asked, walk))
+                motions[key] = _Motion(plant, row, t, walked)
             parts.append(_Needed(plant, row, motions[key]))
     if any(overrides(e, "force") for e in plant.effects):
         _push(plant, x, tracks, parts)
@@ -173,13 +170,10 @@ class _Needed:
 
 
 class _Motion:
-    """Inverse dynamics of one model along a track, with the derived fields that effects may read.
+    """Inverse dynamics of one model along a track, with the derived fields that effects may read."""
 
-    `known` is handed what would work them out, (4, T, nv) as `_walk` gives them, and may know them already.
-    """
-
-    def __init__(self, plant: Plant, x: Array, t: Track, known: Callable[[Callable[[], Array]], Array]) -> None:
-        self.model, self.track, self._known = copy.copy(plant.model), t, known
+    def __init__(self, plant: Plant, x: Array, t: Track, walked: Recent) -> None:
+        self.model, self.track, self._walked = copy.copy(plant.model), t, walked
         self._fields: dict[str, Array] = {}
         fields = ModelFields(self.model, plant.model)
         for (name, of), values in t.known.items():
@@ -187,11 +181,14 @@ class _Motion:
         plant.write(fields, x)
         fields.commit()
         self.friction = self.model.dof_frictionloss.copy()
+        # A walk is the same under any dry friction.
+        edited = {k: v.tobytes() for k, v in fields.touched.items() if k != "dof_frictionloss"}
+        self._question = t.name, plant.model, tuple(sorted(edited.items()))
 
     @cached_property
     def _solved(self) -> tuple[Array, Array]:
         """(T, nv) each: generalised forces without dry friction, and the friction that would hold each joint."""
-        free, holding, bias, passive = self._known(self._walk)
+        free, holding, bias, passive = self._walked(self._question, self._walk)
         self._fields |= {"qfrc_bias": bias, "qfrc_passive": passive}
         return free + holding, holding
 

@@ -5,6 +5,7 @@ the nominal model, so that repeated randomisation never compounds, and derived c
 """
 
 import copy
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -117,6 +118,11 @@ class ModelFields:
                     self._scalars.add(name)
                 self._arrays[name] = np.asarray(value, float) if name in self._scalars else value
         return self._arrays[name]
+
+    @property
+    def touched(self) -> Mapping[str, NDArray]:
+        """Fields that were asked for so far, as they are now: none of the others differs from nominal."""
+        return self._arrays
 
     def restore(self) -> None:
         """Every field touched so far goes back to its nominal value."""

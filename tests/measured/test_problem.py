@@ -6,6 +6,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from mujoco.batch import Batch
 
 from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.measured.forward import ForwardProblem
@@ -15,6 +16,7 @@ from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem, finer, interpolate
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import FAMILIES
+from nfc_gym.physics.effects.inertial import complete_inertia
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -46,6 +48,8 @@ BODY = f"""
   <sensor><accelerometer name="acc" site="imu"/><gyro name="gyro" site="imu"/></sensor>
 </mujoco>
 """
+
+OF_MASS = Parameter("mass", "body_mass", ("base",), "kg", 1, 4)
 
 
 def torque(t: np.ndarray, seed: int) -> np.ndarray:
@@ -271,7 +275,7 @@ def flight(rotating: bool) -> Log:
 @pytest.mark.parametrize("rotating", [False, True])
 def test_forward_problem_reads_the_accelerometer_of_the_closed_form(rotating: bool) -> None:
     model = mujoco.MjModel.from_xml_string(BODY)
-    plant = Plant(model, ParameterSpace(model, [Parameter("mass", "body_mass", ("base",), "kg", 1, 4)]), nthread=1)
+    plant = Plant(model, ParameterSpace(model, [OF_MASS]), nthread=1)
     log = flight(rotating)
     problem = ForwardProblem(model, [log], [estimate_states(model, log)], 0.25)
     predicted = problem.evaluate(plant, np.array([[2.0], [3.0]]), problem.tracks)[0]
@@ -287,7 +291,7 @@ def test_forward_problem_reads_the_accelerometer_of_the_closed_form(rotating: bo
 def test_forward_problem_pushes_by_laws_that_read_the_state() -> None:
     """A body that leans by 0.3 rad climbs at 0.3 m/s: along its own axis air pushes back by c v cos 0.3."""
     model = mujoco.MjModel.from_xml_string(BODY)
-    space = ParameterSpace(model, [Parameter("mass", "body_mass", ("base",), "kg", 1, 4)])
+    space = ParameterSpace(model, [OF_MASS])
     drag, quadratic = (FAMILIES[f](("base",)) for f in ("drag_linear", "drag_quadratic"))
     plant = Plant(model, space, [drag, quadratic], nthread=1)
     log = flight(False)
@@ -297,6 +301,79 @@ def test_forward_problem_pushes_by_laws_that_read_the_state() -> None:
     for row, force in zip(predicted, (2.0 * 0.3, 5.0 * 0.3**2), strict=True):
         wanted = (log.controls["ctrl:thrust"] - force * np.cos(0.3)) / 2.0
         np.testing.assert_allclose(row[:, 2], wanted, rtol=1e-4)
+
+
+def movable() -> mujoco.MjModel:
+    """The body, with a centre of mass that effects may shift."""
+    spec = mujoco.MjSpec.from_string(BODY)
+    complete_inertia(spec)
+    return spec.compile()
+
+
+@pytest.mark.parametrize("family", [None, "drag_linear", "payload", "sensor_delay"])
+def test_forward_problem_of_some_blocks_is_that_part_of_the_whole(
+    family: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only samples of these blocks are evaluated, but for what remembers the samples before."""
+    model = movable()
+    log = flight(False)
+    smooth = replace(log.channels["sensor:acc"], smooth=6)
+    log = replace(log, channels={**log.channels, "sensor:acc": smooth})
+    where = "sensor:acc" if family == "sensor_delay" else "base"
+    effects = [FAMILIES[family]((where,))] if family else []
+    plant = Plant(model, ParameterSpace(model, [OF_MASS]), effects, nthread=1)
+    x = np.stack([np.concatenate([[m], *(e.null + 0.02 for e in effects)]) for m in (2.0, 2.5)])
+    problem = ForwardProblem(model, [log], [estimate_states(model, log)], 0.25)
+    whole, few = problem.residual(plant, x), np.array([1, 4])
+    sizes: list[int] = []
+
+    def counted(model: mujoco.MjModel, nsim: int, nthread: int) -> Batch:
+        sizes.append(nsim)
+        return Batch(model, nsim, nthread)
+
+    monkeypatch.setattr("nfc_gym.measured.forward.Batch", counted)
+    np.testing.assert_array_equal(problem.take(few).residual(plant, x), whole[:, few])
+    assert (max(sizes) == 2 * len(problem.tracks[0].time)) == (family == "sensor_delay")
+
+
+def test_forward_problem_has_the_constants_of_each_parameter_vector() -> None:
+    """A lump changes what MuJoCo derives from masses: the body's inverse weight, by which rows would differ."""
+    model = movable()
+    lump = FAMILIES["payload"](("base",))
+    plant = Plant(model, ParameterSpace(model, [OF_MASS]), [lump], nthread=1)
+    log = flight(True)
+    problem = ForwardProblem(model, [log], [estimate_states(model, log)], 0.25)
+    x = np.stack([np.concatenate([[m], lump.null + s]) for m, s in ((2.0, 0.0), (3.0, 0.05))])
+    together = problem.residual(plant, x)
+    for k in (0, 1):
+        np.testing.assert_array_equal(together[k], problem.residual(plant, x[[k]])[0])
+    assert np.abs(together[0] - together[1]).max() > 1
+
+
+def test_inverse_dynamics_under_any_dry_friction_are_worked_out_once(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    t = np.arange(0, 3, 0.005)
+    q, v, a = analytic(t)
+    values = {"pos": (q, "rad"), "vel": (v, "rad/s"), "acc": (a, "rad/s^2")}
+    channels = {f"joint:hinge:{k}": Channel(c, unit, 1e-4) for k, (c, unit) in values.items()}
+    channels["force:motor"] = Channel(forces(q, v, a, DAMPING), "N m", 1e-3)
+    log = Log("swing", t, {"ctrl:motor": np.zeros_like(t)}, channels)
+    problem = InverseProblem(plant.model, [log], [estimate_states(plant.model, log)], 0.25)
+    calls: list[int] = []
+    solve = mujoco.mj_inverse
+    monkeypatch.setattr(mujoco, "mj_inverse", lambda m, d: calls.append(1) or solve(m, d))
+    bare = problem.residual(plant, np.array([[DAMPING]]))
+    assert len(calls) == len(t)
+    rubbing = plant.with_effects([FAMILIES["coulomb"](("hinge",))])  # whose joint holds otherwise than a free one
+    little, much = (problem.residual(rubbing, np.array([[DAMPING, level]])) for level in (0.05, 0.15))
+    assert len(calls) == 2 * len(t)
+    assert np.abs(little - bare).max() == pytest.approx(0.05 / GEAR, rel=0.01)
+    assert np.abs(much - bare).max() == pytest.approx(0.15 / GEAR, rel=0.01)
+    np.testing.assert_array_equal(problem.residual(plant, np.array([[DAMPING]])), bare)
+    assert len(calls) == 2 * len(t)
+    problem.residual(plant, np.array([[2 * DAMPING]]))
+    assert len(calls) == 3 * len(t)
 
 
 @pytest.mark.parametrize(("kind", "word"), [(InverseProblem, "force:<actuator>"), (ForwardProblem, "sensor:<name>")])

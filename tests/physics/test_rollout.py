@@ -49,6 +49,31 @@ def test_without_effects_it_is_a_loop_of_mj_step(history: int) -> None:
     assert t.stable.all()
 
 
+class Watching(Effect):
+    """Does nothing, before every step."""
+
+    family = "watching"
+
+    def __init__(self) -> None:
+        super().__init__(("all",), [])
+
+    def force(self, ctx: Context, theta: np.ndarray, out: Forces) -> None: ...
+
+
+@pytest.mark.parametrize("family", [None, "lag", "thermal", "coulomb"])
+@pytest.mark.parametrize(("history", "settle"), [(0, 0), (15, 0), (15, 7)])
+def test_steps_in_one_call_are_those_with_hooks_in_between(family: str | None, history: int, settle: int) -> None:
+    segments = replace(zoo_segments(MODEL, 3, size=3, history=history), settle=settle)
+    effects = [candidates(MODEL)[family][0]] if family else []
+    x = np.concatenate([NONE[0], *map(probe, effects)])[None]
+    for sensors in (False, True):
+        whole = plant_of(MODEL, *effects).shoot(x, segments, sensors)
+        watched = plant_of(MODEL, *effects, Watching()).shoot(x, segments, sensors)
+        for field in ("qpos", "qvel", "sensordata", "stable", "touched"):
+            np.testing.assert_array_equal(getattr(whole, field), getattr(watched, field))
+    assert whole.touched.any()
+
+
 def test_sensors_that_nobody_asks_for_are_not_computed_and_the_motion_is_the_same() -> None:
     class Reading(Effect):
         family = "reading"
