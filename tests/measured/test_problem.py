@@ -350,7 +350,7 @@ def test_forward_problem_has_the_constants_of_each_parameter_vector() -> None:
     assert np.abs(together[0] - together[1]).max() > 1
 
 
-def test_inverse_dynamics_under_any_dry_friction_are_worked_out_once(
+def test_inverse_dynamics_under_any_friction_are_worked_out_once(
     plant: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     t = np.arange(0, 3, 0.005)
