@@ -20,6 +20,13 @@ ID = "nfc_gym/JackalFlat-v0"
 DRIVES = "front_left+front_right+rear_left+rear_right"
 
 
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer segments and rounds than a mission's, in half the time."""
+    monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 20)
+    monkeypatch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4, 0.2, 0.05))
+
+
 def test_sizes_are_absent_at_their_null_and_stay_within_bounds() -> None:
     structure = structure_of(Machine(ID))
     far = 40.0 * np.stack([-np.ones(len(structure)), np.ones(len(structure))])
