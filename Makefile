@@ -25,8 +25,8 @@ demo: setup ## run the whole loop on a simulated stand-in machine; the report la
 	@rm -rf demo
 	$(BIN)/nfc-gym demo --out demo
 
-test: setup ## run the test suite
-	$(BIN)/python -m pytest
+test: setup ## run the test suite, or part of it: make test TESTS=tests/measured
+	$(BIN)/python -m pytest $(TESTS)
 
 check: setup ## lint, format and types
 	$(BIN)/ruff check .

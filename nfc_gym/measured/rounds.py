@@ -108,14 +108,15 @@ class Contest:
         return outcome, best
 
     def _shared(self, entered: Sequence[Judged]) -> list[Judged]:
-        """Where bodies touch, the leading law of one place at the sets of like places that it belongs to.
+        """Where bodies touch, the leading law at the wider sets of like places that its own belong to.
 
         A limit that all drives share is reached now by one and now by another, and straight lines from its realistic
-        size may show nothing of it. What promises enough at some share of that size is fitted.
+        size may show nothing of it; a dead zone of all of them shows most at the hips. What promises enough at some
+        share of that size is fitted.
         """
         arena = self.arena
         new = arena.new(entered[0]) if self.rough and entered else []
-        if len(new) != 1 or len(new[0].where) > 1:
+        if len(new) != 1:
             return []
         asked = {arena.label(j) for j in entered}
         wider = [e for e in self.pool.values() if e.family == new[0].family and set(new[0].where) < set(e.where)]

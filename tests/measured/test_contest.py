@@ -293,7 +293,7 @@ def test_a_shifted_centre_of_mass_is_not_believed_before_a_load_was_asked() -> N
     assert asking(screened, [shift, elsewhere])._mimics(best, [best]) == []
 
 
-def test_the_leading_law_of_one_place_is_tried_where_like_places_share_it() -> None:
+def test_the_leading_law_is_tried_where_like_places_share_it() -> None:
     """Only sets that hold the place, were not asked and promise enough are fitted; nothing is where nothing touches."""
     law = FAMILIES["saturation"]
     one, both, three, other = (law(w) for w in (("a",), ("a", "b"), ("a", "b", "c"), ("b", "c")))
@@ -306,7 +306,10 @@ def test_the_leading_law_of_one_place_is_tried_where_like_places_share_it() -> N
     screen.scout = lambda s, rng, draws: replace(s, gain=gains[s.effect.id])  # type: ignore[method-assign]
     assert contest._shared([refitted(one), refitted(other)]) == [both.id]
     assert contest._shared([refitted(one), refitted(both)]) == []
-    assert contest._shared([refitted(both)]) == []
+    assert contest._shared([refitted(both)]) == [], "the widest promises too little"
+    gains[three.id] = 100.0
+    assert contest._shared([refitted(both), refitted(one)]) == [three.id]
+    assert contest._shared([refitted(three)]) == []
     contest.rough = False
     assert contest._shared([refitted(one)]) == []
 
