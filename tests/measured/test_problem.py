@@ -350,9 +350,7 @@ def test_forward_problem_has_the_constants_of_each_parameter_vector() -> None:
     assert np.abs(together[0] - together[1]).max() > 1
 
 
-def test_inverse_dynamics_under_any_friction_are_worked_out_once(
-    plant: Plant, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_inverse_dynamics_under_any_friction_are_worked_out_once(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
     t = np.arange(0, 3, 0.005)
     q, v, a = analytic(t)
     values = {"pos": (q, "rad"), "vel": (v, "rad/s"), "acc": (a, "rad/s^2")}
