@@ -21,7 +21,6 @@ _KEEP = 60  # candidates that are screened again in every round, whatever they g
 _SCOUTED = 16  # candidates, each the best of its family, that a costly problem looks around before refitting
 _SURE = 2  # of them, whose gain by straight lines counts where the look around finds less
 _PURSUED = 40  # candidates that a problem that costs little takes a few steps further before it shortlists
-_PLENTY = 300  # blocks of such a problem from which a part of them is enough for that
 _FIRST = 10  # of the suspected families' candidates that are screened in full, besides the best of each family
 _BESIDE, _MOST_BESIDE = 2, 4  # families that lead plain screening and join the suspected ones: always, and at most
 _ALIKE = 0.5  # of the best gain there: what a family beyond the first two must reach to join them
@@ -90,17 +89,15 @@ class Lookout:
 
     def closer(self, screen: Screen, found: list[Screened]) -> list[Screened]:
         """The leading candidates by what they gain in truth, then the rest as screening has them."""
-        thin = self._thinned(screen)
-        whole = float(screen.current.losses.sum() / thin.current.losses.sum())
         if self.problem.costly:
             leading = list({f.effect.family: f for f in reversed(found) if f.gain > 0}.values())[::-1][:_SCOUTED]
+            thin = self._thinned(screen)
+            whole = float(screen.current.losses.sum() / thin.current.losses.sum())
             # A scout sees few blocks: who leads on all of them by straight lines is not lost for what it saw.
             sure = {id(f) for f in leading[:_SURE]}
             look = lambda f: _times(whole, thin.scout(f, self.rng), f.gain * (id(f) in sure))  # noqa: E731
         else:
-            leading = [f for f in found[:_PURSUED] if f.gain > 0]
-            plenty = len(self.problem) >= _PLENTY
-            look = lambda f: _times(whole, thin.pursue(f), 0.0) if plenty else screen.pursue(f)  # noqa: E731
+            leading, look = [f for f in found[:_PURSUED] if f.gain > 0], screen.pursue
         self.say(f"looking closer at {len(leading)} of them")
         looked = sorted(map(look, leading), key=lambda f: -f.gain)
         chosen = {id(f.effect) for f in looked}

@@ -5,7 +5,6 @@ import copy
 import mujoco
 import numpy as np
 import pytest
-from hinge import FRICTION, SPRING, arena, pool
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.fisher import Lens, repeated
@@ -173,21 +172,3 @@ def test_springs_with_values_of_their_own_are_screened() -> None:
     assert found.gain > 0
     # Drives of one make on one battery follow it alike.
     assert split(FAMILIES["supply_sag"](("a", "b")), screen.current.plant) is None
-
-
-def test_of_plenty_of_blocks_a_part_is_looked_at_closer(monkeypatch: pytest.MonkeyPatch) -> None:
-    contest = arena(FRICTION, [build(*SPRING)])
-    found = Screen(contest.fit_data.problem, contest.under, contest.current)
-    lookout = Lookout(found.problem, np.random.default_rng(0), lambda text: None)
-    assert not found.problem.costly
-    ranked = lookout.screen(found, pool())
-    whole = lookout.closer(found, ranked)
-    blocks: list[int] = []
-    pursue = Screen.pursue
-    monkeypatch.setattr(Screen, "pursue", lambda self, f: blocks.append(len(self.problem)) or pursue(self, f))
-    for name, value in {"_PLENTY": len(found.problem), "_ENOUGH": len(found.problem) // 3}.items():
-        monkeypatch.setattr(f"nfc_gym.measured.lookout.{name}", value)
-    part = lookout.closer(found, ranked)
-    assert set(blocks) == {-(-len(found.problem) // 3)}
-    assert part[0].effect.id == whole[0].effect.id == "coulomb:hinge"
-    assert part[0].gain == pytest.approx(whole[0].gain, rel=0.3)
