@@ -326,7 +326,7 @@ class _Run:
         return self._result(qpos.swapaxes(0, 1), qvel.swapaxes(0, 1), sensed, touched)
 
     def _at_once(self) -> Trajectory:
-        """All steps in one call of the engine, which takes the commands of all: a fifth faster, and the same bits."""
+        """All steps in one call of the engine, which takes the commands of all: faster, and the same bits."""
         batch, steps = self.batch, self.segments.steps
         begin = {"qpos": self.qpos.copy(), "qvel": self.qvel.copy()}
         if self.acting.commanding:
