@@ -21,7 +21,6 @@ from nfc_gym.physics.parameters import ParameterSpace
 from .truth import Truth
 
 ROBOTS: dict[str, type[Robot]] = {k.name: k for k in (Ant, Quadruped, Humanoid, Quadcopter, Jackal)}
-LOOP = 3.0  # m, half the length of the Jackal's figure of eight: each of its two rounds is 3 m long and 3 m wide
 
 
 class Believed(ParameterSpace):
@@ -53,8 +52,6 @@ def machine(kind: type[Robot], truth: Truth) -> type[Robot]:
         return Believed(nominal, kind.parameters())
 
     changed: dict[str, Any] = {"compile": classmethod(compile_true), "space": classmethod(believed)}
-    if kind is Jackal:
-        changed["loop"] = LOOP
     return type(f"Hidden{kind.__name__}", (kind,), {"__doc__": kind.__doc__, **changed})
 
 

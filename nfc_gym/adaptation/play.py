@@ -48,7 +48,8 @@ def play(
     loaded = load_policy(name if policy is None else policy)
     look: dict[str, Any] = {} if path is None else {"render_mode": "rgb_array", "width": _SIZE[0], "height": _SIZE[1]}
     context = ["psi", "elevation"] if loaded.sight.cells else ["psi"]
-    env = gymnasium.make(name, context=context, **look)
+    task = loaded.about.get("training", {}).get("task")  # it is shown doing what it was trained to do
+    env = gymnasium.make(name, context=context, **({"task": task} if task else {}), **look)
     loaded.require(env)
     console = console or Console()
     found, frames = [], []

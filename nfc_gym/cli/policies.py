@@ -24,6 +24,9 @@ def pretrain(
     spread: Annotated[
         float, typer.Option(metavar="SHARE", help="Psi is uniform over this share of its prior, around nominal.")
     ] = 0.5,
+    task: Annotated[
+        str | None, typer.Option(help="Of Jackal and Quadcopter: goal, or figure8. Default: the environment's own.")
+    ] = None,
     device: Annotated[str, typer.Option(help="Of the networks: auto, cpu or cuda.")] = "auto",
     threads: Annotated[
         int, typer.Option(min=0, max=1024, help="Of the physics; 0 takes all cores. With --ray, of each worker.")
@@ -59,7 +62,7 @@ def pretrain(
         from nfc_gym.adaptation import pretrain as run
 
         run(
-            environment, out, steps=steps, seed=seed, envs=envs, net=net, spread=spread, device=device,
+            environment, out, steps=steps, seed=seed, envs=envs, net=net, spread=spread, task=task, device=device,
             threads=threads, seconds=seconds, start=start, ray=ray, workers=workers, console=Console(),
         )  # fmt: skip
 

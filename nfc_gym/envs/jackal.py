@@ -26,8 +26,8 @@ START = 0.5  # m, half the side of the square that episodes start in: the terrai
 EDGE = 12.4  # m from the middle: there the map of 25.5 m ends within a robot's length
 TIPPED = 0.3  # z of the robot's up axis: 72 degrees, from where the hull rests on its side
 
-LOOP = 4.0  # m, half the length of the figure of eight
-LAP = 20.0  # s for one round: 1.2 m/s on average, so one episode
+LOOP = 3.0  # m, half the length of the figure of eight, the paper's: each of its two rounds is 3 m long and 3 m wide
+LAP = 20.0  # s for both rounds: 0.9 m/s on average, so one episode
 
 # Weights of the reward, a second's worth of each adding up to a few units.
 PROGRESS = 1.0  # per m/s towards the goal: 2 at full speed
@@ -35,6 +35,7 @@ ARRIVAL = 2.0  # per step at the goal: staying there is worth as much as driving
 TRACKING = 2.0  # per step, times exp(-(distance / WIDTH)^2)
 WIDTH = 0.5  # m
 JERK = 0.05  # per squared change of action: a full reversal of one command costs 0.2
+SMOOTH = 5.0  # the same along the figure of eight, where no hurry is worth a jerk: with 1 its drivers swerve twice a second
 TILT = 0.5  # per 1 - cos(tilt): driving on a 30 degree slope costs 0.07
 
 
@@ -128,7 +129,7 @@ class Jackal(Robot):
         return {
             self.terms[0]: main,
             "arrival": ARRIVAL * (distance < self.arrived),
-            "jerk": -JERK * view.task["jerk"],
+            "jerk": -(JERK if self.task == "goal" else SMOOTH) * view.task["jerk"],
             "tilt": TILT * (now.frame.zz - 1),
         }
 

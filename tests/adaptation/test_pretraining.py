@@ -60,6 +60,20 @@ def test_a_policy_acts_the_same_from_its_file_and_through_torchrl(jackal: Path) 
     assert policy.about["nominal"]["episodes"] == 2
 
 
+def test_a_task_other_than_the_first_is_what_is_trained_judged_and_resumed(tmp_path: Path) -> None:
+    path = tmp_path / "p.safetensors"
+    run = Run(
+        Training(environment="nfc_gym/JackalFlat-v0", envs=16, task="figure8"), torch.device("cpu"), 1, Record(None, None)
+    )
+    assert (run.envs.unwrapped.robot.task, run.recipe.episode) == ("figure8", 1000)
+    policy = pretrain("JackalFlat", path, steps=2048, task="figure8", **SMALL)
+    assert policy.about["training"]["task"] == "figure8"
+    with pytest.raises(InputError, match="another run"):
+        pretrain("JackalFlat", path, steps=4096, **SMALL)
+    with pytest.raises(InputError, match="it has: goal, figure8"):
+        pretrain("JackalFlat", tmp_path / "q.safetensors", steps=2048, task="fly", **SMALL)
+
+
 def test_a_run_that_stopped_goes_on_and_one_with_other_arguments_does_not(tmp_path: Path) -> None:
     path = tmp_path / "p.safetensors"
     pretrain("JackalFlat", path, steps=2048, **SMALL)
