@@ -108,8 +108,7 @@ class _Scan:
     def refined(self, law: Law, shape: Array) -> Proposal:
         """The shape moved to where the law gains most, psi's share taken out."""
         room = law.reach(self.tensor.context, shape)
-        bounds = [(p.low, p.high) for p in law.params[law.terms :]]
-        low, high = np.array(bounds).reshape(-1, 2).T
+        low, high = law.least(self.tensor.context), np.array([p.high for p in law.params[law.terms :]])
 
         def value(s: Array) -> tuple[float, Array]:
             gains, sizes = self.gains(*self.columns(law, np.clip(s, low, high)[None], True))

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,7 +19,9 @@ from nfc_gym.measured.settle import settle
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import Scales, build, complete_inertia, propose
+from nfc_gym.physics.effects.base import TIME
 from nfc_gym.physics.effects.law import Law
+from nfc_gym.physics.effects.law_waves import LawWave
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -162,6 +166,18 @@ def test_no_law_is_proposed_for_a_machine_that_lacks_nothing(
     found = case(Machine(machine, given, 1.05 * given, command, nothing), seed).explain()
     assert found.scanned is not None
     assert found.laws == []
+
+
+def test_a_wave_swings_once_at_least_in_what_was_recorded() -> None:
+    """A battery that runs down over a log is no swing: with less than a period to see, any slow change is one."""
+    seconds = np.random.default_rng().uniform(5.0, 60.0)
+    ctx: Any = SimpleNamespace(exogenous={TIME: np.linspace(0.0, seconds, 500)})
+    law = LawWave(("rail",), LawWave.sized(1.0, "N"))
+    slowest = 2 * np.pi / seconds
+    for rate in (slowest * 1.05, 10 * slowest):
+        wave = law.at(ctx, np.array([0.3, 0.1, rate])).params[-1]
+        assert 0.99 * slowest < wave.low <= rate <= wave.high
+    assert law.grid(ctx).min() > 0.99 * slowest
 
 
 def test_two_harmonics_of_one_joint_are_two_laws() -> None:

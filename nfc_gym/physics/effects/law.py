@@ -107,6 +107,10 @@ class Law(Effect):
         """(s,) how far each shape parameter may sensibly move from a value found on the grid."""
         return np.zeros(0)
 
+    def least(self, ctx: Context) -> Array:
+        """(s,) the least that each shape parameter may be on the motion at hand."""
+        return np.array([p.low for p in self.params[self.terms :]])
+
     def at(self, ctx: Context, theta: Array) -> "Law":
         """The same law with probes at theta (k,) and bounds about it, for a fit that starts there."""
         params = []
@@ -114,8 +118,9 @@ class Law(Effect):
             size = max(abs(value), max(abs(t) for t in theta[: self.terms]) * 0.1, 1e-9)
             params.append(replace(p, probes=(float(size),), low=-20 * float(size), high=20 * float(size)))
         shape = theta[self.terms :]
-        for p, value, room in zip(self.params[self.terms :], shape, self.reach(ctx, shape), strict=True):
-            low, high = max(p.low, value - room), min(p.high, value + room)
+        shapes = zip(self.params[self.terms :], shape, self.reach(ctx, shape), self.least(ctx), strict=True)
+        for p, value, room, least in shapes:
+            low, high = max(least, value - room), min(p.high, value + room)
             params.append(replace(p, probes=(float(value),), low=float(low), high=float(high)))
         return type(self)(self.where, params)
 

@@ -119,6 +119,9 @@ class LawWave(_Wave):
     def grid(self, ctx: Context) -> Array:
         return self._rates(ctx, self._resolution(ctx), 60.0)[:, None]
 
+    def least(self, ctx: Context) -> Array:
+        return np.array([self._resolution(ctx)])  # slower, it would be no swing but any slow change there is
+
     def say(self, theta: Array, sd: Array | None = None) -> str:
         return f"A {self.noun} that swings at {theta[2] / (2 * np.pi):.3g} Hz: {self.amplitude(theta, sd)}."
 
