@@ -146,18 +146,19 @@ def nfc(**config: Any) -> Make:
         from nfc_gym.adaptation.algorithm import AdaptConfig, adapt
 
         from .learning import EPISODE, Learned, opened
-        from .watching import watcher
+        from .watching import earned_at_home, watcher
 
         posterior = inference(job)
         policy, budget = opened(job.nominal, job.budget.device), job.budget
         detector = job.detector or watcher(policy, job.world, job.seed, nthread=job.budget.threads, **job.settings)
+        home = earned_at_home(policy, job.world, job.seed, EPISODE, nthread=job.budget.threads, **job.settings)
         context = ["psi", "elevation"] if job.world.ground == "Rough" else ["psi"]
         given = AdaptConfig(missions=budget.executed, worlds=budget.envs, steps=budget.steps // budget.executed,
                             episode=EPISODE, seed=job.seed, **config)  # fmt: skip
         found = adapt(
             ppo_agent(policy), job.world.single(context=context, **job.settings), posterior, detector,
             config=given, environment=f"nfc_gym/{job.world.place}-v0", folder=job.folder, threads=budget.threads,
-            settings=job.settings,
+            settings=job.settings, home=home,
         )  # fmt: skip
         curve = [(EPISODE * k, row["return"]) for k, row in enumerate(found.history)]
         return Learned(policy, curve, {"anomalies": found.anomalies, "history": found.history})

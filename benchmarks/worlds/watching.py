@@ -11,7 +11,7 @@ from nfc_gym.inference.detector import WindowDetector
 from nfc_gym.inference.rates import threshold_at
 
 from .judge import Policy
-from .players import seen_by
+from .players import play, seen_by
 from .world import World
 
 HORIZON = 50  # control steps of a window: 1 s
@@ -142,3 +142,9 @@ def watcher(policy: Policy, world: World, seed: int, **settings: Any) -> Lasting
     lasting = Lasting(scorer, np.concatenate(scores))
     lasting.threshold = threshold_at([lasting.lasting(each).max() for each in scores], RATE).value
     return lasting
+
+
+def earned_at_home(policy: Policy, world: World, seed: int, episode: int, **settings: Any) -> list[float]:
+    """Returns of as many episodes at home, of so many control steps at most."""
+    at_home = World(world.place, "nominal", world.seed, engine=world.engine)
+    return play(policy, at_home, ROBOTS // 2, seed, max_episode_steps=episode, **settings).returns

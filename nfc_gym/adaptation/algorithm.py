@@ -5,11 +5,12 @@ policy is touched only after an anomaly. A world that never shows one leaves it 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from gymnasium.vector import VectorEnv
 from rich.console import Console
 from torch import nn
@@ -17,6 +18,7 @@ from torch import nn
 from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.agent import Agent
 from nfc_gym.adaptation.beliefs import Inference, inference_of, width
+from nfc_gym.adaptation.earned import RATE, chance, require_home
 from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portable, spread
 from nfc_gym.adaptation.hallucination import hallucination
 from nfc_gym.adaptation.imagined import imagined
@@ -82,8 +84,8 @@ class Adapted:
 def adapt(
     agent: Agent, world: Any, posterior: Any, detector: Any, *, config: AdaptConfig | None = None,
     environment: str | None = None, folder: str | Path | None = None, threshold: float | None = None, threads: int = 0,
-    settings: Mapping[str, Any] | None = None, ray: str | None = None, workers: int = 0,
-    console: Console | None = None,
+    settings: Mapping[str, Any] | None = None, home: Sequence[float] | None = None, ray: str | None = None,
+    workers: int = 0, console: Console | None = None,
 ) -> Adapted:  # fmt: skip
     """Adapt an agent to a world.
 
@@ -98,6 +100,8 @@ def adapt(
       threshold: of the detector; default its own.
       threads: of the physics; 0 takes every core. On a cluster of each worker, and 0 is one.
       settings: of the simulator.
+      home: returns of episodes of the agent, as it is before, in the nominal world: a trajectory with which it has
+        lately earned less than would happen there (`earned.RATE`) is anomalous, whatever the detector says.
       ray, workers: a Ray cluster on which the worlds of the belief are simulated, as of `pretrain`.
       console: is told.
 
@@ -107,7 +111,7 @@ def adapt(
     config = config or AdaptConfig()
     cluster = cluster_of(ray, workers, threads, config.worlds)
     run = _Run(agent, world, posterior, detector, config, environment, folder, threshold, threads,
-               dict(settings or {}), cluster, console)  # fmt: skip
+               dict(settings or {}), None if home is None else require_home(home), cluster, console)  # fmt: skip
     while run.mission_goes_on():
         tau = run.execute()
         if tau.anomalous:
@@ -125,12 +129,12 @@ class _Run:
     def __init__(
         self, agent: Agent, world: Any, posterior: Any, detector: Any, config: AdaptConfig, environment: str | None,
         folder: str | Path | None, threshold: float | None, threads: int, settings: dict[str, Any],
-        cluster: Cluster | None, console: Console | None,
+        home: np.ndarray | None, cluster: Cluster | None, console: Console | None,
     ) -> None:  # fmt: skip
         check_fit(agent, world)
         self.agent, self.world, self.config, self.threads, self.cluster = agent, world, config, threads, cluster
         self.environment = full_id(environment or world.spec.id)
-        self.settings = settings
+        self.settings, self.home = settings, home
         self.detector, self.threshold = opened(detector, threshold)
         self.inference = inference_of(posterior)
         self.folder = None if folder is None else Path(folder)
@@ -152,10 +156,13 @@ class _Run:
         """One episode in the world, watched by the detector."""
         seed = mixed(self.config.seed, self.t) % 2**31
         tau = execute(self.agent, self.world, self.detector, self.threshold, seed)
-        self.now = {
-            "return": tau.total, "length": len(tau), "reached": tau.reached, "anomalous": tau.anomalous,
-            "score": float(tau.scores.max()) / self.threshold,
-        }  # fmt: skip
+        self.now = {"return": tau.total, "length": len(tau), "reached": tau.reached,
+                    "score": float(tau.scores.max()) / self.threshold}  # fmt: skip
+        if self.home is not None:
+            self.now["chance"] = chance(self.home, [*(row["return"] for row in self.history), tau.total])
+            if self.now["chance"] < RATE and not tau.anomalous:
+                tau = replace(tau, scores=np.append(tau.scores[:-1], self.threshold))
+        self.now["anomalous"] = tau.anomalous
         return tau
 
     def infer(self, tau: Trajectory) -> Sampler:
@@ -202,7 +209,7 @@ class _Run:
         self.dataset.add(tau)
         self.history.append(self.now)
         self.record.scalars(self.t, {k: float(v) for k, v in self.now.items() if isinstance(v, int | float)})
-        shown = {k: v for k, v in self.now.items() if k in ("return", "length", "score", "width")}
+        shown = {k: v for k, v in self.now.items() if k in ("return", "length", "score", "chance", "width")}
         what = "anomalous: adapted" if tau.anomalous else "no anomaly: the policy is not touched"
         reached = "" if not self.world.unwrapped.robot.place_size else f"  reached {tau.reached}"
         self.record.say(f"mission {self.t}: {in_words(shown)}{reached}  {what}")

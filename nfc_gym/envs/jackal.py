@@ -35,7 +35,7 @@ ARRIVAL = 2.0  # per step at the goal: staying there is worth as much as driving
 TRACKING = 2.0  # per step, times exp(-(distance / WIDTH)^2)
 WIDTH = 0.5  # m
 JERK = 0.05  # per squared change of action: a full reversal of one command costs 0.2
-SMOOTH = 5.0  # the same along the figure of eight, where no hurry is worth a jerk: with 1 its drivers swerve twice a second
+SMOOTH = 5.0  # the same along the figure of eight: with 1 its drivers swerve twice a second
 TILT = 0.5  # per 1 - cos(tilt): driving on a 30 degree slope costs 0.07
 
 

@@ -63,7 +63,10 @@ def test_a_policy_acts_the_same_from_its_file_and_through_torchrl(jackal: Path) 
 def test_a_task_other_than_the_first_is_what_is_trained_judged_and_resumed(tmp_path: Path) -> None:
     path = tmp_path / "p.safetensors"
     run = Run(
-        Training(environment="nfc_gym/JackalFlat-v0", envs=16, task="figure8"), torch.device("cpu"), 1, Record(None, None)
+        Training(environment="nfc_gym/JackalFlat-v0", envs=16, task="figure8"),
+        torch.device("cpu"),
+        1,
+        Record(None, None),
     )
     assert (run.envs.unwrapped.robot.task, run.recipe.episode) == ("figure8", 1000)
     policy = pretrain("JackalFlat", path, steps=2048, task="figure8", **SMALL)
