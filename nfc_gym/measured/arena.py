@@ -80,13 +80,13 @@ class Arena(Yardstick):
         chord = known if quick or known.shape[-1] > _CHORD else None
         return fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord)
 
-    def enter_beside(self, leader: Judged, pick: Screened) -> Judged:
-        """Fit a screened candidate in a leading one's place, also from where the leader's fit took all the rest."""
-        self.say(f"refitting {pick.effect.id}, which does much the same")
+    def enter_beside(self, leader: Judged, picks: Sequence[Screened]) -> Judged:
+        """Fit screened candidates in a leading one's place, also from where the leader's fit took all the rest."""
+        self.say(f"refitting {' and '.join(s.effect.id for s in picks)}, which does much the same")
         current = self.current
-        plant = current.plant.with_effects([*current.plant.effects, pick.effect])
-        beside = np.concatenate([leader.fitted.x[: len(current.x)], pick.theta])
-        rows = np.vstack([beside, starts(self.fit_data.problem, self.under, current, plant, [pick])])
+        plant = current.plant.with_effects([*current.plant.effects, *(s.effect for s in picks)])
+        beside = np.concatenate([leader.fitted.x[: len(current.x)], *(s.theta for s in picks)])
+        rows = np.vstack([beside, starts(self.fit_data.problem, self.under, current, plant, picks)])
         known = leader.fitted.jacobian[..., : current.jacobian.shape[-1]]
         return self._refit(plant, self._nearest(plant, rows), 10, known, quick=self.fit_data.problem.costly)
 

@@ -199,7 +199,7 @@ class Contest:
         asked |= {s.effect.id for s in kin}
         others = [s for s in self.screened if s.effect.id not in asked]
         like = mimics(self._known[new[0].id], others, self.screen.projected)
-        return [arena.enter_beside(best, s) for s in (*kin, *like)]
+        return [arena.enter_beside(best, [s]) for s in (*kin, *like)]
 
     def _screened(self, name: str) -> Screened | None:
         """A candidate as screening has it; None where there is none of that id.
@@ -352,7 +352,7 @@ class Contest:
 
         rivals = [j for j in believed if j.total > enough(j) * best.total and arena.ties(best, j)]
         for parts in self._plainer(winner) if added else []:
-            plain = arena.enter(parts)
+            plain = arena.enter_beside(best, parts)  # psi is the law's own: from elsewhere a fit may end in a hollow
             if self._believed(plain) and plain.total > NEARLY * best.total and arena.ties(best, plain):
                 rivals.append(plain)
         chosen = min(rivals, key=lambda j: (len(j.fitted.x), -len(arena.new(j)[0].where), -j.total))

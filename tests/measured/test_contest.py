@@ -260,7 +260,7 @@ def asking(screened: list[Screened], pool: list[Any] = []) -> Contest:  # noqa: 
         current=SimpleNamespace(plant=SimpleNamespace(effects=[])),
         new=lambda j: j.fitted.plant.effects,
         label=lambda j: j.fitted.plant.effects[0].id,
-        enter_beside=lambda best, pick: pick.effect.id,
+        enter_beside=lambda best, picks: picks[0].effect.id,
     )
     screen: Any = SimpleNamespace(
         projected=np.array([1.0, 0.0, 0.0, 0.0]), try_one=lambda e: replace(candidate("new", [[0, 0, 1, 0]]), effect=e)
