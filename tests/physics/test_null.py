@@ -157,6 +157,15 @@ def test_say_names_value_and_unit() -> None:
     assert "0.25 ± 0.02 N m" in effect.say(np.array([0.25]), np.array([0.01]))
 
 
+def test_what_only_sets_a_unit_is_said_without_an_interval() -> None:
+    effect = CANDIDATES["thermal"][0]
+    theta = np.array([p.probes[0] for p in effect.params])
+    said = effect.say(theta, 0.1 * theta)
+    assert [p.name for p in effect.params if p.given] == ["reference"]
+    assert f"reference {theta[2]:.3g}." in said
+    assert f"fade {theta[0]:.3g} ± " in said
+
+
 def test_simple_bodies_are_refused_and_completed() -> None:
     text = "<mujoco><worldbody><body name='b'><freejoint/><geom size='.1' mass='1'/></body></worldbody></mujoco>"
     model = mujoco.MjModel.from_xml_string(text)

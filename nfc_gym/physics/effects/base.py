@@ -29,6 +29,7 @@ from nfc_gym.physics.names import names as names_in
 Array = NDArray[np.float64]
 Rows = slice | NDArray[np.intp]  # what picks rows of an array, see `index`
 TIME = "exo:time"  # seconds since the log, or the episode, began: a signal that every log has
+_NO_CHOICE = 0.01  # of a value: a range so narrow is no range
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,11 @@ class Param:
     resolution: float = 0.0
     natural: bool = False
     ambient: bool = False
+
+    @property
+    def given(self) -> bool:
+        """Whether its bounds leave no choice: it sets a unit, and nothing is measured of it."""
+        return self.high - self.low < _NO_CHOICE * abs(self.high)
 
 
 @dataclass(frozen=True)
@@ -296,7 +302,7 @@ class Effect(ABC):
         """One sentence with units."""
         parts = []
         for i, p in enumerate(self.params):
-            spread = "" if sd is None or not np.isfinite(sd[i]) else f" ± {1.96 * sd[i]:.2g}"
+            spread = "" if sd is None or p.given or not np.isfinite(sd[i]) else f" ± {1.96 * sd[i]:.2g}"
             unit = "" if p.unit == "1" else f" {p.unit}"
             parts.append(f"{p.name.replace('_', ' ')} {theta[i]:.3g}{spread}{unit}")
         return f"{self.summary} at {' and '.join(self.where)}: {', '.join(parts)}."
