@@ -22,7 +22,8 @@ from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import actuator_names
 from nfc_gym.physics.effects.generic import TIME
-from nfc_gym.physics.rollout import Plant, Segments, Trajectory
+from nfc_gym.physics.rollout import Plant
+from nfc_gym.physics.segments import Segments, Trajectory
 
 Array = NDArray[np.float64]
 

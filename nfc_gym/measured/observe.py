@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.fields import object_id
-from nfc_gym.physics.rollout import Trajectory
+from nfc_gym.physics.segments import Trajectory
 from nfc_gym.physics.state import quat_difference, rotate, rotate_back
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from nfc_gym.measured.charts import Series
 from nfc_gym.measured.experiment import Stage
 from nfc_gym.measured.observe import Observer
 from nfc_gym.measured.report import page
-from nfc_gym.physics.rollout import Trajectory
+from nfc_gym.physics.segments import Trajectory
 
 Array = NDArray[np.float64]
 _POINTS = 500  # of a curve

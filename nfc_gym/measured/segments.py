@@ -12,7 +12,7 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured.states import States
 from nfc_gym.physics.effects.base import TIME
 from nfc_gym.physics.past import Before, Past
-from nfc_gym.physics.rollout import Segments, Servo
+from nfc_gym.physics.segments import Segments, Servo
 
 Array = NDArray[np.float64]
 _LEAD = 200  # steps that a log's commands before the history are thinned to

@@ -17,7 +17,8 @@ from nfc_gym.measured.recent import Recent
 from nfc_gym.measured.segments import Cut, Layout, cut, lay, pick, refine, repeat
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import overrides
-from nfc_gym.physics.rollout import Plant, Segments, Servo, Trajectory
+from nfc_gym.physics.rollout import Plant
+from nfc_gym.physics.segments import Segments, Servo, Trajectory
 from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
 
 Array = NDArray[np.float64]

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects import FAMILIES, Effect, Scales, build, propose
 from nfc_gym.physics.parameters import ParameterSpace
-from nfc_gym.physics.rollout import Plant, Segments, Trajectory
+from nfc_gym.physics.rollout import Plant
+from nfc_gym.physics.segments import Segments, Trajectory
 
 Array = NDArray[np.float64]
 

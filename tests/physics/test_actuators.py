@@ -7,7 +7,7 @@ from machines import make, plant_of, run
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects import build
-from nfc_gym.physics.rollout import Segments
+from nfc_gym.physics.segments import Segments
 
 DT, MASS = 0.002, 2.0
 RAIL = f"""

@@ -12,7 +12,7 @@ from nfc_gym.physics.effects.base import Scales
 from nfc_gym.physics.effects.load import Wind
 from nfc_gym.physics.effects.places import base_bodies, joint_places
 from nfc_gym.physics.effects.rotor import RotorDrag
-from nfc_gym.physics.rollout import Segments
+from nfc_gym.physics.segments import Segments
 
 DT, MASS = 0.001, 2.0
 FLYER = f"""

@@ -10,7 +10,8 @@ import pytest
 
 from nfc_gym.physics.effects.base import Effect, Scales
 from nfc_gym.physics.parameters import ParameterSpace
-from nfc_gym.physics.rollout import Plant, Segments
+from nfc_gym.physics.rollout import Plant
+from nfc_gym.physics.segments import Segments
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
 (PROGRAM,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)

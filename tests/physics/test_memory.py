@@ -7,7 +7,7 @@ from machines import make, plant_of, run
 
 from nfc_gym.physics.effects import FAMILIES, Context, Forces, Scales
 from nfc_gym.physics.past import Past, trace
-from nfc_gym.physics.rollout import Segments
+from nfc_gym.physics.segments import Segments
 
 DT, MASS = 0.001, 2.0
 RAIL = f"""

@@ -12,7 +12,8 @@ from nfc_gym.physics.effects import Effect, build
 from nfc_gym.physics.effects.base import Context, Forces, Param
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
-from nfc_gym.physics.rollout import Plant, Segments, Servo
+from nfc_gym.physics.rollout import Plant
+from nfc_gym.physics.segments import Segments, Servo
 
 MODEL = zoo()
 NONE = np.zeros((1, 0))

@@ -17,7 +17,8 @@ from nfc_gym.physics.effects.each import each
 from nfc_gym.physics.effects.saved import to_row
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import ParameterSpace
-from nfc_gym.physics.rollout import Plant, Segments
+from nfc_gym.physics.rollout import Plant
+from nfc_gym.physics.segments import Segments
 from nfc_gym.wrappers import ApplyEffects
 
 MODEL = mujoco.MjModel.from_xml_string(STATELESS)
