@@ -168,6 +168,16 @@ def test_no_law_is_proposed_for_a_machine_that_lacks_nothing(
     assert found.laws == []
 
 
+@pytest.mark.parametrize(("floor", "there"), [("", False), ('<geom type="plane" size="9 9 1"/>', True)])
+def test_a_place_on_the_ground_may_push_and_one_in_the_air_does_not(floor: str, there: bool) -> None:
+    text = CRAFT.format(known=1.0).replace("<worldbody>", f"<worldbody>{floor}")
+    model = mujoco.MjModel.from_xml_string(text)
+    scales = Scales(np.full(model.nv, 0.1), np.ones(model.nv), np.ones(model.nu), np.ones(model.nu), 0.01)
+    ids = [e.id for e in propose(model, scales)]
+    assert any(i.startswith(("law_place:", "law_friction:")) for i in ids) == there
+    assert "law_height:flight[2]" in ids
+
+
 def test_a_wave_swings_once_at_least_in_what_was_recorded() -> None:
     """A battery that runs down over a log is no swing: with less than a period to see, any slow change is one."""
     seconds = np.random.default_rng().uniform(5.0, 60.0)

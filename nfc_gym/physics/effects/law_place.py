@@ -13,6 +13,15 @@ _STICK = 0.02  # m/s or rad/s over which a proposed dry friction turns from one 
 _EDGE = 0.05  # of a patch's length: how soft its edges are
 
 
+def meets(model: mujoco.MjModel, tree: int) -> bool:
+    """Whether any body of a kinematic tree can touch one that is not of it."""
+    own = model.body_treeid[model.geom_bodyid] == tree
+    pairs = (model.geom_contype[own, None] & model.geom_conaffinity[~own]) | (
+        model.geom_conaffinity[own, None] & model.geom_contype[~own]
+    )
+    return bool(pairs.any())
+
+
 class _Patch(OfVariable):
     """A law that acts between two ends of a coordinate of the world, which its second name says."""
 
@@ -55,7 +64,9 @@ class _Patch(OfVariable):
         for place, dof, _, force, unit in pushed(model, scales):
             for name, (its, q) in places.items():
                 along = its - int(model.jnt_dofadr[model.dof_jntid[its]])
-                horizontal = kind_of(model, its) == _SLIDE or (kind_of(model, its) == _FREE and along < 2)
+                # Nothing is at a place in the air: what seems so stands for where along its path a craft was.
+                on_ground = kind_of(model, its) == _FREE and along < 2 and meets(model, int(model.dof_treeid[its]))
+                horizontal = kind_of(model, its) == _SLIDE or on_ground
                 same = model.dof_treeid[its] == model.dof_treeid[dof]
                 if q is not None and horizontal and same and not place.endswith("@body"):
                     out.append(cls((place, name), cls.sized(force, unit)))
