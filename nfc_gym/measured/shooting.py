@@ -23,6 +23,7 @@ from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
 
 Array = NDArray[np.float64]
 _DRAWS = 24  # starts, at most, from which the noise where bodies touch is estimated; a step's error from two in three
+_NEAR, _OFF = 4, 0.05  # psi that this noise is averaged over, with the one asked for, and how far off, a share of it
 _RECENT = 64_000_000  # bytes of residuals that a problem keeps
 
 
@@ -216,6 +217,8 @@ class RolloutProblem(Problem):
         Where bodies touch neither is a straight line: a foot that lands a step sooner or later makes an error in a
         direction of its own. There both are taken over starts drawn from their noise: with one direction for the
         discretisation, X of the true model of a trotting quadruped is 3 at a step of 5 ms, and with `_DRAWS` it is 1.
+        And over a few psi near by: how much a landing's error grows differs from one to the next, so that under the
+        noise of one alone its own errors would be the likeliest, and a fit would stay where it began.
         """
         size, width = len(self), len(self.columns)
         sigma = np.zeros((size, width, width))
@@ -250,13 +253,27 @@ class RolloutProblem(Problem):
             draws = np.zeros((len(found), *sd.shape))
             draws[..., noisy] = found * sd[:, noisy]
         few = draws[: -(-2 * len(draws) // 3)]
-        here, reach = self._again(plant, x, self._begun(draws), len(draws)), self.reach(plant)
+        rows, bases = self._near(plant, x, base, len(draws))
+        here, reach = self._again(plant, rows, self._begun(draws), len(draws)), self.reach(plant)
         if self._whole is None:
-            error = (here[: len(few)] - self._halved(plant, x, self._begun(few), len(few))) / reach
+            error = (here[: len(few)] - self._halved(plant, rows[: len(few)], self._begun(few), len(few))) / reach
         else:  # a step twice as long tells the same in a quarter of the time
             whole = self._whole
-            error = (whole._again(coarser(plant), x, whole._begun(few), len(few)) - here[: len(few)]) * (1 / reach - 1)
-        return (here - base) / np.sqrt(len(draws)), error / np.sqrt(len(few))
+            coarse = whole._again(coarser(plant), rows[: len(few)], whole._begun(few), len(few))
+            error = (coarse - here[: len(few)]) * (1 / reach - 1)
+        return (here - bases) / np.sqrt(len(draws)), error / np.sqrt(len(few))
+
+    def _near(self, plant: Plant, x: Array, base: Array, count: int) -> tuple[Array, Array]:
+        """(count, size) parameters, in turn x and a few with a psi near by, and (count, S, m) residuals under each."""
+        free = np.flatnonzero(plant.space.free)
+        rows = np.repeat(x[None], _NEAR, 0)
+        off = np.random.default_rng(len(self)).normal(size=(_NEAR - 1, len(free)))
+        low, high = plant.space.low[free], plant.space.high[free]
+        rows[1:, free] = np.clip(x[free] * (1 + _OFF * off), np.minimum(low, x[free]), np.maximum(high, x[free]))
+        bases = np.concatenate([base[None], self.residual(plant, rows[1:])])
+        bases = np.where(np.isfinite(bases).all(-1, keepdims=True), bases, base)
+        turn = np.arange(count) % _NEAR
+        return rows[turn], bases[turn]
 
     def _begun(self, draws: Array) -> Segments:
         """Copies of the segments that begin off their starts by draws (D, S, 2 nv)."""
@@ -281,7 +298,11 @@ class RolloutProblem(Problem):
         return self._again(plant, x, repeat(seg, n, np.concatenate(starts_q), np.concatenate(starts_v)), n) - base
 
     def _again(self, plant: Plant, x: Array, segments: Segments, copies: int, finer: int = 1) -> Array:
-        """(copies, S, m) residual of copies of the segments with other starts, at a step so many times finer."""
+        """(copies, S, m) residual of copies of the segments with other starts, at a step so many times finer.
+
+        x is (size,), or (copies, size) with parameters of its own for each copy.
+        """
+        x = x if x.ndim == 1 else np.repeat(x, len(self), 0)
         measured = [np.concatenate([m] * copies) for m in self._measured]
         step, mask = np.concatenate([self._where.step * finer] * copies), np.concatenate([self.mask] * copies)
         return self._compare(plant, x[None], segments, measured, step, mask)[0].reshape(copies, len(self), -1)

@@ -445,3 +445,29 @@ def test_at_half_the_step_the_noise_of_impacts_is_told_by_the_whole_one(monkeypa
     monkeypatch.setattr(Plant, "shoot", lambda self, x, s, **kw: steps.append(s.dt) or shoot(self, x, s, **kw))
     assert 0.7 < chi2(problem, finer(plant), plant.null).mean() < 1.3
     assert set(steps) == {DT / 2, DT}  # and not a quarter
+
+
+def test_the_noise_of_impacts_is_that_of_several_psi_near_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Balls that are slowed down a little more or less: on average what each of those expects by itself."""
+    rng = np.random.default_rng(5)
+    logs, model = [bounce(0.0005, 2.1, rng) for _ in range(8)], bouncy(DT)
+    joints = tuple(f"up{i}" for i in range(BALLS))
+    plant = Plant(
+        model, ParameterSpace(model, [Parameter("damping", "dof_damping", joints, low=0.0, high=2.0)]), nthread=1
+    )
+    layout = Layout(0.4, 0.0, (0.1, 0.2, 0.4), 0.4, DT)
+    problem = RolloutProblem(model, logs, [estimate_states(model, log) for log in logs], layout)
+    x = np.array([0.4])
+
+    def noise(at: np.ndarray) -> np.ndarray:
+        return np.einsum("sii->i", problem.covariance(plant, at)) / len(problem)
+
+    monkeypatch.setattr("nfc_gym.measured.shooting._OFF", 1.0)
+    rows = problem._near(plant, x, problem.residual(plant, x[None])[0], 4)[0]
+    together = noise(x)
+    assert rows[0] == x
+    assert np.ptp(rows) > 0.3
+    monkeypatch.setattr("nfc_gym.measured.shooting._OFF", 0.0)
+    alone = np.stack([noise(row) for row in rows])
+    assert (np.abs(np.log(alone / alone[0])) > 0.1).any(), "else this would test nothing"
+    np.testing.assert_allclose(together, alone.mean(0), rtol=0.15)
