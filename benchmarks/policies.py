@@ -39,6 +39,8 @@ from worlds.methods import METHODS, Job, run
 from worlds.scenarios import TABLE_III
 from worlds.world import ENGINES, World
 
+from nfc_gym.adaptation.threads import limit_threads
+
 REFERENCES = ("random", "unadapted", "oracle")  # what returns are measured by
 PLACES = tuple(f"{robot}{ground}" for robot in paper.ROBOTS for ground in paper.GROUNDS)
 
@@ -46,6 +48,7 @@ PLACES = tuple(f"{robot}{ground}" for robot in paper.ROBOTS for ground in paper.
 def main(argv: Sequence[str] | None = None) -> int:
     args = parse(argv)
     began = time.monotonic()
+    limit_threads(args.threads)
     with tempfile.TemporaryDirectory() as folder:
         out = args.out or Path(folder)
         out.mkdir(parents=True, exist_ok=True)

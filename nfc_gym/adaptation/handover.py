@@ -30,6 +30,7 @@ from nfc_gym.adaptation.policy import Policy, load_policy
 from nfc_gym.adaptation.record import Record
 from nfc_gym.adaptation.returns import figure, from_plain, gain, to_plain
 from nfc_gym.adaptation.sight import VectorSight
+from nfc_gym.adaptation.threads import limit_threads
 from nfc_gym.adaptation.worlds import full_id, vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together, write_whole
@@ -86,8 +87,7 @@ def hand_over(
     _require_fit(start, name)
     folder = Path(out)
     _require_own(folder)
-    if threads:
-        torch.set_num_threads(threads)
+    limit_threads(threads)
     run = _Run(start, extension, truth, config, folder, episodes, threads,
                Record(folder / "log", console))  # fmt: skip
     adapted = run.trained(extension, folder)

@@ -29,6 +29,7 @@ from nfc_gym.adaptation.policy import Policy, check_suffix, load_policy, taught
 from nfc_gym.adaptation.ppo import Diverged, OnPolicy, PPOConfig, clipped
 from nfc_gym.adaptation.record import Episodes, Record, in_words
 from nfc_gym.adaptation.sight import VectorSight
+from nfc_gym.adaptation.threads import limit_threads
 from nfc_gym.adaptation.worlds import full_id, training_env, vector_env
 from nfc_gym.core.errors import InputError, NfcError
 from nfc_gym.core.files import require_writable
@@ -167,8 +168,7 @@ def pretrain(
         environment=full_id(environment), seed=seed, envs=envs, horizon=horizon, net=net, spread=spread, task=task
     )
     cluster = cluster_of(ray, workers, threads, envs)
-    if threads and cluster is None:
-        torch.set_num_threads(threads)
+    limit_threads(threads if cluster is None else 0)
     # With its index: a collector takes "cuda" and "cuda:0" for two devices, and would keep a copy of the policy.
     place = torch.empty(0, device=device_of(device)).device
     recipe = recipe_of(training.environment, start is not None, task)

@@ -1,0 +1,14 @@
+"""How many threads a process takes besides the physics'."""
+
+import cv2
+import torch
+
+
+def limit_threads(threads: int) -> None:
+    """Give networks and maps so many threads; 0 leaves both as they are.
+
+    OpenCV takes as many as there are cores by default, in each of many processes beside each other.
+    """
+    if threads:
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(threads)
