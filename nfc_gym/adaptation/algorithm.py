@@ -234,7 +234,9 @@ class _Run:
 
     def _described(self) -> dict[str, Any]:
         config = {k: v for k, v in asdict(self.config).items() if k != "missions"}
-        return {"environment": self.environment, **config, "settings": self.settings, "threshold": self.threshold}
+        home = None if self.home is None else f"{len(self.home)} returns, {self.home.mean():.6g} on average"
+        known = {"settings": self.settings, "threshold": self.threshold, "home": home}
+        return {"environment": self.environment, **config, **known}
 
     def _save(self) -> None:
         if self.folder is None:

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from nfc_gym.core.errors import InputError
 
 LAST = 5  # trajectories that are looked at together: one that went badly may be bad luck
-RATE = 0.025  # of trajectories at home that count as too poor
+RATE = 0.025  # of trajectories at home that may count as too poor, at most
 _FEWEST = 40  # returns at home: one in 1 / RATE of them must be there to be seen
 
 

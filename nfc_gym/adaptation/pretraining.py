@@ -30,7 +30,7 @@ from nfc_gym.adaptation.ppo import Diverged, OnPolicy, PPOConfig, clipped
 from nfc_gym.adaptation.record import Episodes, Record, in_words
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.threads import limit_threads
-from nfc_gym.adaptation.worlds import full_id, training_env, vector_env
+from nfc_gym.adaptation.worlds import full_id, robot_of, training_env, vector_env
 from nfc_gym.core.errors import InputError, NfcError
 from nfc_gym.core.files import require_writable
 from nfc_gym.inference.jobs import device_of
@@ -75,7 +75,7 @@ RECIPES: Mapping[str, Recipe] = {
 
 def recipe_of(environment: str, onward: bool = False, task: str | None = None) -> Recipe:
     """What suits the robot of an environment, by its full id; `onward` where weights are there to begin with."""
-    recipe = RECIPES[environment.removeprefix("nfc_gym/").split("Flat")[0].split("Rough")[0].lower()]
+    recipe = RECIPES[robot_of(environment)]
     if task == "figure8":  # a lap takes longer than the way to a goal
         recipe = replace(recipe, episode=Recipe.episode)
     return replace(recipe, ppo=ONWARD) if onward else recipe
@@ -343,5 +343,4 @@ class Run:
         return {"network": self.network, "reward": self.learner.power}
 
     def _described(self) -> dict[str, Any]:
-        training = {k: v for k, v in asdict(self.training).items() if v is not None}
-        return {**training, "ppo": asdict(self.recipe.ppo), "episode": self.recipe.episode}
+        return {**asdict(self.training), "ppo": asdict(self.recipe.ppo), "episode": self.recipe.episode}

@@ -79,6 +79,11 @@ def full_id(name: str) -> str:
     return full
 
 
+def robot_of(environment: str) -> str:
+    """`nfc_gym/JackalFlat-v0` -> `jackal`."""
+    return environment.removeprefix("nfc_gym/").split("Flat")[0].split("Rough")[0].lower()
+
+
 def training_env(
     name: str, n: int, *, threads: int, seed: int, spread: float, episode: int, settings: Mapping[str, Any]
 ) -> VectorSight:

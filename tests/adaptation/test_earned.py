@@ -47,3 +47,15 @@ def test_few_returns_say_nothing_of_what_is_usual(jackal: Path) -> None:
     for home in (np.ones(39), np.full(64, np.nan)):
         with pytest.raises(InputError, match="want 40 or more"):
             adapt(ppo_agent(load_policy(jackal)), world(), belief(), Alarm(None), config=CONFIG, home=home)
+
+
+def test_a_run_goes_on_with_the_returns_that_it_began_with(jackal: Path, tmp_path: Path) -> None:
+    def run(home: np.ndarray | None) -> None:
+        adapt(ppo_agent(load_policy(jackal)), world(), belief(), Alarm(None), config=CONFIG, folder=tmp_path, home=home)
+
+    usual = np.linspace(-1e4, -9e3, 64)
+    run(usual)
+    run(usual)
+    for other in (usual - 1.0, None):
+        with pytest.raises(InputError, match="home"):
+            run(other)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nfc_gym import InputError
-from nfc_gym.adaptation import play
+from nfc_gym.adaptation import load_policy, play
 from nfc_gym.adaptation.play import sheet, video
 
 
@@ -39,3 +39,8 @@ def test_bad_input_is_named(jackal: Path, tmp_path: Path) -> None:
         play.play("JackalFlat", jackal, tmp_path / "x.gif")
     with pytest.raises(InputError, match="cannot act in AntFlat"):
         play.play("AntFlat", jackal)
+    policy = load_policy(jackal)
+    policy.about["training"]["task"] = "figure8"  # of which an Ant knows nothing
+    policy.save(tmp_path / "eight.safetensors")
+    with pytest.raises(InputError, match="cannot act in AntFlat"):
+        play.play("AntFlat", tmp_path / "eight.safetensors")

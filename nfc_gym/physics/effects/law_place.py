@@ -6,20 +6,12 @@ import mujoco
 import numpy as np
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales
+from nfc_gym.physics.effects.ground import ground_geoms, touching_geoms
 from nfc_gym.physics.effects.law import OfVariable, degrees, ends_of, kind_of, pushed, spread
 
 _SLIDE, _FREE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_FREE)
 _STICK = 0.02  # m/s or rad/s over which a proposed dry friction turns from one side to the other
 _EDGE = 0.05  # of a patch's length: how soft its edges are
-
-
-def meets(model: mujoco.MjModel, tree: int) -> bool:
-    """Whether any body of a kinematic tree can touch one that is not of it."""
-    own = model.body_treeid[model.geom_bodyid] == tree
-    pairs = (model.geom_contype[own, None] & model.geom_conaffinity[~own]) | (
-        model.geom_conaffinity[own, None] & model.geom_contype[~own]
-    )
-    return bool(pairs.any())
 
 
 class _Patch(OfVariable):
@@ -61,11 +53,12 @@ class _Patch(OfVariable):
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         out: list[Effect] = []
         places = degrees(model)
+        trees = model.body_treeid[model.geom_bodyid[touching_geoms(model, ground_geoms(model))]]
         for place, dof, _, force, unit in pushed(model, scales):
             for name, (its, q) in places.items():
                 along = its - int(model.jnt_dofadr[model.dof_jntid[its]])
                 # Nothing is at a place in the air: what seems so stands for where along its path a craft was.
-                on_ground = kind_of(model, its) == _FREE and along < 2 and meets(model, int(model.dof_treeid[its]))
+                on_ground = kind_of(model, its) == _FREE and along < 2 and model.dof_treeid[its] in trees
                 horizontal = kind_of(model, its) == _SLIDE or on_ground
                 same = model.dof_treeid[its] == model.dof_treeid[dof]
                 if q is not None and horizontal and same and not place.endswith("@body"):

@@ -120,7 +120,8 @@ class LawWave(_Wave):
         return self._rates(ctx, self._resolution(ctx), 60.0)[:, None]
 
     def least(self, ctx: Context) -> Array:
-        return np.array([self._resolution(ctx)])  # slower, it would be no swing but any slow change there is
+        # Slower, it would be no swing but any slow change there is.
+        return np.maximum(super().least(ctx), self._resolution(ctx))
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
         return f"A {self.noun} that swings at {theta[2] / (2 * np.pi):.3g} Hz: {self.amplitude(theta, sd)}."
