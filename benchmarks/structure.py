@@ -62,6 +62,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--nulls", type=int, default=0, help="machines a robot without any")
     add("--windows", type=int, default=Course().windows, help="that a head is trained on")
     add("--epochs", type=int, default=Course().epochs, help="of its training, at most")
+    add("--jobs", type=int, default=1, help="processes that simulate its windows")
+    add("--device", default="cpu", help="that it is trained on (default cpu)")
     add("--seed", type=int, help="repeats a run; default drawn, or the one that --out was begun with")
     add("--stop", type=float, default=float("inf"), metavar="SECONDS", help="begin no trial after so long")
     add("--out", type=Path, metavar="DIR", help="keeps windows, heads and finished trials, and results.json")
@@ -76,7 +78,7 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     course = Course(96, 64, 1, small=True) if args.quick else Course(args.windows, epochs=args.epochs)
     rows: list[dict[str, Any]] = []
     for robot in args.robots:
-        head = taught(robot, course, folder, seed)
+        head = taught(robot, course, folder, seed, args.jobs, args.device)
         told = _kept(folder / f"{robot}_judged.json", lambda r=robot, h=head: judged(r, h, course, folder, seed))
         rows += told_rows(robot, told)
         trials = []

@@ -1,11 +1,14 @@
 """Two cases of their own: a Jackal that lost an axle, and sequential rounds against one."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors.torch
 import torch
 
 from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import Sizes
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.encoders.place import place_of
@@ -21,6 +24,8 @@ from posteriors import metrics
 from posteriors.fitted import Ours
 from posteriors.methods import METHODS, OURS, network_config
 
+FIRST, ONE = "first", "one"  # networks of the first round, and of one round of twice as many
+HELD_OUT = 0.1  # of each round's windows
 AXLE = "front_left_wheel_damping"  # the gain kv of its servo: 0 is a lost axle
 
 
@@ -45,40 +50,66 @@ def axle(network: Network, env: str, windows: int, samples: int, jobs: int) -> d
     }
 
 
+def before(
+    env: str, prior: PriorBox, size: int, training: TrainConfig, small: bool, jobs: int, device: torch.device,
+    folder: Path,
+) -> None:  # fmt: skip
+    """What all truths share: networks trained on `size` simulations from the prior and on twice as many, drawn apart.
+
+    No round from the prior knows what was observed, so that it need not be made for each truth anew. What is in the
+    folder already is not made again.
+    """
+    for name, count in ((FIRST, size), (ONE, 2 * size)):
+        file = folder / f"{name}.safetensors"
+        if file.is_file():
+            continue
+        rng = np.random.default_rng([4, count])
+        batch = Simulator(env, effects=0, jobs=jobs, names=("states", "actions")).draw(count, rng)
+        config = network_config(METHODS[OURS], "summaries", small)
+        network = Network(config, Sizes.of(batch, place=place_of(Machine(env).state_names)), prior, count)
+        train(network, *TensorWindows(batch).split(HELD_OUT), training, device=device)
+        folder.mkdir(parents=True, exist_ok=True)
+        safetensors.torch.save_file(batch, folder / f"{name}_windows.safetensors")
+        checkpoint.save(file, network)
+
+
 def rounds(
-    env: str, prior: PriorBox, truth: int, size: int, training: TrainConfig, small: bool, jobs: int,
-    device: torch.device,
-) -> dict[str, Any]:  # fmt: skip
+    env: str, truth: int, size: int, training: TrainConfig, jobs: int, device: torch.device, folder: Path
+) -> dict[str, Any]:
     """One truth: two rounds of `size` simulations against one of twice as many; gain of the true psi, nats a parameter.
 
-    The two of them draw their simulations apart, with seeds of their own.
+    Args:
+      env: id.
+      truth: its seed.
+      size: simulations a round.
+      training: of the second round.
+      jobs: processes of the simulation.
+      device: to train on.
+      folder: what `before` wrote.
     """
+    first, one = (checkpoint.load(folder / f"{name}.safetensors")[0].to(device) for name in (FIRST, ONE))
+    begun = TensorWindows(safetensors.torch.load_file(folder / f"{FIRST}_windows.safetensors"))
+    prior, rng = first.prior, np.random.default_rng([3, truth])
     simulate = Simulator(env, effects=0, jobs=jobs, names=("states", "actions"))
-    rng = np.random.default_rng([3, truth])
     psi = prior.psi_of(rng.uniform(size=(1, len(prior))))
     seen = simulate(psi, rng)
     window = Window(seen["states"][0].numpy(), seen["actions"][0].numpy())
-    config = network_config(METHODS[OURS], "summaries", small)
-    sizes = Sizes.of(seen, place=place_of(Machine(env).state_names))
 
     def gain(given: NeuralPosterior) -> float:
         return float(given.log_prob(Fidelity(psi))[0] + prior.log_volume) / prior.size
 
-    how = SequentialConfig(rounds=2, simulations=size, narrows=-np.inf, seed=mixed(truth, 2))
-    two = sequential(Network(config, sizes, prior, truth), simulate, window, how, training, device=device)
-    alone = np.random.default_rng([4, truth])
-    u = alone.uniform(size=(2 * size, len(prior)))
-    batch = dict(simulate(prior.psi_of(u), alone)) | {"psi": torch.as_tensor(u, dtype=torch.float32)}
-    one = Network(config, sizes, prior, truth)
-    train(one, *TensorWindows(batch).split(how.held_out), training, device=device)
-    return {"two": gain(two.posterior), "one": gain(NeuralPosterior(one).given(window)), "kept": two.kept}
+    alone, once = gain(NeuralPosterior(one).given(window)), gain(NeuralPosterior(first).given(window))
+    how = SequentialConfig(2, size, narrows=-np.inf, held_out=HELD_OUT, seed=mixed(truth, 2))
+    two = sequential(first, simulate, window, how, training, begun=begun, device=device, scales=False)
+    return {"two": gain(two.posterior), "one": alone, "first": once, "kept": two.kept[1]}
 
 
 def summed(found: list[dict[str, Any]]) -> dict[str, Any]:
     """The truths together."""
-    two, one = (np.array([f[k] for f in found]) for k in ("two", "one"))
+    two, one, first = (np.array([f[k] for f in found]) for k in ("two", "one", "first"))
     return {
         "truths": len(found),
+        "the first round alone, gain a parameter": metrics.mean(first),
         "two rounds, gain a parameter": metrics.mean(two),
         "one round of twice as many": metrics.mean(one),
         "two less one": metrics.mean(two - one),

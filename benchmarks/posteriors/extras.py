@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import torch
 
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Spoken
 from nfc_gym.inference.train import TrainConfig
 from posteriors import cases, plots, residuals
+from posteriors.keep import Kept
 from posteriors.methods import OURS, cell_name
 from posteriors.sets import HALF, Sets, environment, prior_of
 
@@ -38,15 +45,30 @@ def _axle(run: Run, robot: str, terrain: str, sets: Sets) -> None:
 
 
 def _rounds(run: Run, robot: str, terrain: str, sets: Sets) -> None:
-    env, args, found = environment(robot, terrain), run.args, []
-    training = TrainConfig(epochs=args.epochs, batch=args.batch, rate=args.rate)
-    for truth in range(args.truths):
-        if run.over:
-            break
-        found.append(run.kept.once(f"{robot}{terrain}_round_{truth}", lambda t=truth: cases.rounds(
-            env, prior_of(env), t, args.round, training, args.small, args.jobs, run.device)))  # fmt: skip
+    """Truths side by side, a process each: a second round simulates and trains for one of them alone."""
+    env, args, name = environment(robot, terrain), run.args, f"{robot}{terrain}_round"
+    training = TrainConfig(epochs=args.epochs, batch=args.batch, rate=args.rate, mixed=False)
+    folder = run.folder(f"{name}s_{args.round}")
+    cases.before(env, prior_of(env), args.round, training, args.small, args.jobs, run.device, folder)
+    at_once = min(args.truths, args.jobs or os.cpu_count() or 1)
+    with ProcessPoolExecutor(at_once, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        asked = {
+            pool.submit(_round, run.kept, f"{name}_{t}", env, t, args.round, training, run.device, folder, run.ends)
+            for t in range(args.truths)
+        }
+        found = [done for future in as_completed(asked) if (done := future.result())]
     if len(found) > 1:
-        run.kept.keep(f"{robot}{terrain}_rounds", cases.summed(found))
+        run.kept.keep(f"{name}s", cases.summed(found))
+
+
+def _round(
+    kept: Kept, name: str, env: str, truth: int, size: int, training: TrainConfig, device: torch.device, folder: Path,
+    ends: float,
+) -> dict[str, Any]:  # fmt: skip
+    """One truth, unless time is up."""
+    if time.monotonic() > ends:
+        return {}
+    return kept.once(name, lambda: cases.rounds(env, truth, size, training, 1, device, folder), round=size)
 
 
 def _plots(run: Run, robot: str, terrain: str, sets: Sets) -> None:

@@ -82,15 +82,15 @@ class Declared:
         return Fidelity(np.clip(psi, self.space.low, self.space.high))
 
 
-def taught(robot: str, course: Course, folder: Path, seed: int) -> Path:
-    """The head's file; what is there already is not made again."""
+def taught(robot: str, course: Course, folder: Path, seed: int, jobs: int = 1, device: str = "cpu") -> Path:
+    """The head's file, from windows that `jobs` processes simulate; what is there already is not made again."""
     head = folder / f"{robot}.safetensors"
     if not head.exists():
-        windows = _windows(robot, Declared(robot), course.windows, folder / f"{robot}_windows", seed)
+        windows = _windows(robot, Declared(robot), course.windows, folder / f"{robot}_windows", seed, jobs)
         config = replace(SMALL, width=64, features=64, hidden=64) if course.small else SMALL
         train_structure(
             windows.folders[0], head, TrainConfig(epochs=course.epochs, rate=1e-3, decay=0.02, patience=6, seed=seed),
-            config=config, noise=NOISE[robot], report=Spoken(),
+            config=config, noise=NOISE[robot], device=device, report=Spoken(),
         )  # fmt: skip
     return head
 
@@ -137,9 +137,9 @@ def mean_square(states: Array) -> Array:
     return (np.clip(missed, -50, 50) ** 2).mean((1, 2))
 
 
-def _windows(robot: str, declared: Declared, count: int, folder: Path, seed: int) -> Windows:
+def _windows(robot: str, declared: Declared, count: int, folder: Path, seed: int, jobs: int = 1) -> Windows:
     return simulate(
-        ENVIRONMENTS[robot], count, folder, seed=seed, jobs=1, effects=EFFECTS, proposal=declared, motor=MOTOR,
+        ENVIRONMENTS[robot], count, folder, seed=seed, jobs=jobs, effects=EFFECTS, proposal=declared, motor=MOTOR,
         per_shard=min(count, 2048),
     )  # fmt: skip
 

@@ -147,17 +147,19 @@ class TruncatedPrior:
 
 def sequential(
     network: Network, simulate: Simulator, window: Window, config: SequentialConfig | None = None,
-    training: TrainConfig | None = None, *, device: str | torch.device = "cpu", report: Report = quiet,
-    scales: bool = True,
+    training: TrainConfig | None = None, *, begun: TensorWindows | None = None, device: str | torch.device = "cpu",
+    report: Report = quiet, scales: bool = True,
 ) -> Rounds:  # fmt: skip
     """Infer psi from one window in rounds of simulations that close in on it.
 
     Args:
-      network: as built, or trained before: then its own posterior is the first round's proposal.
+      network: as built, or trained before.
       simulate: (psi (n, d) in physical units, generator) -> a batch of n windows without `psi`; see `data`.
       window: what was observed.
       config: see `SequentialConfig`.
       training: of each round, on all windows so far.
+      begun: windows whose psi is drawn from the prior and which the network has been trained on: they are the first
+        round, whatever their number, for any window that was observed.
       device: to train on.
       report: is told of the progress.
       scales: see `train`; a network that was trained before on other windows is to keep its own.
@@ -171,18 +173,19 @@ def sequential(
     train_set: TensorWindows | None = None
     held_out: TensorWindows | None = None
     for r in range(config.rounds):
-        if r == 0:
-            out.kept.append(1.0)
-            psi = network.prior.psi_of(rng.uniform(size=(config.simulations, len(network.prior))))
-        else:
+        if r:
             proposal = TruncatedPrior(out.posterior, config, rng)
             out.kept.append(proposal.kept)
-            psi = proposal.sample(config.simulations, rng)
-        new = _simulated(network.prior, simulate, psi, rng)
+            new = _simulated(network.prior, simulate, proposal.sample(config.simulations, rng), rng)
+        else:
+            out.kept.append(1.0)
+            new = begun or _simulated(network.prior, simulate, _prior(network.prior, config.simulations, rng), rng)
         first, last = new.split(config.held_out)
         train_set = first if train_set is None else train_set.append(first)
         held_out = last if held_out is None else held_out.append(last)
-        out.outcomes.append(train(network, train_set, held_out, training, device=device, report=report, scales=scales))
+        if r or begun is None:
+            told = train(network, train_set, held_out, training, device=device, report=report, scales=scales)
+            out.outcomes.append(told)
         out.posterior = NeuralPosterior(network).given(window)
         out.entropy.append(-float(TruncatedPrior(out.posterior, config, rng)._draws(config.samples, rng)[1].mean()))
         report.message(f"round {r + 1}: {len(train_set)} windows, posterior entropy {out.entropy[-1]:.3f} nats")
@@ -193,6 +196,11 @@ def sequential(
     assert held_out is not None
     out.windows = train_set.append(held_out)
     return out
+
+
+def _prior(prior: PriorBox, n: int, rng: np.random.Generator) -> Array:
+    """(n, d) psi, physical units."""
+    return prior.psi_of(rng.uniform(size=(n, len(prior))))
 
 
 def _simulated(prior: PriorBox, simulate: Simulator, psi: Array, rng: np.random.Generator) -> TensorWindows:

@@ -1,5 +1,7 @@
 """Truncated proposals on a posterior that is known."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from problems import NOISE, box, gaussian, linear_windows, mix, network
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.sequential import SequentialConfig, TruncatedPrior, sequential
-from nfc_gym.inference.train import TrainConfig
+from nfc_gym.inference.train import TrainConfig, train
 
 X = torch.tensor([[0.8, -0.5, 0.3]])
 OBSERVED = Window(X, np.zeros((0, 0)))
@@ -77,6 +79,32 @@ def test_rounds_close_in_and_end_where_they_no_longer_narrow() -> None:
     sd = exact.covariance_matrix.diagonal().sqrt().numpy()
     assert np.abs((z.mean(0) - exact.mean.numpy()) / sd).max() < 0.5
     assert np.isfinite(out.posterior.log_prob(Fidelity(box(3).from_z(z[:5])))).all()
+
+
+def test_windows_of_the_prior_that_were_learned_before_are_the_first_round() -> None:
+    begun = linear_windows(400)
+    net = network(begun, linear=True)
+    training = TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95)
+    train(net, *begun.split(0.1), training)
+    weights = {k: t.clone() for k, t in net.state_dict().items()}
+    first = NeuralPosterior(deepcopy(net)).given(OBSERVED)
+
+    config = SequentialConfig(rounds=1, samples=150)
+    alone = sequential(net, simulate, OBSERVED, config, training, begun=begun)
+    assert not alone.outcomes
+    assert len(alone.windows) == 400
+    assert all(torch.equal(t, weights[k]) for k, t in net.state_dict().items())
+
+    config = SequentialConfig(rounds=2, simulations=300, samples=150, oversampling=4, narrows=-np.inf)
+    out = sequential(net, simulate, OBSERVED, config, training, begun=begun, scales=False)
+    assert len(out.outcomes) == 1
+    assert len(out.windows) == 700
+    proposal = TruncatedPrior(first, config, np.random.default_rng(config.seed))
+    fresh = box(3).psi_of(out.windows.tensors["psi"].double().numpy())
+    gains = first.log_prob(Fidelity(fresh)) + first.prior.log_volume
+    # of the second round's windows all lie where the first network's posterior of this window has its mass
+    assert (gains > proposal.threshold - 1e-3).sum() >= 300
+    assert (gains > proposal.threshold).mean() < 1
 
 
 def test_bad_settings_are_refused() -> None:
