@@ -1,8 +1,8 @@
 """Anomaly detectors on simulated windows with and without faults: what is found, and at which price.
 
     python benchmarks/anomaly.py [--quick] [--robots Jackal Ant ...] [--nominal N] [--held-out N] [--faulty N]
-                                 [--training N] [--epochs N] [--effects N] [--draws N] [--width W] [--seed S]
-                                 [--json FILE]
+                                 [--training N] [--epochs N] [--effects N] [--draws N] [--levels N] [--width W]
+                                 [--seed S] [--json FILE]
 
 Every machine's psi is drawn within `--width` of the prior's range about nominal, and the replay believes that
 distribution and no more. Faults: main mass, an actuator's gain, friction, and effects of the library drawn at run
@@ -35,6 +35,7 @@ from nfc_gym.inference.train import TrainConfig, train
 from nfc_gym.physics.effects import Effect, build
 from nfc_gym.physics.effects.base import Param
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.simulate.bank import ReplayBank
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
 from nfc_gym.simulate.residuals import candidates, sizes
@@ -44,6 +45,7 @@ from nfc_gym.simulate.trials import trials
 Array = NDArray[np.float64]
 RATES = (0.05, 0.01, 0.001)
 MASS, GAIN, FRICTION = (2.0, 1.5, 1.25, 1.1), (0.0, 0.25, 0.5, 0.75), (0.3, 0.5, 0.7, 0.9)
+LEVEL = 0.01  # share of nominal windows in which each fault of the bank alone would be believed
 EFFECT = (1.0, 0.3, 3.0)  # times the size drawn
 GOAL, STRONG = 0.995, 5.0  # rate found at a false-positive rate of 0.001; X / X_null from which an effect has that goal
 
@@ -84,7 +86,7 @@ def faults(machine: Machine, effects: int, rng: np.random.Generator) -> list[Fau
             out.append(Fault(f"{servos[0]} x {k:g}", scaled(servos[:1], k), wanted=k == GAIN[0]))
         else:
             actuator = machine.model.actuator(0).name
-            loss, theta = build("loss", actuator, {"loss": 1 - k})
+            loss, theta = build("loss", actuator, {"fraction": 1 - k})
             out.append(Fault(f"gain of {actuator} x {k:g}", ones, loss, theta, wanted=k == GAIN[0]))
     own = [n for n in names if n.endswith("_friction")]
     for k in FRICTION:
@@ -135,6 +137,8 @@ class Bench:
         training = self.windows(None, args.training)
         belief = Fidelity(psi=self.psi(512))
         self.replay = Replay(self.machine.environment, belief, draws=args.draws, seed=args.seed)
+        bank = ReplayBank(self.machine.environment, belief, draws=max(2, args.draws // 2), seed=args.seed)
+        self.bank = bank.levelled(*self.started(self.windows(None, args.levels)), rate=LEVEL)
         self.plain = Unconditional(training)
         tensors = {k: torch.as_tensor(training[k], dtype=torch.float32) for k in ("states", "actions")}
         space = self.machine.space
@@ -164,15 +168,21 @@ class Bench:
                 given = {"effect": fault.effect, "theta": np.tile(fault.theta, (n, 1))}
         return trials(self.machine, psi, 1000 * self.args.seed + self.count, **given)
 
-    def scores(self, windows: dict[str, NDArray]) -> dict[str, Array]:
-        """(n,) of each detector, and the mean X, not cut, as `x`."""
+    def started(self, windows: dict[str, NDArray]) -> tuple[Array, Array, Array | None]:
+        """States, actions, and a state estimate of the start of robots that do not observe their whole state."""
         model, start = self.machine.model, None
-        if self.machine.kind.name not in ("jackal", "quadcopter"):  # the others do not observe their whole state
+        if self.machine.kind.name not in ("jackal", "quadcopter"):
             true = windows["start"][:, 1 : 1 + model.nq + model.nv]
             start = disturbed(self.machine, true, self.rng.standard_normal((len(true), 2 * model.nv)))
-        steps = self.replay.steps(windows["states"], windows["actions"], start)
+        return windows["states"], windows["actions"], start
+
+    def scores(self, windows: dict[str, NDArray]) -> dict[str, Array]:
+        """(n,) of each detector, and the mean X, not cut, as `x`."""
+        started = self.started(windows)
+        steps = self.replay.steps(*started)
         return {
             "replay": self.replay.summed(steps),
+            "bank": self.bank.score(*started),
             "contrast": self.contrast.score(windows["states"], windows["actions"]),
             "unconditional": self.plain.score(windows),
             "x": steps.mean(1),
@@ -183,7 +193,7 @@ def measure(table: Table, robot: str, args: argparse.Namespace) -> None:
     """All rows of one robot."""
     bench, seeds = Bench(robot, args), (args.seed,)
     held, nominal = (bench.scores(bench.windows(None, n)) for n in (args.held_out, args.nominal))
-    names = ("replay", "contrast", "unconditional")
+    names = ("replay", "bank", "contrast", "unconditional")
     unit = {k: np.quantile(held[k], 0.95) for k in ("replay", "contrast")}
     for scores in (held, nominal):
         scores["either"] = np.maximum(scores["replay"] / unit["replay"], scores["contrast"] / unit["contrast"])
@@ -218,7 +228,7 @@ def report(
 ) -> None:  # fmt: skip
     """Rows of one fault at one size."""
     base = auroc(nominal["unconditional"], faulty["unconditional"])[0]
-    for k in ("replay", "contrast", "either"):
+    for k in ("replay", "bank", "contrast", "either"):
         area, error = auroc(nominal[k], faulty[k])
         table.add(f"{name}: AUROC, {k} (+- {error:.2g})", area, "1", baseline=base, seeds=seeds)
         for rate, limit in limits.items():
@@ -240,7 +250,8 @@ def main() -> None:
     parser.add_argument("--training", type=int, default=20_000, help="nominal windows of the contrastive net")
     parser.add_argument("--epochs", type=int, default=30, help="of the contrastive net")
     parser.add_argument("--effects", type=int, default=6, help="effects of the library, drawn")
-    parser.add_argument("--draws", type=int, default=32, help="replays a window")
+    parser.add_argument("--levels", type=int, default=1000, help="nominal windows that level the bank's faults")
+    parser.add_argument("--draws", type=int, default=32, help="replays a window; of each machine in the bank half")
     parser.add_argument("--width", type=float, default=0.02, help="of psi about nominal, in the prior's range")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help="Jackal alone, a few windows: a minute, and says little")
@@ -248,7 +259,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 64, 64, 8
-        args.training, args.epochs, args.effects, args.draws = 256, 1, 1, 16
+        args.training, args.epochs, args.effects, args.draws, args.levels = 256, 1, 1, 8, 100
     torch.set_num_threads(1)
     table = Table()
     for robot in args.robots:

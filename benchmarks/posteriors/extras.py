@@ -24,6 +24,8 @@ from posteriors.sets import HALF, Sets, environment, prior_of
 if TYPE_CHECKING:
     from posterior_table import Run
 
+ROOM = 10 * 2**30  # of a GPU's memory that densities of one second round's proposals take
+
 
 def _residuals(run: Run, robot: str, terrain: str, sets: Sets) -> None:
     name, env, args = f"{robot}{terrain}_residuals", environment(robot, terrain), run.args
@@ -51,6 +53,8 @@ def _rounds(run: Run, robot: str, terrain: str, sets: Sets) -> None:
     folder = run.folder(f"{name}s_{args.round}")
     cases.before(env, prior_of(env), args.round, training, args.small, args.jobs, run.device, folder)
     at_once = min(args.truths, args.jobs or os.cpu_count() or 1)
+    if run.device.type == "cuda":
+        at_once = max(1, min(at_once, torch.cuda.mem_get_info(run.device)[1] // ROOM))
     with ProcessPoolExecutor(at_once, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)) as pool:
         asked = {
             pool.submit(_round, run.kept, f"{name}_{t}", env, t, args.round, training, run.device, folder, run.ends)

@@ -22,7 +22,7 @@ from nfc_gym.measured.hidden import Array
 from nfc_gym.simulate import simulate
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.misfit import of_windows
-from nfc_gym.simulate.teach import SMALL, train_structure
+from nfc_gym.simulate.teach import EPOCHS, SMALL, train_structure
 from nfc_gym.simulate.witness import Witness
 
 from .robots import ROBOTS
@@ -49,7 +49,7 @@ class Course:
 
     windows: int = 40_960
     judged: int = 2048
-    epochs: int = 20
+    epochs: int = EPOCHS
     small: bool = False
 
 
@@ -87,7 +87,7 @@ def taught(robot: str, course: Course, folder: Path, seed: int, jobs: int = 1, d
     head = folder / f"{robot}.safetensors"
     if not head.exists():
         windows = _windows(robot, Declared(robot), course.windows, folder / f"{robot}_windows", seed, jobs)
-        config = replace(SMALL, width=64, features=64, hidden=64) if course.small else SMALL
+        config = replace(SMALL, encoder="nn", width=64, features=64, hidden=64) if course.small else SMALL
         train_structure(
             windows.folders[0], head, TrainConfig(epochs=course.epochs, rate=1e-3, decay=0.02, patience=6, seed=seed),
             config=config, noise=NOISE[robot], device=device, report=Spoken(),

@@ -1,6 +1,7 @@
 """Commands of neural posteriors: simulate, train, infer; torch is loaded only inside them."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -95,7 +96,9 @@ def train(
     noise: Annotated[
         float, typer.Option(metavar="FACTOR", min=0, help="Times the sensor noise that the windows' manifest assumes.")
     ] = 1.0,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes over the windows, at most.")] = 100,
+    epochs: Annotated[
+        int | None, typer.Option(min=1, help="Passes over the windows, at most; default 100, 4 with --structure.")
+    ] = None,
     batch: Annotated[int, typer.Option(min=1, help="Windows a step.")] = 256,
     seed: Annotated[int, typer.Option(min=0, help="Of the first weights, the order and the noise.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto is a GPU where there is one.")] = "auto",
@@ -133,10 +136,12 @@ def train(
         config = NetworkConfig(
             encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
         )
-        training, how = TrainConfig(epochs=epochs, batch=batch, seed=seed), {"report": Spoken(), "noise": noise}
+        training, how = TrainConfig(batch=batch, seed=seed), {"report": Spoken(), "noise": noise}
+        training = replace(training, epochs=epochs or training.epochs)
         if structure:
-            from nfc_gym.simulate.teach import train_structure
+            from nfc_gym.simulate.teach import EPOCHS, train_structure
 
+            training = replace(training, epochs=epochs or EPOCHS)
             done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
         else:
             done = jobs.train_posterior(windows, prior, out, config, training, device=device, **how)

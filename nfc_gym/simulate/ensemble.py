@@ -23,10 +23,12 @@ class Innovation(NamedTuple):
 
     Attributes:
       squared: (n,) e' Sigma^-1 e.
+      log_det: (n,) log det Sigma.
       gain: (n, M, M) by which members move: row m is the weights, one for each member's deviation, of member m.
     """
 
     squared: Array
+    log_det: Array
     gain: Array
 
 
@@ -40,12 +42,14 @@ def innovation(errors: Array, eps: Array) -> Innovation:
     m = errors.shape[1]
     mean = errors.mean(1)
     spread = (mean[:, None] - errors) / np.sqrt(m - 1)  # members less their mean
-    root = 1 / np.sqrt(1 + DIAGONAL * (spread * spread).sum(1))
+    alone = 1 + DIAGONAL * (spread * spread).sum(1)
+    root = 1 / np.sqrt(alone)
     e, s = mean * root, spread * (np.sqrt(1 - DIAGONAL) * root[:, None])
-    inner = np.linalg.inv(np.eye(m) + s @ s.transpose(0, 2, 1))
+    among = np.eye(m) + s @ s.transpose(0, 2, 1)
+    inner, log_det = np.linalg.inv(among), np.log(alone).sum(1) + np.linalg.slogdet(among)[1]
     b = np.einsum("nmk,nk->nm", s, e)
     squared = (e * e).sum(1) - np.einsum("nm,nmj,nj->n", b, inner, b)
     # x_m += X' S Sigma^-1 (e_m + eps_m); S Sigma^-1 = (1 + s s')^-1 s D^-1/2, scaled back by sqrt(1 - a)
     told = (errors + eps) * root[:, None]
     gain = (told @ s.transpose(0, 2, 1)) @ inner.transpose(0, 2, 1) / np.sqrt(1 - DIAGONAL)
-    return Innovation(squared, gain)
+    return Innovation(squared, log_det, gain)

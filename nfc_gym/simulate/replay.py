@@ -18,6 +18,7 @@ go without a fault is found from nominal windows (`inference.rates`), not from t
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import mujoco
@@ -31,9 +32,11 @@ from nfc_gym.envs.humanoid import Humanoid
 from nfc_gym.envs.quadcopter import Quadcopter
 from nfc_gym.envs.simulations import Simulations
 from nfc_gym.inference.detector import checked
+from nfc_gym.physics.effects import Effect
 from nfc_gym.simulate.ensemble import innovation
 from nfc_gym.simulate.machine import MOTOR, Machine
-from nfc_gym.simulate.roll import step
+from nfc_gym.simulate.residuals import Given, Residuals
+from nfc_gym.simulate.roll import acted_on
 from nfc_gym.simulate.start import disturbed, observed
 from nfc_gym.terrain import Heightfield
 
@@ -90,12 +93,30 @@ class Replay:
         self.start = rng.standard_normal((draws, 2 * machine.model.nv))
         self.told = np.flatnonzero(told(machine))
         self.eps = rng.standard_normal((draws, self.horizon, len(self.told)))
+        self.lacks: tuple[Effect, Array] | None = None  # what every replay has beyond the model, see `under`
+        self._residuals: Residuals
         self._sims: Simulations | None = None
+
+    def under(self, scale: Array, lacks: tuple[Effect, Array] | None = None) -> "Replay":
+        """The same draws for a machine with a fault.
+
+        Args:
+          scale: (d,) that psi is multiplied by.
+          lacks: an effect of the machine, and its parameters (k,).
+
+        Raises:
+          InputError: scale of another size.
+        """
+        if np.shape(scale) != (len(self.machine.space),):
+            raise InputError(f"replay: scale has shape {np.shape(scale)}, want ({len(self.machine.space)},)")
+        out = copy(self)
+        out.psi, out.lacks, out._sims = self.psi * scale, lacks, None
+        return out
 
     def score(
         self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
     ) -> Array:
-        """(n,) mean of min(X, `MOST`) after the first `SETTLE` steps; arguments and errors as of `steps`."""
+        """(n,) mean of min(X, `MOST`) after the first `SETTLE` steps; arguments and errors as of `told_of`."""
         return self.summed(self.steps(states, actions, start, which))
 
     def score_rows(self, states: Array, actions: Array, rows: NDArray[np.intp]) -> Array:
@@ -111,7 +132,16 @@ class Replay:
     def steps(
         self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
     ) -> Array:
-        """(n, H) X of each control step of windows; infinite from where replays come apart.
+        """(n, H) X of each control step; infinite from where replays come apart. Arguments as of `told_of`."""
+        return self.told_of(states, actions, start, which)[..., 0] / len(self.told)
+
+    def told_of(
+        self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
+    ) -> Array:
+        """(n, H, 2) e' Sigma^-1 e and log det Sigma of each control step of windows.
+
+        Their sum, halved, is minus the log likelihood of what was observed in the step given all before it, but for a
+        constant. From where replays come apart the first is infinite and the second 0.
 
         Args:
           states: (n, H+1, s) as observed, with noise.
@@ -132,7 +162,7 @@ class Replay:
             self._scored(states[i : i + per], actions[i : i + per], starts[i : i + per], which[i : i + per], hidden)
             for i in range(0, len(states), per)
         ]
-        return np.concatenate(parts) if parts else np.zeros((0, self.horizon))
+        return np.concatenate(parts) if parts else np.zeros((0, self.horizon, 2))
 
     def _which(self, n: int, which: NDArray[np.intp] | None) -> NDArray[np.intp]:
         count = max(len(self.maps), 1)
@@ -154,15 +184,16 @@ class Replay:
     def _scored(
         self, states: Array, actions: Array, starts: Array, which: NDArray[np.intp], hidden: bool
     ) -> Array:  # fmt: skip
-        """(n, H) X of each control step; infinite from where replays come apart."""
+        """(n, H, 2), see `told_of`."""
         sims, held = self._begin(states, starts, which, hidden), np.ones(len(states), bool)
-        out = np.empty((len(states), self.horizon))
+        out = np.empty((len(states), self.horizon, 2))
         with np.errstate(over="ignore", invalid="ignore"):
             for t in range(self.horizon):
                 errors = self._step(sims, states, actions, t)
                 held &= np.isfinite(errors).all((1, 2))
                 found = innovation(np.where(held[:, None, None], errors, 0.0), self.eps[:, t])
-                out[:, t] = np.where(held, found.squared / len(self.told), np.inf)
+                out[:, t, 0] = np.where(held, found.squared, np.inf)
+                out[:, t, 1] = np.where(held, found.log_det, 0.0)
                 self._move(sims, np.where(held[:, None, None], found.gain, 0.0))
         return out
 
@@ -172,7 +203,7 @@ class Replay:
         robot, view = sims.robot, sims.view
         commanded = np.repeat(actions[:, t], m, 0)
         view.ctrl[...] = robot.actuate(np.clip(commanded + np.tile(self.jitter[:, t], (n, 1)), -1, 1), view)
-        step(sims, np.ones(n * m, bool), machine.kind.frame_skip)
+        acted_on(sims, self._residuals, np.ones(n * m, bool), machine.kind.frame_skip)
         view.task.update(robot.advance(view, commanded))
         view.before, view.now = view.now, robot.derive(view)
         shown = np.concatenate(robot.proprio(view), -1).reshape(n, m, -1)
@@ -206,6 +237,7 @@ class Replay:
         if fresh or len(self.maps) > 1:
             on = {"terrain_id": np.repeat(which, self.draws)} if machine.rough else {}
             sims.begin(np.arange(sims.n), {"psi": np.tile(self.psi, (n, 1))} | on)
+            self._residuals = Residuals(sims, self._given_effects(sims))
         sims.batch.reset(np.arange(sims.n), sims.rest)
         view = sims.view
         rows = disturbed(machine, np.repeat(starts, self.draws, 0), np.tile(self.start, (n, 1)), hidden)
@@ -214,7 +246,16 @@ class Replay:
         if isinstance(sims.robot, Quadcopter):
             view.task["goal"] = np.repeat(starts[:, :3] + states[:, 0, :3], self.draws, 0)
         view.now = sims.robot.derive(view)
+        for _, acting, _ in self._residuals.parts:
+            acting.restart()
         return sims
+
+    def _given_effects(self, sims: Simulations) -> list[Given]:
+        if self.lacks is None:
+            return []
+        effect, theta = self.lacks
+        effect.bind(sims.model)
+        return [Given(effect, slice(0, sims.n), np.tile(theta, (sims.n, 1)))]
 
 
 def told(machine: Machine) -> NDArray[np.bool_]:

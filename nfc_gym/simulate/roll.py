@@ -98,6 +98,17 @@ def step(sims: Simulations, rows: Flags, steps: int) -> None:
         sims.view.qvel[error.ids] = np.nan
 
 
+def acted_on(sims: Simulations, residuals: Residuals, rows: Flags, steps: int) -> None:
+    """Physics steps of some simulations under the commands that they have, with their effects at work."""
+    residuals.command(sims.view.ctrl)
+    step(sims, rows & ~residuals.between, steps)
+    if residuals.parts:
+        for _ in range(steps):
+            residuals.act()
+            step(sims, rows & residuals.between, 1)
+        residuals.rest()
+
+
 def roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy | None, nthread: int) -> Rolled:
     """Simulate the rows of a task.
 
@@ -152,13 +163,7 @@ def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy 
             actions[:, k] = action
             shown = shadow.step(machine, sims, batch.state[rows], action[rows], acted[rows], alive)
         view.ctrl[...] = robot.actuate(acted, view)
-        residuals.command(view.ctrl)
-        step(sims, alive & ~residuals.between, kind.frame_skip)
-        if residuals.parts:
-            for _ in range(kind.frame_skip):
-                residuals.act()
-                step(sims, alive & residuals.between, 1)
-            residuals.rest()
+        acted_on(sims, residuals, alive, kind.frame_skip)
         apart = alive & broken(view)
         if apart.any():
             unstable |= apart

@@ -22,7 +22,8 @@ from nfc_gym.simulate.observed import require_unfeeling
 from nfc_gym.simulate.witness import MISFIT
 
 HELD_OUT = 0.05  # of the windows, by which epochs are compared
-SMALL = NetworkConfig(encoder="nn", density="mixture", components=1, width=384, features=256, hidden=256)
+EPOCHS = 4  # passes over windows that are shown several times each: more and their noise is learned by heart
+SMALL = NetworkConfig(encoder="tcn", density="mixture", components=1, width=384, features=256, hidden=256)
 
 
 class Head(Network):
@@ -37,7 +38,7 @@ class Head(Network):
 
 def train_structure(
     folder: Path, out: Path, training: TrainConfig, *, config: NetworkConfig = SMALL, noise: float = 1.0,
-    repeats: int = 2, device: str | torch.device = "cpu", report: Report = quiet,
+    repeats: int = 6, device: str | torch.device = "cpu", report: Report = quiet,
 ) -> Outcome:  # fmt: skip
     """Train a structure head on a folder of windows into a checkpoint; a run that was stopped goes on.
 
