@@ -259,7 +259,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 64, 64, 8
-        args.training, args.epochs, args.effects, args.draws, args.levels = 256, 1, 1, 8, 100
+        args.training, args.epochs, args.effects, args.draws, args.levels = 256, 1, 1, 4, 100
     torch.set_num_threads(1)
     table = Table()
     for robot in args.robots:
