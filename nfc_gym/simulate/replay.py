@@ -231,7 +231,9 @@ class Replay:
         machine, n, nq = self.machine, len(states), self.machine.model.nq
         mujoco.set_mju_user_warning(lambda message: None)  # replays that come apart are nan
         sims = self._sims
-        fresh = sims is None or sims.n != n * self.draws
+        # An effect's edits of the model are made once: on other ground than before it gets new simulations.
+        anew = self.lacks is not None and len(self.maps) > 1
+        fresh = sims is None or sims.n != n * self.draws or anew
         if sims is None or fresh:
             sims = self._sims = machine.simulations(n * self.draws, self.nthread, self.maps)
         if fresh or len(self.maps) > 1:
