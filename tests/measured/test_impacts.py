@@ -1,0 +1,108 @@
+"""Where bodies touch: the noise that impacts make of starts and steps, and psi near by."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nfc_gym.core import Channel, Log
+from nfc_gym.measured.metric import metric
+from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.shooting import RolloutProblem, finer
+from nfc_gym.measured.states import estimate_states
+from nfc_gym.physics.parameters import Parameter, ParameterSpace
+from nfc_gym.physics.rollout import Plant
+
+DT, BALLS = 0.005, 4
+LAYOUT = Layout(0.4, 0.0, (0.1, 0.2, 0.4), 0.4, DT)
+BOUNCY = """
+<mujoco>
+  <option timestep="{step}" integrator="implicitfast"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    {balls}
+  </worldbody>
+</mujoco>
+"""
+BALL = """
+    <body name="ball{i}" pos="{i} 0 0.3">
+      <joint name="up{i}" type="slide" axis="0 0 1"/>
+      <geom name="shell{i}" size="0.05" mass="0.2" solref="-4000 -1"/>
+    </body>
+"""
+
+
+def chi2(problem: RolloutProblem, plant: Plant, x: np.ndarray) -> np.ndarray:
+    return metric(problem, problem.covariance(plant, x)).whiten(problem.residual(plant, x[None]))[0] ** 2
+
+
+def bouncy(step: float) -> mujoco.MjModel:
+    balls = "".join(BALL.format(i=i) for i in range(BALLS))
+    return mujoco.MjModel.from_xml_string(BOUNCY.format(step=step, balls=balls))
+
+
+def bounce(step: float, seconds: float, rng: np.random.Generator) -> Log:
+    """Balls that were dropped, simulated at a step, seen at 200 Hz with noise."""
+    model, rows = bouncy(step), []
+    data = mujoco.MjData(model)
+    data.qpos[:] = rng.uniform(-0.2, 0.2, BALLS)
+    for _ in range(round(seconds / DT)):
+        rows.append((data.qpos.copy(), data.qvel.copy()))
+        mujoco.mj_step(model, data, round(DT / step))
+    q, v = np.swapaxes(rows, 0, 1)
+    q, v = q + 0.001 * rng.normal(size=q.shape), v + 0.02 * rng.normal(size=v.shape)
+    channels = {f"joint:up{i}:pos": Channel(q[:, i], "m", 0.001) for i in range(BALLS)}
+    channels |= {f"joint:up{i}:vel": Channel(v[:, i], "m/s", 0.02) for i in range(BALLS)}
+    return Log(str(rng.integers(1 << 30)), np.arange(len(q)) * DT, {}, channels)
+
+
+def test_the_noise_of_impacts_is_drawn_from_starts() -> None:
+    """A bounce at a coarse step is off in a direction that depends on when it falls between two steps."""
+    rng = np.random.default_rng(3)
+    logs, model = [bounce(0.0005, 2.1, rng) for _ in range(8)], bouncy(DT)
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    states = [estimate_states(model, log) for log in logs]
+    problem = RolloutProblem(model, logs, states, LAYOUT)
+    assert problem.rough
+    drawn = chi2(problem, plant, plant.null)
+    problem.rough = False  # one direction for the discretisation, as where nothing touches
+    straight = chi2(problem, plant, plant.null)
+    print(straight.mean(), np.median(straight.mean(1)), drawn.mean(), np.median(drawn.mean(1)), drawn.mean(1).max())
+    assert 0.7 < drawn.mean() < 1.3 < straight.mean()
+
+
+def test_at_half_the_step_the_noise_of_impacts_is_told_by_the_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    logs, model = [bounce(0.0005, 2.1, rng) for _ in range(8)], bouncy(DT)
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    states = [estimate_states(model, log) for log in logs]
+    problem = RolloutProblem(model, logs, states, LAYOUT).halved()
+    steps: list[float] = []
+    shoot = Plant.shoot
+    monkeypatch.setattr(Plant, "shoot", lambda self, x, s, **kw: steps.append(s.dt) or shoot(self, x, s, **kw))
+    assert 0.7 < chi2(problem, finer(plant), plant.null).mean() < 1.3
+    assert set(steps) == {DT / 2, DT}  # and not a quarter
+
+
+def test_the_noise_of_impacts_is_that_of_several_psi_near_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Balls that are slowed down a little more or less: on average what each of those expects by itself."""
+    rng = np.random.default_rng(5)
+    logs, model = [bounce(0.0005, 2.1, rng) for _ in range(8)], bouncy(DT)
+    joints = tuple(f"up{i}" for i in range(BALLS))
+    plant = Plant(
+        model, ParameterSpace(model, [Parameter("damping", "dof_damping", joints, low=0.0, high=2.0)]), nthread=1
+    )
+    problem = RolloutProblem(model, logs, [estimate_states(model, log) for log in logs], LAYOUT)
+    x = np.array([0.4])
+
+    def noise(at: np.ndarray) -> np.ndarray:
+        return np.einsum("sii->i", problem.covariance(plant, at)) / len(problem)
+
+    monkeypatch.setattr("nfc_gym.measured.shooting._OFF", 1.0)
+    rows = problem._near(plant, x, problem.residual(plant, x[None])[0], 4)[0]
+    together = noise(x)
+    assert rows[0] == x
+    assert np.ptp(rows) > 0.3
+    monkeypatch.setattr("nfc_gym.measured.shooting._OFF", 0.0)
+    alone = np.stack([noise(row) for row in rows])
+    assert (np.abs(np.log(alone / alone[0])) > 0.1).any(), "else this would test nothing"
+    np.testing.assert_allclose(together, alone.mean(0), rtol=0.15)
