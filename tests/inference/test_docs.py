@@ -19,7 +19,7 @@ PAGE = (Path(__file__).resolve().parents[2] / "docs" / "inference.md").read_text
 
 def test_train_then_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     programs = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
-    assert len(programs) == 3
+    assert len(programs) == 4
     monkeypatch.chdir(tmp_path)
     t = motion_windows(60).tensors
     env = gymnasium.make("nfc_gym/JackalFlat-v0", context=["psi"])
@@ -34,5 +34,9 @@ def test_train_then_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     names |= {"nominal_states": nominal["states"], "nominal_actions": nominal["actions"]}
     exec(programs[2].replace("given)", "given, draws=4)").replace("rate=0.01", "rate=0.05"), names)
     names["env"].reset(seed=0)
+    names |= {f"other_{k}": nominal[k][:20] for k in ("states", "actions")}
+    few = programs[3].replace("given)", "given, draws=2)").replace("rate=0.01", "rate=0.05")
+    exec(re.sub(r"other_actions,?\n", "other_actions, rate=0.1\n", few), names)
+    assert names["detector"].threshold is not None
     assert {p.name for p in tmp_path.iterdir()} == {"run", "jackal.safetensors", "today.safetensors"}
     env.close()
