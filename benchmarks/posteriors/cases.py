@@ -69,7 +69,8 @@ def before(
         network = Network(config, Sizes.of(batch, place=place_of(Machine(env).state_names)), prior, count)
         train(network, *TensorWindows(batch).split(HELD_OUT), training, device=device)
         folder.mkdir(parents=True, exist_ok=True)
-        safetensors.torch.save_file(batch, folder / f"{name}_windows.safetensors")
+        if name == FIRST:  # the second round learns from them too
+            safetensors.torch.save_file(batch, folder / f"{name}_windows.safetensors")
         checkpoint.save(file, network)
 
 

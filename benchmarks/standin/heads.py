@@ -16,13 +16,12 @@ from posteriors.metrics import area
 from nfc_gym.core import Fidelity
 from nfc_gym.inference.evidence import told_by
 from nfc_gym.inference.progress import Spoken
-from nfc_gym.inference.train import TrainConfig
 from nfc_gym.inference.windows import Windows
 from nfc_gym.measured.hidden import Array
 from nfc_gym.simulate import simulate
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.misfit import of_windows
-from nfc_gym.simulate.teach import EPOCHS, SMALL, train_structure
+from nfc_gym.simulate.teach import NETWORK, TRAINING, train_structure
 from nfc_gym.simulate.witness import Witness
 
 from .robots import ROBOTS
@@ -49,7 +48,7 @@ class Course:
 
     windows: int = 40_960
     judged: int = 2048
-    epochs: int = EPOCHS
+    epochs: int = TRAINING.epochs
     small: bool = False
 
 
@@ -87,9 +86,9 @@ def taught(robot: str, course: Course, folder: Path, seed: int, jobs: int = 1, d
     head = folder / f"{robot}.safetensors"
     if not head.exists():
         windows = _windows(robot, Declared(robot), course.windows, folder / f"{robot}_windows", seed, jobs)
-        config = replace(SMALL, encoder="nn", width=64, features=64, hidden=64) if course.small else SMALL
+        config = replace(NETWORK, encoder="nn", width=64, features=64, hidden=64) if course.small else NETWORK
         train_structure(
-            windows.folders[0], head, TrainConfig(epochs=course.epochs, rate=1e-3, decay=0.02, patience=6, seed=seed),
+            windows.folders[0], head, replace(TRAINING, epochs=course.epochs, seed=seed),
             config=config, noise=NOISE[robot], device=device, report=Spoken(),
         )  # fmt: skip
     return head

@@ -130,18 +130,17 @@ def train(
         from nfc_gym.inference.progress import Spoken
         from nfc_gym.inference.space import PriorBox
         from nfc_gym.inference.train import TrainConfig
+        from nfc_gym.simulate.teach import TRAINING, train_structure
 
         machine = Machine(Manifest.read(windows).environment)
         prior = PriorBox.of(machine.space, machine.kind.name)
         config = NetworkConfig(
             encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
         )
-        training, how = TrainConfig(batch=batch, seed=seed), {"report": Spoken(), "noise": noise}
-        training = replace(training, epochs=epochs or training.epochs)
+        training = TRAINING if structure else TrainConfig()
+        training = replace(training, epochs=epochs or training.epochs, batch=batch, seed=seed)
+        how = {"report": Spoken(), "noise": noise}
         if structure:
-            from nfc_gym.simulate.teach import EPOCHS, train_structure
-
-            training = replace(training, epochs=epochs or EPOCHS)
             done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
         else:
             done = jobs.train_posterior(windows, prior, out, config, training, device=device, **how)

@@ -105,7 +105,7 @@ class ReplayBank:
         self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
     ) -> Array:
         """(n,) nats by which the likeliest fault explains windows better; arguments as of `Replay.told_of`."""
-        return (self.told(states, actions, start, which) - self.offset).max(1)
+        return (self.gains(states, actions, start, which) - self.offset).max(1)
 
     def levelled(self, states: Array, actions: Array, start: Array | None = None, rate: float = 0.01) -> "ReplayBank":
         """The same with an offset for each fault, at which it alone would be believed in a share `rate` of windows.
@@ -125,7 +125,7 @@ class ReplayBank:
                 f"replay bank: {len(states)} windows do not show a share of {rate:g}; want 1 / rate or more"
             )
         out = copy(self)
-        out.offset = np.quantile(self.told(states, actions, start), 1 - rate, axis=0)
+        out.offset = np.quantile(self.gains(states, actions, start), 1 - rate, axis=0)
         return out
 
     def score_rows(self, states: Array, actions: Array, rows: NDArray[np.intp]) -> Array:
@@ -133,7 +133,7 @@ class ReplayBank:
         standing = self.believed.standing
         return self.score(states, actions, which=None if standing is None else np.asarray(standing())[rows])
 
-    def told(
+    def gains(
         self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
     ) -> Array:
         """(n, len(names)) nats by which each of `names` explains a window better than the belief does."""

@@ -22,8 +22,9 @@ from nfc_gym.simulate.observed import require_unfeeling
 from nfc_gym.simulate.witness import MISFIT
 
 HELD_OUT = 0.05  # of the windows, by which epochs are compared
-EPOCHS = 4  # passes over windows that are shown several times each: more and their noise is learned by heart
-SMALL = NetworkConfig(encoder="tcn", density="mixture", components=1, width=384, features=256, hidden=256)
+# Few passes, since windows are shown several times in each: more, and their noise is learned by heart.
+TRAINING = TrainConfig(epochs=4, rate=1e-3, decay=0.02, patience=6)
+NETWORK = NetworkConfig(encoder="tcn", density="mixture", components=1, width=384, features=256, hidden=256)
 
 
 class Head(Network):
@@ -37,7 +38,7 @@ class Head(Network):
 
 
 def train_structure(
-    folder: Path, out: Path, training: TrainConfig, *, config: NetworkConfig = SMALL, noise: float = 1.0,
+    folder: Path, out: Path, training: TrainConfig, *, config: NetworkConfig = NETWORK, noise: float = 1.0,
     repeats: int = 6, device: str | torch.device = "cpu", report: Report = quiet,
 ) -> Outcome:  # fmt: skip
     """Train a structure head on a folder of windows into a checkpoint; a run that was stopped goes on.
@@ -45,7 +46,7 @@ def train_structure(
     Args:
       folder: what `nfc-gym simulate` wrote, with effects, on flat ground.
       out: the checkpoint, `.safetensors`.
-      training: see `TrainConfig`.
+      training: `TRAINING`, or another.
       config: of the network; its families are those of the windows.
       noise: what multiplies the sensor noise that the windows' manifest assumes.
       repeats: how often each window is shown, with other noise and other errors of start and parameters.

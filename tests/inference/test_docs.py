@@ -36,7 +36,7 @@ def test_train_then_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     names["env"].reset(seed=0)
     names |= {f"other_{k}": nominal[k][:20] for k in ("states", "actions")}
     few = programs[3].replace("given)", "given, draws=2)").replace("rate=0.01", "rate=0.05")
-    exec(re.sub(r"other_actions,?\n", "other_actions, rate=0.1\n", few), names)
+    exec(few.replace("other_actions)", "other_actions, rate=0.1)"), names)
     assert names["detector"].threshold is not None
     assert {p.name for p in tmp_path.iterdir()} == {"run", "jackal.safetensors", "today.safetensors"}
     env.close()

@@ -37,12 +37,12 @@ def windows(machine: Machine, seed: int, n: int = 16, **scale: float) -> tuple[n
 
 
 def test_the_fault_that_there_is_is_the_likeliest(machine: Machine, bank: ReplayBank) -> None:
-    healthy, heavy = bank.told(*windows(machine, 0)), bank.told(*windows(machine, 1, base_mass=2.0))
+    healthy, heavy = bank.gains(*windows(machine, 0)), bank.gains(*windows(machine, 1, base_mass=2.0))
     assert bank.names == ("base_mass x 1.6", "friction x 0.45", ELSE)
     assert np.median(healthy[:, :2].max(1)) < 0 < np.median(heavy.max(1))
     assert np.mean(heavy[:, :2].argmax(1) == 0) > 0.8
     # one size of a fault stands for others: half as much is found too
-    lighter = bank.told(*windows(machine, 2, base_mass=1.4))
+    lighter = bank.gains(*windows(machine, 2, base_mass=1.4))
     assert auroc(healthy[:, 0], lighter[:, 0])[0] > 0.85
 
 
@@ -57,14 +57,14 @@ def test_something_else_is_told_by_errors_that_no_fault_explains(machine: Machin
     states, actions = windows(machine, 5)
     jumped = states.copy()
     jumped[:, 25:, :3] += 0.3  # the place jumps by 0.3 m
-    assert (bank.told(jumped, actions)[:, -1] > bank.told(states, actions)[:, -1]).all()
+    assert (bank.gains(jumped, actions)[:, -1] > bank.gains(states, actions)[:, -1]).all()
 
 
 def test_levels_give_each_fault_the_same_rate(machine: Machine, bank: ReplayBank) -> None:
     nominal = windows(machine, 6)
     level = bank.levelled(*nominal, rate=0.25)
     assert (bank.offset == 0).all()  # the bank itself is as it was
-    alone = bank.told(*nominal) - level.offset
+    alone = bank.gains(*nominal) - level.offset
     assert ((alone > 0).sum(0) == 4).all()
     np.testing.assert_array_equal(level.score(*nominal), alone.max(1))
     with pytest.raises(InputError, match=r"do not show a share of 0\.001"):
@@ -81,11 +81,11 @@ def test_an_effect_of_the_library_may_be_the_fault() -> None:
     same = {"effect": effect, "theta": np.tile(theta, (12, 1))}
     bank = ReplayBank("nfc_gym/QuadcopterFlat-v0", faults=weak[:2], draws=8)
     found = trials(quadcopter, nominal, 0, **same)
-    told = bank.told(found["states"], found["actions"])
+    told = bank.gains(found["states"], found["actions"])
     # where no replay comes near, as from some of so few starts, errors are cut under all of them and tell of none
     assert np.median(told[:, 0]) > 10
     assert told[:, 1].max() < 5
-    again = bank.told(found["states"], found["actions"])  # hidden states of effects begin anew in each call
+    again = bank.gains(found["states"], found["actions"])  # hidden states of effects begin anew in each call
     np.testing.assert_array_equal(told, again)
 
 
