@@ -53,6 +53,14 @@ class Kept:
         write(file, make() | of)
         return json.loads(file.read_text())
 
+    def has(self, name: str) -> bool:
+        """Whether there is a result of that name."""
+        return (self.cells / f"{name}.json").is_file()
+
+    def get(self, name: str) -> dict[str, Any]:
+        """A result that there is."""
+        return json.loads((self.cells / f"{name}.json").read_text())
+
     def keep(self, name: str, found: dict[str, Any]) -> None:
         """Write a result, over an earlier one of that name."""
         write(self.cells / f"{name}.json", found)

@@ -1,0 +1,1 @@
+"""Machines with and without faults, and what each detector says of their windows."""

@@ -1,0 +1,71 @@
+"""Faults of all kinds and sizes: main mass, an actuator's gain, friction, and effects of the library."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.physics.effects import Effect, build
+from nfc_gym.physics.effects.base import Param
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.residuals import candidates, sizes
+
+Array = NDArray[np.float64]
+MASS, GAIN, FRICTION = (2.0, 1.5, 1.25, 1.1), (0.0, 0.25, 0.5, 0.75), (0.3, 0.5, 0.7, 0.9)
+EFFECT = (1.0, 0.3, 3.0)  # times the size drawn
+
+
+class Friction(Effect):
+    """Sliding friction of every geom times a factor, for robots whose psi has none."""
+
+    family = "benchmark_friction"
+
+    def model(self, fields: ModelFields, theta: Array) -> None:
+        """See `Effect`."""
+        fields["geom_friction"][..., 0] *= theta[..., :1]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a machine: `scale` (d,) multiplies psi; `theta` (k,) of an effect."""
+
+    name: str
+    scale: Array
+    effect: Effect | None = None
+    theta: Array | None = None
+    wanted: bool = False  # whether the goal is set for it, its X / X_null aside
+
+
+def faults(machine: Machine, effects: int, rng: np.random.Generator) -> list[Fault]:
+    """Of all kinds and sizes; `effects` of the library are drawn."""
+    names, ones = machine.space.names, np.ones(len(machine.space))
+
+    def scaled(which: list[str], by: float) -> Array:
+        return np.where([n in which for n in names], by, ones)
+
+    body = next(n for n in names if n.endswith("_mass"))
+    out = [Fault(f"{body} x {k:g}", scaled([body], k), wanted=k == MASS[0]) for k in MASS]
+    servos = [n for n in names if n.endswith("_damping")]
+    for k in GAIN:
+        if servos:
+            out.append(Fault(f"{servos[0]} x {k:g}", scaled(servos[:1], k), wanted=k == GAIN[0]))
+        else:
+            actuator = machine.model.actuator(0).name
+            loss, theta = build("loss", actuator, {"fraction": 1 - k})
+            out.append(Fault(f"gain of {actuator} x {k:g}", ones, loss, theta, wanted=k == GAIN[0]))
+    own = [n for n in names if n.endswith("_friction")]
+    for k in FRICTION:
+        slippery = None if own else Friction(("ground",), (Param("factor", "1", 0.0, 1.0, null=1.0),))
+        by, theta = (scaled(own, k), None) if own else (ones, np.array([k]))
+        out.append(Fault(f"friction x {k:g}", by, slippery, theta, wanted=k == FRICTION[0]))
+    library = candidates(machine)
+    for i in rng.choice(len(library), min(effects, len(library)), replace=False):
+        one = library[i]
+        size = sizes(one, rng.random((1, 2 * len(one.params))))[0]
+        low, high = np.array([(p.low, p.high) for p in one.params]).T
+        for k in EFFECT:
+            theta = np.clip(np.where([p.shape for p in one.params], size, one.null + k * (size - one.null)), low, high)
+            said = ", ".join(f"{p.name} {v:.3g} {p.unit}" for p, v in zip(one.params, theta, strict=True))
+            out.append(Fault(f"{one.family}:{'+'.join(one.where)} {said}", ones, one, theta))
+    return out
