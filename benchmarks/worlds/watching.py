@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from anomaly import Unconditional
+from anomalies.unconditional import Unconditional
 from gymnasium.vector import VectorEnv
 
 from nfc_gym.adaptation.trajectory import Array
