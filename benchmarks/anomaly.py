@@ -129,6 +129,8 @@ class Bench:
         out: dict[str | int, Scores] = {}
         for role, group in self.asked.items():
             each = [self.kept.get(self._name(p)) | others[p] for p in group]
+            for part in each:  # a list of no windows has forgotten how many faults there are
+                part["gains"] = np.reshape(part["gains"], (-1, len(self.course.bank.names)))
             out[role] = {k: np.concatenate([np.asarray(e[k]) for e in each]) for k in each[0]}
         offset = np.quantile(out["levels"]["gains"], 1 - LEVEL, axis=0)
         for scores in out.values():
@@ -226,7 +228,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, help="default drawn, or the one that --out was begun with; printed")
     parser.add_argument("--jobs", type=int, default=1, help="processes that replay")
     parser.add_argument("--device", default="cpu", help="that the contrastive net learns on: cpu or cuda")
-    parser.add_argument("--stop", type=float, metavar="SECONDS", help="begin nothing new after that time")
+    parser.add_argument(
+        "--stop", type=float, metavar="SECONDS", help="begin no new part after that time; the net's training is not cut"
+    )
     parser.add_argument("--quick", action="store_true", help="Jackal alone, a few windows: a minute, and says little")
     parser.add_argument("--json", type=Path, help="write the rows here")
     args = parser.parse_args()
