@@ -1,8 +1,8 @@
 """Anomaly detectors on simulated windows with and without faults: what is found, and at which price.
 
     python benchmarks/anomaly.py --out DIR [--robots Jackal Ant ...] [--nominal N] [--held-out N] [--faulty N]
-                                 [--training N] [--epochs N] [--effects N] [--draws N] [--levels N] [--width W]
-                                 [--seed S] [--jobs J] [--stop SECONDS] [--json FILE]
+                                 [--training N] [--epochs N] [--effects N] [--draws N] [--levels N] [--lessons N]
+                                 [--width W] [--seed S] [--jobs J] [--stop SECONDS] [--json FILE]
     python benchmarks/anomaly.py --quick
 
 Every machine's psi is drawn within `--width` of the prior's range about nominal, and the replay believes that
@@ -43,6 +43,7 @@ from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.rates import auroc, rate_above, threshold_at
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
+from nfc_gym.simulate.judge import Judge
 from nfc_gym.simulate.pool import unordered
 
 Array = NDArray[np.float64]
@@ -50,7 +51,7 @@ Scores = dict[str, Array]
 RATES = (0.05, 0.01, 0.001)
 LEVEL = 0.01  # share of nominal windows in which each fault of the bank alone would be believed
 GOAL, STRONG = 0.995, 5.0  # rate found at a false-positive rate of 0.001; X / X_null from which an effect has that goal
-DETECTORS = ("replay", "bank", "contrast", "unconditional")
+DETECTORS = ("replay", "bank", "judge", "contrast", "unconditional")
 
 
 class Bench:
@@ -67,6 +68,7 @@ class Bench:
         self.course = Course(settings)
         self.asked = {
             "levels": parts("levels", args.levels),
+            "lessons": parts("lessons", args.lessons),
             "held out": parts("held out", args.held_out),
             "nominal": parts("nominal", args.nominal),
         } | {i: parts("faulty", args.faulty, i) for i in range(len(self.course.faults))}
@@ -135,6 +137,11 @@ class Bench:
         offset = np.quantile(out["levels"]["gains"], 1 - LEVEL, axis=0)
         for scores in out.values():
             scores["bank"] = (scores["gains"] - offset).max(1)
+            unexplained = self.course.bank.unexplained(np.stack([scores["replay"], scores["x"]], 1))
+            scores["evidence"] = np.concatenate([scores["gains"], unexplained], 1)
+        judge = Judge.learned(out["levels"]["evidence"], out["lessons"]["evidence"])
+        for scores in out.values():
+            scores["judge"] = judge.odds(scores["evidence"])
         unit = {k: np.quantile(out["held out"][k], 0.95) for k in ("replay", "contrast")}
         for scores in out.values():
             scores["either"] = np.maximum(*(scores[k] / unit[k] for k in unit))
@@ -174,7 +181,7 @@ def report(
 ) -> None:  # fmt: skip
     """Rows of one fault at one size."""
     base = auroc(nominal["unconditional"], faulty["unconditional"])[0]
-    for k in ("replay", "bank", "contrast", "either"):
+    for k in ("replay", "bank", "judge", "contrast", "either"):
         area, error = auroc(nominal[k], faulty[k])
         table.add(f"{name}: AUROC, {k} (+- {error:.2g})", area, "1", baseline=base, seeds=seeds)
         for rate, limit in limits.items():
@@ -222,7 +229,13 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--training", type=int, default=20_000, help="nominal windows of the contrastive net")
     parser.add_argument("--epochs", type=int, default=30, help="of the contrastive net")
     parser.add_argument("--effects", type=int, default=6, help="effects of the library, drawn")
-    parser.add_argument("--levels", type=int, default=1000, help="nominal windows that level the bank's faults")
+    parser.add_argument("--levels", type=int, default=2000, help="nominal windows that level the bank's faults")
+    parser.add_argument(
+        "--lessons",
+        type=int,
+        default=1000,
+        help="windows with drawn faults, beside those of --levels: what the bank's judge learns from",
+    )
     parser.add_argument("--draws", type=int, default=32, help="replays a window; of each machine in the bank half")
     parser.add_argument("--width", type=float, default=0.02, help="of psi about nominal, in the prior's range")
     parser.add_argument("--seed", type=int, help="default drawn, or the one that --out was begun with; printed")
@@ -237,6 +250,7 @@ def _arguments() -> argparse.Namespace:
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 64, 64, 8
         args.training, args.epochs, args.effects, args.draws, args.levels = 256, 1, 1, 4, 100
+        args.lessons = 50
     return args
 
 

@@ -13,6 +13,7 @@ from anomalies.faults import Fault, faults
 from nfc_gym.core import Fidelity
 from nfc_gym.inference.windows import Batch
 from nfc_gym.simulate.bank import ReplayBank
+from nfc_gym.simulate.faulty import faulty
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
 from nfc_gym.simulate.start import disturbed
@@ -20,7 +21,7 @@ from nfc_gym.simulate.trials import trials
 
 Array = NDArray[np.float64]
 PART = 50  # windows: a minute of the replays, so that an interrupted run loses little
-ROLES = ("training", "levels", "held out", "nominal", "faulty")
+ROLES = ("training", "levels", "held out", "nominal", "faulty", "lessons")
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,8 @@ class Course:
         entropy = [self.settings.seed, 2, ROLES.index(part.role), part.fault, part.number]
         rng = np.random.default_rng(entropy)
         psi, given = self._psi(part.size, rng), {}
+        if part.role == "lessons":
+            return faulty(self.machine, psi, int(rng.integers(2**31)))
         if part.role == "faulty":
             fault = self.faults[part.fault]
             psi = psi * fault.scale

@@ -10,6 +10,8 @@ The likelihood ratio of two machines asks in that direction alone, and is the mo
 in nats, l being the Gaussian log likelihood of the step's error given all before it (`replay`). What a fault of another
 size does lies mostly in the direction of the one in the bank, so that one size of each will do. The last alternative is
 no fault in particular: errors with twice the variance, which costs no replay.
+
+What all of them say together tells more than the greatest: see `judge`.
 """
 
 from collections.abc import Sequence
@@ -23,6 +25,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
 from nfc_gym.physics.effects import Effect, build
+from nfc_gym.simulate.judge import Judge
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import MOST, SETTLE, Replay
 
@@ -83,6 +86,7 @@ class ReplayBank:
     Attributes:
       names: of the faults, and last `ELSE`.
       offset: (len(names),) nats taken off each, see `levelled`.
+      judge: of all evidence together, see `judged`; None takes the greatest gain less its offset.
 
     Raises:
       InputError: as of `Replay`; faults of another robot, or none.
@@ -99,12 +103,18 @@ class ReplayBank:
         self.faulty = [self.believed.under(f.scale, f.lacks) for f in asked]
         self.names = (*(f.name for f in asked), ELSE)
         self.offset = np.zeros(len(self.names))
+        self.judge: Judge | None = None
         self.horizon, self.states, self.actions = self.believed.horizon, self.believed.states, self.believed.actions
 
     def score(
         self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
     ) -> Array:
-        """(n,) nats by which the likeliest fault explains windows better; arguments as of `Replay.told_of`."""
+        """(n,) the judge's log odds, or nats by which the likeliest fault explains windows better.
+
+        Arguments as of `Replay.told_of`.
+        """
+        if self.judge is not None:
+            return self.judge.odds(self.evidence(states, actions, start, which))
         return (self.gains(states, actions, start, which) - self.offset).max(1)
 
     def levelled(self, states: Array, actions: Array, start: Array | None = None, rate: float = 0.01) -> "ReplayBank":
@@ -128,6 +138,20 @@ class ReplayBank:
         out.offset = np.quantile(self.gains(states, actions, start), 1 - rate, axis=0)
         return out
 
+    def judged(self, healthy: Array, faulty: Array) -> "ReplayBank":
+        """The same with a judge of all evidence together.
+
+        Args:
+          healthy, faulty: (n, e) and (m, e) `evidence` of windows without and with a fault, a thousand or more of each:
+            `trials` and `faulty` make them. Not those that a threshold is then taken from.
+
+        Raises:
+          InputError: as of `Judge.learned`.
+        """
+        out = copy(self)
+        out.judge = Judge.learned(healthy, faulty)
+        return out
+
     def score_rows(self, states: Array, actions: Array, rows: NDArray[np.intp]) -> Array:
         """The same for windows of some rows of a vector environment, each on the map that it stands on."""
         standing = self.believed.standing
@@ -137,14 +161,26 @@ class ReplayBank:
         self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
     ) -> Array:
         """(n, len(names)) nats by which each of `names` explains a window better than the belief does."""
-        k = len(self.believed.told)
-        squared, log_det = self._steps(self.believed, states, actions, start, which)
-        wider = (squared / _WIDER + log_det + k * np.log(_WIDER)).sum(1)
-        others = [sum(self._steps(r, states, actions, start, which)).sum(1) for r in self.faulty]
-        return ((squared + log_det).sum(1)[:, None] - np.stack([*others, wider], 1)) / 2
+        return self.evidence(states, actions, start, which)[:, : len(self.names)]
 
-    @staticmethod
-    def _steps(replay: Replay, *window: Any) -> tuple[Array, Array]:
-        """(n, H - SETTLE) e' Sigma^-1 e, cut as the mean X is, and log det Sigma."""
-        found = replay.told_of(*window)[:, SETTLE:]
-        return np.minimum(found[..., 0], MOST * len(replay.told)), found[..., 1]
+    def evidence(
+        self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
+    ) -> Array:
+        """(n, len(names) + 2) the `gains`, and what the belief leaves unexplained, see `unexplained`."""
+        k = len(self.believed.told)
+        found = self.believed.told_of(states, actions, start, which)[:, SETTLE:]
+        squared, log_det = _cut(found, k)
+        wider = (squared / _WIDER + log_det + k * np.log(_WIDER)).sum(1)
+        others = [sum(_cut(r.told_of(states, actions, start, which)[:, SETTLE:], k)).sum(1) for r in self.faulty]
+        gains = ((squared + log_det).sum(1)[:, None] - np.stack([*others, wider], 1)) / 2
+        mean = np.stack([squared.mean(1), found[..., 0].mean(1)], 1) / k
+        return np.concatenate([gains, self.unexplained(mean)], 1)
+
+    def unexplained(self, x: Array) -> Array:
+        """Nats from a mean X of a window's steps: what chi^2 / 2 exceeds its expectation by where X = 1 is expected."""
+        return (x - 1) * len(self.believed.told) * (self.horizon - SETTLE) / 2
+
+
+def _cut(found: Array, k: int) -> tuple[Array, Array]:
+    """(n, H - SETTLE) e' Sigma^-1 e, cut as the mean X is, and log det Sigma."""
+    return np.minimum(found[..., 0], MOST * k), found[..., 1]
