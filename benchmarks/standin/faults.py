@@ -141,7 +141,11 @@ class Spring(OnJoint):
 
 
 class Stribeck(OnJoint):
-    """Dry friction that is higher at rest; it passes through zero within about 0.1 rad/s."""
+    """Dry friction that is higher at rest.
+
+    As a torque it could only pass through zero over a width of level dt / inertia, here 0.1 rad/s, which takes a
+    quarter of a rise within 1 rad/s away. So MuJoCo's constraint makes it, with a level that is set anew each step.
+    """
 
     family = "stribeck"
 
@@ -151,9 +155,14 @@ class Stribeck(OnJoint):
             (joint,), values, f"{joint} drags with {level:.3g} N m, and {rise:.3g} more below {speed:.2g} rad/s"
         )
 
-    def torque(self, q: Array, v: Array) -> Array:
-        p = self.parameters
-        return -(p["level"] + p["rise"] * np.exp(-((v / p["speed"]) ** 2))) * np.tanh(v / 0.1)
+    def begin(self, model: mujoco.MjModel) -> None:
+        super().begin(model)
+        self.model = model
+        model.dof_solref[self.v] = (2 * model.opt.timestep, 1.0)
+
+    def push(self, data: mujoco.MjData) -> None:
+        p, v = self.parameters, data.qvel[self.v]
+        self.model.dof_frictionloss[self.v] = p["level"] + p["rise"] * np.exp(-((v / p["speed"]) ** 2))
 
 
 class Damping(Hidden):
