@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.contest import Judged
-from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.fit import Fit, fit, fit_last
 from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Problem
@@ -86,6 +86,8 @@ class Arena(Yardstick):
         current = self.current
         plant = current.plant.with_effects([*current.plant.effects, *(s.effect for s in picks)])
         beside = np.concatenate([leader.fitted.x[: len(current.x)], *(s.theta for s in picks)])
+        count = sum(len(s.effect.params) for s in picks)
+        beside = fit_last(self.fit_data.problem, self.under, plant, beside, count)
         rows = np.vstack([beside, starts(self.fit_data.problem, self.under, current, plant, picks)])
         known = leader.fitted.jacobian[..., : current.jacobian.shape[-1]]
         return self._refit(plant, self._nearest(plant, rows), 10, known, quick=self.fit_data.problem.costly)

@@ -162,12 +162,26 @@ def dispersion(fitted: Fit) -> float:
 
 
 def not_worse(
-    best: Judged, other: Judged, blocks_fit: NDArray[np.intp], blocks_select: NDArray[np.intp], rng: np.random.Generator
+    best: Judged,
+    other: Judged,
+    blocks_fit: NDArray[np.intp],
+    blocks_select: NDArray[np.intp],
+    rng: np.random.Generator,
+    *,
+    priced: bool = True,
 ) -> bool:
-    """Whether `other` explains the data not significantly worse than `best` (2.5 % level, both sets of logs)."""
+    """Whether `other` explains the data not significantly worse than `best` (2.5 % level, both sets of logs).
+
+    Args:
+      best, other: what is compared.
+      blocks_fit, blocks_select: clusters of blocks, see `clusters`.
+      rng: of the bootstrap.
+      priced: whether parameters have their price, as in the choice of a law. What the data cannot exclude is another
+        question, and a push along three axes is not excluded by a floor that leans about two.
+    """
     apart = np.concatenate([best.fit_gains - other.fit_gains, best.gains - other.gains])
     blocks = np.concatenate([blocks_fit, blocks_select + int(blocks_fit.max()) + 1])
-    penalty = best.total - other.total - float(apart.sum())
+    penalty = best.total - other.total - float(apart.sum()) if priced else 0.0
     draws = bootstrap(apart, blocks, rng) + penalty
     return bool(np.quantile(draws, 0.025) <= 0)
 

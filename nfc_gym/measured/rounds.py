@@ -270,7 +270,7 @@ class Contest:
         arena, chosen = self.arena, self.arena.new(best)
         ids = [e.id for e in chosen]
         rivals = [j for j in judged if j.total > NEARLY * best.total and arena.label(j) not in ids]
-        rivals = [j for j in rivals if arena.ties(leading, j)]
+        rivals = [j for j in rivals if arena.ties(leading, j, priced=False)]
         # Nor is one thing that two bodies could carry, hung on the one farther away.
         rivals = [j for j in rivals if not any(arena.nearer(k, j) for k in (best, *rivals))]
         # A law that has the chosen one, or another rival, as its special case is no further alternative.

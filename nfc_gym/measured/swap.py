@@ -76,7 +76,7 @@ def swapped(
             if rival.total <= NEARLY * kept.total or contains(pick.effect, effect):
                 continue
             # The law itself was fitted more than once.
-            if without.ties(kept, rival) or without.ties(kept, without.enter_again(rival)):
+            if without.ties(kept, rival, priced=False) or without.ties(kept, without.enter_again(rival), priced=False):
                 alike.setdefault(effect.id, []).append(pick.effect.id)
     return Swap(alike=alike)
 

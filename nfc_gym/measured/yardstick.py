@@ -192,9 +192,9 @@ class Yardstick:
         """How many are compared, on both sets of logs."""
         return int(self.fit_data.problem.mask.sum()) + int(self.select.problem.mask.sum())
 
-    def ties(self, best: Judged, other: Judged) -> bool:
-        """Whether `other` is not significantly worse."""
-        return not_worse(best, other, *self.blocks, self.rng)
+    def ties(self, best: Judged, other: Judged, *, priced: bool = True) -> bool:
+        """Whether `other` is not significantly worse, the price of its parameters counted or not."""
+        return not_worse(best, other, *self.blocks, self.rng, priced=priced)
 
     def nearer(self, one: Judged, other: Judged) -> bool:
         """Whether two candidates are one thing that two bodies could carry, hung by the first on the one nearer to it.

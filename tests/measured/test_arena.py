@@ -205,7 +205,7 @@ def test_one_lump_on_either_of_two_bodies_is_one_equivalent() -> None:
     found: Any = SimpleNamespace(
         new=lambda j: [j.law],
         label=lambda j: j.law.id,
-        ties=lambda best, other: True,
+        ties=lambda best, other, *, priced: True,
         nearer=lambda one, other: (one.law, other.law) == (near, far),
     )
     contest: Any = object.__new__(Contest)

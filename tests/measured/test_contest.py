@@ -375,3 +375,15 @@ def test_only_who_comes_near_the_best_is_judged_by_noise_of_its_own(own: bool, d
     )  # fmt: skip
     contest = Contest(arena, SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
     assert contest._near(drops) == near
+
+
+def test_a_price_decides_a_choice_but_excludes_nothing() -> None:
+    rng = np.random.default_rng(5)
+    blocks = np.arange(100)
+    base = rng.normal(5, 1, 100)
+    plain = judged(base, base)
+    richer = judged(base + rng.normal(0, 0.1, 100), base + rng.normal(0, 0.1, 100))
+    richer = replace(richer, total=richer.total - 10)  # what another parameter costs
+    assert not not_worse(plain, richer, blocks, blocks, rng)
+    assert not_worse(plain, richer, blocks, blocks, rng, priced=False)
+    assert not not_worse(plain, judged(base - 1, base - 1), blocks, blocks, rng, priced=False)

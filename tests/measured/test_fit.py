@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
-from nfc_gym.measured.fit import Fit, box, differs, fit, jacobian, uncertainty
+from nfc_gym.measured.fit import Fit, box, differs, fit, fit_last, jacobian, uncertainty
 from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
@@ -171,3 +171,17 @@ def test_the_jacobian_is_the_residuals_slope(fitted: tuple[RolloutProblem, Metri
         pair = under.whiten(problem.residual(result.plant, np.stack([x + step, x - step])))
         slope = (pair[0] - pair[1]) / 2e-5
         np.testing.assert_allclose(found[..., i], slope, atol=5e-3 * np.abs(slope).max())
+
+
+def test_the_last_parameters_are_fitted_with_the_others_held() -> None:
+    problem, plant, under = build()
+    start = np.array([TRUTH[0], plant.null[1]])
+    found = fit_last(problem, under, plant, start, 1)
+    assert found[0] == start[0]
+    assert found[1] == pytest.approx(TRUTH[1], abs=0.01)  # its null is 0.05
+    assert total(problem, under, plant, found) < total(problem, under, plant, start)
+    # with a wrong mass it is the best that damping alone can do
+    wrong = fit_last(problem, under, plant, plant.null, 1)
+    near = np.array([[wrong[0], wrong[1] + d] for d in (-0.01, 0.0, 0.01)])
+    left = [total(problem, under, plant, x) for x in near]
+    assert left[1] <= min(left) * 1.01
