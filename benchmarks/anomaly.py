@@ -250,7 +250,7 @@ def _arguments() -> argparse.Namespace:
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 64, 64, 8
         args.training, args.epochs, args.effects, args.draws, args.levels = 256, 1, 1, 4, 100
-        args.lessons = 50
+        args.lessons = 80
     return args
 
 
