@@ -25,7 +25,7 @@ from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
 from nfc_gym.measured.owned import Data, Owned, owned
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
-from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.base import Effect, Param
 
 Array = NDArray[np.float64]
 HOPE = 0.25  # of the gain that a law must reach: what a cheap look must promise for a dear one to be worth its time
@@ -215,11 +215,8 @@ class Yardstick:
         A law that wants to go beyond stands in for another: what fits where the logs were taken then fails elsewhere.
         """
         thetas = dict(zip(map(id, j.fitted.plant.effects), j.fitted.plant.split(j.fitted.x)[1], strict=True))
-        return all(
-            p.shape or p.natural or bound == p.null or abs(value - bound) > _EDGE * (p.high - p.low)
-            for e in self.new(j)
-            for p, value in zip(e.params, thetas[id(e)], strict=True)
-            for bound in (p.low, p.high)
+        return not any(
+            _at_edge(p, value) for e in self.new(j) for p, value in zip(e.params, thetas[id(e)], strict=True)
         )
 
     def told_apart(self, j: Judged) -> bool:
@@ -268,3 +265,17 @@ def _of(fitted: Fit, effect: Effect) -> NDArray[np.bool_]:
     """(size,) which of a fit's parameters are an effect's."""
     psi = np.zeros(len(fitted.plant.space), bool)
     return np.concatenate([psi, *(np.full(len(e.params), e is effect) for e in fitted.plant.effects)])
+
+
+def _at_edge(param: Param, value: float) -> bool:
+    """Whether a parameter ended at a bound that it would rather pass.
+
+    A bound nearer to null than any size that counts is none: damping can be less than the model's by what that has.
+    """
+    if param.shape or param.natural:
+        return False
+    for bound in (param.low, param.high):
+        room = abs(bound - param.null)
+        if room > param.resolution and abs(value - bound) <= _EDGE * min(param.high - param.low, 2 * room):
+            return True
+    return False

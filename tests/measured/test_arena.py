@@ -100,6 +100,11 @@ def test_leftover_counts_the_slack_beyond_the_noise() -> None:
         (Param("level", "N m", 0.0, 5.0), 5.0, False),
         (Param("speed", "rad/s", 0.1, 5.0, shape=True), 5.0, True),
         (Param("fraction", "1", 0.0, 1.0, natural=True), 1.0, True),
+        # a bound close to null: null is not at it, and where no size that counts lies between, nothing is
+        (Param("linear", "N m s/rad", -0.01, 4.0), 0.0, True),
+        (Param("linear", "N m s/rad", -0.01, 4.0), -0.0099, False),
+        (Param("cubic", "N m s^3/rad^3", -1e-5, 0.15, resolution=6e-5), -1e-5, True),
+        (Param("cubic", "N m s^3/rad^3", -1e-5, 0.15, resolution=6e-5), 0.149, False),
     ],
 )
 def test_a_law_that_ends_at_the_edge_of_the_plausible_stands_in_for_another(
