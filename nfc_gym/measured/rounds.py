@@ -89,7 +89,8 @@ class Contest:
             return outcome, None
         best, judged, believed = self._challenged(outcome, judged, believed)
         beaten = [arena.judge(j.fitted) for j in beaten if j.total > far]
-        alike = self._alike([*judged, *beaten], best, believed[0])
+        met = [*judged, *beaten]
+        alike = self._alike(met, best, believed[0])
         if len({i.partition(":")[0] for i in alike}) > _ALIKE:
             # So many causes that do alike are no finding: each would be named for want of the others.
             outcome.reason = f"{len(alike)} effects explain it alike: {', '.join(alike)}"
@@ -97,6 +98,9 @@ class Contest:
                 return outcome, None
             outcome.reason, best, alike = "", both, self._alike([], both, both)
             outcome.ranking = [arena.row(best), *outcome.ranking]
+        else:
+            # What the data cannot exclude is told even where more parameters make it the less likely.
+            alike = self._alike(met, best, believed[0], priced=False)
         outcome.accepted = [e.id for e in arena.new(best)]
         outcome.share = best.gain / max(float(arena.base.sum()), 1e-9)
         again = {arena.label(j) for j in judged}  # the others' fits are a first look
@@ -260,17 +264,19 @@ class Contest:
         both = self._together(self._pairs(judged, entered), [best], judged)
         return self._simplest(both) if both else None
 
-    def _alike(self, judged: Sequence[Judged], best: Judged, leading: Judged) -> list[str]:
+    def _alike(self, judged: Sequence[Judged], best: Judged, leading: Judged, *, priced: bool = True) -> list[str]:
         """Ids of the law that is accepted and of what explains the data as well, each once."""
-        ids = [*(e.id for e in self.arena.new(best)), *self._equivalents(judged, best, leading)]
+        ids = [*(e.id for e in self.arena.new(best)), *self._equivalents(judged, best, leading, priced=priced)]
         return list(dict.fromkeys(ids))
 
-    def _equivalents(self, judged: Sequence[Judged], best: Judged, leading: Judged) -> list[str]:
-        """Ids of what explains the data as well as the law that is accepted."""
+    def _equivalents(
+        self, judged: Sequence[Judged], best: Judged, leading: Judged, *, priced: bool = True
+    ) -> list[str]:
+        """Ids of what explains the data as well as the law that is accepted, see `Arena.ties`."""
         arena, chosen = self.arena, self.arena.new(best)
         ids = [e.id for e in chosen]
         rivals = [j for j in judged if j.total > NEARLY * best.total and arena.label(j) not in ids]
-        rivals = [j for j in rivals if arena.ties(leading, j, priced=False)]
+        rivals = [j for j in rivals if arena.ties(leading, j, priced=priced)]
         # Nor is one thing that two bodies could carry, hung on the one farther away.
         rivals = [j for j in rivals if not any(arena.nearer(k, j) for k in (best, *rivals))]
         # A law that has the chosen one, or another rival, as its special case is no further alternative.

@@ -154,7 +154,7 @@ def test_more_than_three_families_that_do_alike_are_no_claim(families: tuple, cl
     """Pretend arena, real contest: only the number of families that tie differs."""
     arena: Any = _Alike()
     for name in ("worth", "plausible", "told_apart", "ties"):
-        setattr(arena, name, lambda *a: True)
+        setattr(arena, name, lambda *a, **k: True)
     arena.nearer = lambda one, other: False
     arena.unexplained, arena.say, arena.likelier = (lambda f: 0.0), (lambda t: None), (lambda j: True)
     arena.label = lambda j: j.fitted.plant.effects[0].id
