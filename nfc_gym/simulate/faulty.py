@@ -36,14 +36,15 @@ def faulty(machine: Machine, psi: Array, seed: int, *, nthread: int = 1) -> Batc
       InputError: the machine stands on rough ground, or psi has another shape.
     """
     psi, rng = np.array(psi, float), np.random.default_rng(seed)
-    if psi.ndim != 2 or psi.shape[1] != len(machine.space):
-        raise InputError(f"faulty: psi has shape {psi.shape}, want (n, {len(machine.space)})")
+    if psi.ndim != 2 or psi.shape[1] != len(machine.space) or not len(psi):
+        raise InputError(f"faulty: psi has shape {psi.shape}, want (n, {len(machine.space)}) with n of 1 or more")
     scales = _scales(machine)
     kind = rng.integers(len(scales) + 1, size=len(psi))
     for row, k in enumerate(kind):
         if k < len(scales):
             psi[row] *= scales[k](rng)
-    parts = [trials(machine, psi[kind < len(scales)], int(rng.integers(2**31)), nthread=nthread)]
+    scaled, first = np.flatnonzero(kind < len(scales)), int(rng.integers(2**31))
+    parts = [trials(machine, psi[scaled], first, nthread=nthread)] if len(scaled) else []
     library, rest = candidates(machine), np.flatnonzero(kind == len(scales))
     for i in range(0, len(rest), _TOGETHER):
         rows, effect = rest[i : i + _TOGETHER], library[rng.integers(len(library))]

@@ -93,3 +93,7 @@ def test_faults_are_drawn_of_every_kind() -> None:
     np.testing.assert_array_equal(found["states"], again["states"])
     with pytest.raises(InputError, match=r"psi has shape \(2,\)"):
         faulty(machine, nominal[0, :2], 5)
+    with pytest.raises(InputError, match="n of 1 or more"):
+        faulty(machine, nominal[:0], 5)
+    for seed in range(6):  # a single row may have a fault of any kind
+        assert len(faulty(machine, nominal[:1], seed)["psi"]) <= 1
