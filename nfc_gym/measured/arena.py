@@ -177,3 +177,14 @@ def contains(law: Effect, plain: Effect) -> bool:
     if law.family == plain.family:
         return same and isinstance(law, Each | Conditioned)
     return same and ((plain.family,) in law.simpler or plain.family in law.covers)
+
+
+def alternatives(law: Effect, rivals: Sequence[str], pool: Sequence[Effect]) -> list[str]:
+    """Of ids that do as well as a law, those that are alternatives to it and to each other, each once.
+
+    A gale on hardly any drag is a push: beside the push, which does as well with less, the wind says nothing more.
+    """
+    known = {e.id: e for e in pool}
+    laws = [law, *(known[i] for i in rivals if i in known)]
+    told = dict.fromkeys(i for i in rivals if not any(i in known and contains(known[i], e) for e in laws if e.id != i))
+    return list(told)

@@ -91,7 +91,7 @@ class Contest:
         beaten = [arena.judge(j.fitted) for j in beaten if j.total > far]
         met = [*judged, *beaten]
         alike = self._alike(met, best, believed[0])
-        if len({i.partition(":")[0] for i in alike}) > _ALIKE:
+        if _too_many(alike):
             # So many causes that do alike are no finding: each would be named for want of the others.
             outcome.reason = f"{len(alike)} effects explain it alike: {', '.join(alike)}"
             if (both := self._instead(best, judged, entered)) is None:
@@ -99,8 +99,10 @@ class Contest:
             outcome.reason, best, alike = "", both, self._alike([], both, both)
             outcome.ranking = [arena.row(best), *outcome.ranking]
         else:
-            # What the data cannot exclude is told even where more parameters make it the less likely.
-            alike = self._alike(met, best, believed[0], priced=False)
+            # What the data cannot exclude is told even where more parameters make it the less likely, short of so much
+            # that it says nothing.
+            possible = self._alike(met, best, believed[0], priced=False)
+            alike = alike if _too_many(possible) else possible
         outcome.accepted = [e.id for e in arena.new(best)]
         outcome.share = best.gain / max(float(arena.base.sum()), 1e-9)
         again = {arena.label(j) for j in judged}  # the others' fits are a first look
@@ -375,3 +377,8 @@ class Contest:
             if len(parts) == len(families):
                 out.append(parts)
         return out
+
+
+def _too_many(ids: Sequence[str]) -> bool:
+    """Whether more families explain the data alike than one of them may be claimed among."""
+    return len({i.partition(":")[0] for i in ids}) > _ALIKE

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.arena import Arena
+from nfc_gym.measured.arena import Arena, alternatives
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.doubt import doubted
 from nfc_gym.measured.fit import Fit, differs, fit
@@ -245,10 +245,11 @@ class Search:
             return None
         swap = swapped(arena, self.lookout, self.named, self.options.worth, self.say, _met(rounds))
         if (found := swap.better) is None:
+            laws = {e.id: e for e in arena.current.plant.effects}
             for r in rounds:
-                for law in r.accepted:
+                for law in (i for i in r.accepted if i in laws):
                     rivals = r.rivals(law)
-                    rivals += [i for i in swap.alike.get(law, []) if i not in rivals]
+                    rivals[:] = alternatives(laws[law], [*rivals, *swap.alike.get(law, [])], self.named)
             return None
         rounds.append(self._exchanged(arena.current, found, "beside the others"))
         return found

@@ -7,16 +7,19 @@ import mujoco
 import numpy as np
 import pytest
 
-from nfc_gym.measured.arena import contains
+from nfc_gym.measured.arena import alternatives, contains
 from nfc_gym.measured.box import box
 from nfc_gym.measured.fit import COARSE, fit, polish
 from nfc_gym.measured.metric import Metric, loss
 from nfc_gym.measured.screen import probe_sets
+from nfc_gym.physics.effects.air import DragLinear
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.drive import Loss
 from nfc_gym.physics.effects.each import each
 from nfc_gym.physics.effects.friction import Coulomb, DirectionalFriction, Stribeck
 from nfc_gym.physics.effects.inertial import Payload
-from nfc_gym.physics.effects.load import ExternalForce, Wind
+from nfc_gym.physics.effects.load import ExternalForce, Slope, Wind
+from nfc_gym.physics.effects.thermal import Thermal
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -128,4 +131,15 @@ def test_a_law_covers_its_special_cases_only() -> None:
     assert contains(DirectionalFriction(("a",)), coulomb)
     assert not contains(DirectionalFriction(("b",)), coulomb)
     assert contains(Wind(("a",)), ExternalForce(("a",)))
+    assert contains(Wind(("a",)), DragLinear(("a",)))
+    assert contains(Thermal(("a",)), Loss(("a",)))
     assert not contains(Coulomb(("a", "b")), coulomb), "one value for both is a claim of its own"
+
+
+def test_alternatives_to_a_law_are_told_without_what_contains_them() -> None:
+    pool: list[Effect] = [Wind(("a",)), ExternalForce(("a",)), Slope(("world",)), Stribeck(("j",)), Coulomb(("j",))]
+    slope, push, wind = "slope:world", "external_force:a", "wind:a"
+    assert alternatives(Slope(("world",)), [wind, push, push], pool) == [push]
+    assert alternatives(Slope(("world",)), [wind, "gone:a"], pool) == [wind, "gone:a"], "what it contains is not there"
+    assert alternatives(Wind(("a",)), [slope, push], pool) == [slope, push], "the law's own special case is one"
+    assert alternatives(DirectionalFriction(("j",)), ["stribeck:j", "coulomb:j"], pool) == ["coulomb:j"]

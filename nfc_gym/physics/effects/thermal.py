@@ -23,6 +23,7 @@ class Thermal(Effect):
 
     family = "thermal"
     summary = "Drive fades as it warms up"
+    covers = ("loss", "gain")  # heat that hardly changes while the log lasts
     slow = True  # it warms up over minutes
     PARAMS = (
         Param("fade", "1", 0.0, 0.9, probes=(0.05, 0.2), resolution=0.002),
