@@ -26,7 +26,7 @@ def merged(arena: Arena, pool: Sequence[Effect], worth: float) -> tuple[tuple[Ef
     """
     effects = arena.current.plant.effects
     for two in combinations([e for e in effects if not e.generic], 2):
-        rivals = [e for e in pool if _may_replace(e, two) and e not in effects]
+        rivals = [e for e in pool if _may_replace(e, two) and e.id not in {own.id for own in effects}]
         if not rivals:
             continue
         without = arena
@@ -42,10 +42,11 @@ def merged(arena: Arena, pool: Sequence[Effect], worth: float) -> tuple[tuple[Ef
 
 
 def _may_replace(law: Effect, two: Sequence[Effect]) -> bool:
-    """Whether a law acts where one of two does, is neither's kind, and has no more numbers than both together.
+    """Whether a law acts where one of two does, and has no more numbers than both together.
 
-    Nor fewer than each: a plainer law than one of them was beaten by it already.
+    Nor fewer than each: a plainer law than one of them was beaten by it already. It may be of the other one's kind: a
+    load on an arm mends the shift that is believed of the base, and the load is the base's.
     """
     sizes = [len(e.params) for e in two]
-    there = any(set(law.where) == set(e.where) for e in two)
-    return there and law.family not in {e.family for e in two} and max(sizes) <= len(law.params) <= sum(sizes)
+    there = any(set(law.where) == set(e.where) and law.family != e.family for e in two)
+    return there and max(sizes) <= len(law.params) <= sum(sizes)

@@ -26,6 +26,7 @@ _FAR = 0.5  # of the best first gain: who gains less is beaten for good, and ran
 _FAINT = 0.02  # nats a number beyond the noise, below which two laws have nothing to mend together
 _RIVAL, _DUELS = 0.5, 2  # of the best gain: who comes so near meets the best again at half the step; how many do
 _BY_PSI = 0.1  # of a candidate's gain, beyond which its psi alone becomes the model to beat
+_NARROWER = 2  # sets within the leading law's own where it is fitted too, those that promise most
 _ALIKE = 3  # families that may explain the data alike for one of them to be claimed
 
 
@@ -114,22 +115,24 @@ class Contest:
         return outcome, best
 
     def _shared(self, entered: Sequence[Judged]) -> list[Judged]:
-        """Where bodies touch, the leading law at the wider sets of like places that its own belong to.
+        """Where bodies touch, the leading law at the wider and the narrower sets of like places than its own.
 
         A limit that all drives share is reached now by one and now by another, and straight lines from its realistic
-        size may show nothing of it; a dead zone of all of them shows most at the hips. What promises enough at some
-        share of that size is fitted.
+        size may show nothing of it; a dead zone of all of them shows most at the hips, and a limit of the ankles is
+        seen at all joints where no hip comes near it. What promises enough at some share of that size is fitted.
         """
         arena = self.arena
         new = arena.new(entered[0]) if self.rough and entered else []
         if len(new) != 1:
             return []
-        asked = {arena.label(j) for j in entered}
-        wider = [e for e in self.pool.values() if e.family == new[0].family and set(new[0].where) < set(e.where)]
-        found = [
-            self.screen.scout(s, arena.rng, draws=0) for e in wider if e.id not in asked and (s := self._screened(e.id))
-        ]
-        return [arena.enter([s]) for s in found if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
+        asked, own = {arena.label(j) for j in entered}, set(new[0].where)
+        like = [e for e in self.pool.values() if e.family == new[0].family and e.id not in asked]
+        wider = [e for e in like if own < set(e.where)]
+        narrower = [e for e in like if set(e.where) < own]
+        found = [self.screen.scout(s, arena.rng, draws=0) for e in (*wider, *narrower) if (s := self._screened(e.id))]
+        able = [s for s in found if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
+        inner = sorted((s for s in able if set(s.effect.where) < own), key=lambda s: -s.gain)[:_NARROWER]
+        return [arena.enter([s]) for s in (*(s for s in able if own < set(s.effect.where)), *inner)]
 
     def _challenged(
         self, outcome: Round, judged: list[Judged], believed: list[Judged]

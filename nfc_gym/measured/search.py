@@ -152,7 +152,12 @@ class Search:
                 break
             state = State(better.plant, better.x, tuple(rounds), frozenset(self.lookout.hopeless))
             keep(state)
-        confirmed = self._merged(self._plainer(self._confirmed(arena, rounds), rounds), rounds)
+        whole = self._merged(
+            arena, rounds
+        )  # before any part of it is doubted: what two do together neither may do alone
+        confirmed = self._plainer(self._confirmed(whole, rounds), rounds)
+        if confirmed is not whole:
+            confirmed = self._merged(confirmed, rounds)
         if confirmed is not arena:
             arena, screen = confirmed, Screen(self.fit_data.problem, confirmed.under, confirmed.current)
         dropped: list[str] = []

@@ -14,9 +14,9 @@ ELSEWHERE = FAMILIES["payload"](("arm",))
 
 
 def asked(
-    monkeypatch: pytest.MonkeyPatch, total: float, pool: list, believed: bool = True
+    monkeypatch: pytest.MonkeyPatch, total: float, pool: list, believed: bool = True, two: tuple = (SHIFT, GAIN)
 ) -> tuple[Any, list[str], list[str]]:
-    """What becomes of a shift and a gain that are worth 100, and the ids that were screened and entered."""
+    """What becomes of two laws that are worth 100, and the ids that were screened and entered."""
     screened: list[str] = []
     entered: list[str] = []
 
@@ -42,7 +42,7 @@ def asked(
         )  # fmt: skip
 
     monkeypatch.setattr(merging, "Screen", Screen)
-    return merging.merged(arena([SHIFT, GAIN]), pool, 0.02), screened, entered
+    return merging.merged(arena(list(two)), pool, 0.02), screened, entered
 
 
 @pytest.mark.parametrize("total", [101.0, 99.0])
@@ -59,6 +59,12 @@ def test_what_is_not_believed_takes_no_place(monkeypatch: pytest.MonkeyPatch) ->
     assert asked(monkeypatch, 200.0, [LOAD], believed=False) == (None, [LOAD.id], [LOAD.id])
 
 
-def test_another_place_the_same_kind_and_what_is_there_already_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    other = FAMILIES["gain"](("base",))
-    assert asked(monkeypatch, 200.0, [ELSEWHERE, SHIFT, GAIN, other]) == (None, [], [])
+def test_a_load_stands_for_a_shift_and_what_mends_it_as_a_load_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, screened, _ = asked(monkeypatch, 101.0, [LOAD, ELSEWHERE, SHIFT], two=(SHIFT, ELSEWHERE))
+    assert found is not None
+    assert screened == [LOAD.id]
+
+
+def test_another_place_too_few_numbers_and_what_is_there_already_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = FAMILIES["gain"](("base",))
+    assert asked(monkeypatch, 200.0, [ELSEWHERE, SHIFT, GAIN, few]) == (None, [], [])
