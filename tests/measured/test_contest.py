@@ -10,6 +10,7 @@ import pytest
 from nfc_gym.measured.contest import (
     Judged,
     bootstrap,
+    calmed,
     clusters,
     dispersion,
     fold_of,
@@ -198,6 +199,32 @@ def test_not_worse_tells_a_clear_difference_from_one_lucky_block() -> None:
     assert not_worse(judged(lucky, base), best, blocks, blocks, rng)
 
 
+def test_few_blocks_that_gain_much_are_believed_and_one_is_not() -> None:
+    """Seventy blocks of a hundred numbers; what chance does to them is symmetric, and heavy where a foot slips."""
+    rng = np.random.default_rng(5)
+    numbers, blocks = np.full(70, 100), np.arange(70)
+
+    def believed(gains: np.ndarray) -> bool:
+        return float(np.quantile(bootstrap(calmed(gains, numbers), blocks, rng), 0.005)) > 0
+
+    noise = rng.permutation(np.concatenate([np.linspace(-30, 30, 68), [-150.0, 150.0]]))
+    limit = noise.copy()
+    limit[:9] += [1400, 250, 240, 200, 190, 180, 160, 150, 140]  # a limit that few blocks reach
+    one = noise.copy()
+    one[0] += 3000
+    assert believed(limit)
+    assert not believed(one)
+    assert not believed(noise)
+    assert not believed(-limit)
+
+
+def test_calmed_gains_are_the_gains_where_these_are_small() -> None:
+    small, numbers = np.array([-1.0, 0.0, 2.0]), np.full(3, 200)
+    np.testing.assert_allclose(calmed(small, numbers), small, rtol=2e-3)
+    assert calmed(np.array([2000.0]), numbers[:1])[0] == pytest.approx(200 * np.arcsinh(10))
+    assert np.isfinite(calmed(small, np.zeros(3, int))).all()
+
+
 def row(family: str, gain: float, where: str = "hub", simpler: tuple = ()) -> Any:
     """A screened candidate at a place of its own, or at a shared one."""
     place = (where,) if simpler or where != "hub" else (f"{family}_{gain}",)
@@ -294,13 +321,13 @@ def test_a_shifted_centre_of_mass_is_not_believed_before_a_load_was_asked() -> N
 
 
 def test_the_leading_law_is_tried_where_like_places_share_it() -> None:
-    """Only sets that hold the place, were not asked and promise enough are fitted; nothing is where nothing touches."""
+    """Only wider and narrower sets that were not asked and promise enough are; nothing is where nothing touches."""
     law = FAMILIES["saturation"]
     one, both, three, other = (law(w) for w in (("a",), ("a", "b"), ("a", "b", "c"), ("b", "c")))
     pool = [one, both, three, other, FAMILIES["gain"](("a", "b"))]
     contest = asking([], pool)
     arena, screen = contest.arena, contest.screen
-    gains = {both.id: 100.0, three.id: 1.0}
+    gains = {one.id: 1.0, other.id: 1.0, both.id: 100.0, three.id: 1.0}
     arena.promises, arena.asked = (lambda s: s.gain), (lambda s, worth: 100.0)  # type: ignore[method-assign]
     arena.rng, arena.enter = np.random.default_rng(0), lambda picks: picks[0].effect.id  # type: ignore[assignment]
     screen.scout = lambda s, rng, draws: replace(s, gain=gains[s.effect.id])  # type: ignore[method-assign]
@@ -309,7 +336,9 @@ def test_the_leading_law_is_tried_where_like_places_share_it() -> None:
     assert contest._shared([refitted(both)]) == [], "the widest promises too little"
     gains[three.id] = 100.0
     assert contest._shared([refitted(both), refitted(one)]) == [three.id]
-    assert contest._shared([refitted(three)]) == []
+    assert contest._shared([refitted(three)]) == [both.id], "a narrower set"
+    gains |= {one.id: 200.0, other.id: 300.0}
+    assert contest._shared([refitted(three)]) == [other.id, one.id], "the two that promise most"
     contest.rough = False
     assert contest._shared([refitted(one)]) == []
 
