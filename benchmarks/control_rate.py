@@ -152,7 +152,7 @@ def main() -> None:
     args = parser.parse_args()
     timing.use_clock(args.clock)
     torch.set_num_threads(1)
-    robots, repeats = (["Jackal"], 2) if args.quick else (args.robots, args.repeats)
+    robots, repeats = (["Jackal"], 1) if args.quick else (args.robots, args.repeats)
     table = Table()
     for robot in robots:
         with tempfile.TemporaryDirectory() as folder:

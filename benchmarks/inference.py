@@ -149,7 +149,7 @@ def main() -> None:
     args = parser.parse_args()
     use_clock(args.clock)
     if args.quick:
-        args.seeds, args.simulations, args.observations, args.samples, args.epochs = [0], 2000, 1, 1000, 5
+        args.seeds, args.simulations, args.observations, args.samples, args.epochs = [0], 512, 1, 500, 2
         args.base = "linear"
     print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
     table = Table()
