@@ -6,6 +6,7 @@ import pytest
 from machines import make
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.sensors import unit_of
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, vector_to_quat
 
 MODEL = mujoco.MjModel.from_xml_string("""
@@ -32,6 +33,28 @@ def test_bias_and_gain_are_affine() -> None:
     effect, theta = _bound("sensor_bias", "sensor:gyro", {"x": 0.1, "y": 0.2, "z": 0.3})
     three = RNG.normal(size=(4, 20, 3))
     np.testing.assert_allclose(effect.sense("sensor:gyro", three, theta, DT), three + np.array([0.1, 0.2, 0.3]))
+
+
+@pytest.mark.parametrize(
+    ("channel", "unit"),
+    [
+        ("joint:arm:pos", "rad"),
+        ("joint:arm:vel", "rad/s"),
+        ("joint:lift:pos", "m"),
+        ("joint:lift:acc", "m/s^2"),
+        ("body:base:linvel", "m/s"),
+        ("body:base:angvel@body", "rad/s"),
+        ("sensor:gyro", "1"),
+    ],
+)
+def test_a_bias_has_the_unit_of_its_channel(channel: str, unit: str) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """
+<mujoco><worldbody><body name="base"><freejoint/><geom size=".1"/><site name="imu"/></body>
+<body><joint name="arm"/><geom size=".1"/></body><body><joint name="lift" type="slide"/><geom size=".1"/></body>
+</worldbody><sensor><gyro name="gyro" site="imu"/></sensor></mujoco>"""
+    )
+    assert unit_of(model, channel) == unit
 
 
 def test_delay_reports_the_past_exactly_for_straight_lines() -> None:

@@ -17,7 +17,10 @@ from nfc_gym.physics.fields import object_id
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, rotate, vector_to_quat
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
-_UNITS = {"pos": "m", "linvel": "m/s", "angvel": "rad/s", "vel": "rad/s", "acc": "rad/s^2"}
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+_OF_HINGE = {"pos": "rad", "vel": "rad/s", "acc": "rad/s^2"}
+_OF_SLIDE = {"pos": "m", "vel": "m/s", "acc": "m/s^2"}
+_OF_BODY = {"pos": "m", "linvel": "m/s", "angvel": "rad/s"}
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,17 @@ def resolve_channel(model: mujoco.MjModel, channel: str) -> Place:
         object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
         return Place(kind, "", 1)
     raise InputError(f"channel {channel!r}: want joint:<name>:..., body:<name>:..., sensor:<name> or force:<actuator>")
+
+
+def unit_of(model: mujoco.MjModel, channel: str) -> str:
+    """Unit of what a channel reports, `1` where the name does not say."""
+    at = resolve_channel(model, channel)
+    quantity = at.quantity.partition("@")[0]
+    if at.kind == "joint":
+        joint = object_id(model, mujoco.mjtObj.mjOBJ_JOINT, channel.split(":")[1])
+        slides = int(model.jnt_type[joint]) == _SLIDE
+        return (_OF_SLIDE if slides else _OF_HINGE).get(quantity, "1")
+    return _OF_BODY.get(quantity, "1") if at.kind == "body" else "1"
 
 
 class _OnChannel(Effect):
@@ -110,7 +124,7 @@ class SensorBias(_OnChannel):
                 "high": spread,
                 "resolution": 2e-3 * spread,
             }
-            size["unit"] = _UNITS.get(at.quantity.split("@")[0], "1")
+            size["unit"] = unit_of(model, channel)
             out.append(cls((channel,), sized(params, **{p.name: size for p in params})))
         return out
 
