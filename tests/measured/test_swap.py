@@ -11,7 +11,7 @@ from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.search import Options, Search, _met
 from nfc_gym.measured.swap import Swap, swapped
-from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects import FAMILIES, build
 from nfc_gym.physics.effects.joint import DampingPoly
 
 
@@ -61,9 +61,23 @@ def test_equivalents_in_the_last_model_join_those_of_the_round(monkeypatch: pyte
     rounds = [Round(["a:x"], 0.5, equivalents=["b:x"]), Round(["d:x", "e:x"], 0.1), Round([], 0.0)]
     alike = {"a:x": ["b:x", "c:x"], "e:x": ["f:x"]}
     monkeypatch.setattr("nfc_gym.measured.search.swapped", lambda *_: Swap(alike=alike))
-    assert search._exchange(None, rounds) is None
+    laws = [SimpleNamespace(id=i) for i in ("a:x", "d:x", "e:x")]
+    last: Any = SimpleNamespace(current=SimpleNamespace(plant=SimpleNamespace(effects=laws)))
+    assert search._exchange(last, rounds) is None
     assert [r.equivalents for r in rounds] == [["b:x", "c:x"], [], []]
     assert [rounds[1].rivals(i) for i in rounds[1].accepted] == [[], ["f:x"]]
+
+
+def test_what_contains_an_equivalent_that_an_exchange_found_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The round found the wind beside a slope; the push that it contains does as well in the last model."""
+    slope, push, wind = FAMILIES["slope"](("world",)), FAMILIES["external_force"](("b",)), FAMILIES["wind"](("b",))
+    search: Any = object.__new__(Search)
+    search.options, search.lookout, search.named, search.say = Options(), None, [slope, push, wind], None
+    rounds = [Round([slope.id], 0.5, equivalents=[wind.id])]
+    monkeypatch.setattr("nfc_gym.measured.search.swapped", lambda *_: Swap(alike={slope.id: [push.id]}))
+    last: Any = SimpleNamespace(current=SimpleNamespace(plant=SimpleNamespace(effects=[slope])))
+    assert search._exchange(last, rounds) is None
+    assert rounds[0].equivalents == [push.id]
 
 
 @pytest.mark.parametrize(
