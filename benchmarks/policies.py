@@ -14,8 +14,8 @@ drawn once and kept.
 Pretrained policies are those that `pretrain.py --out DIR` made, else the package's; posteriors (also .npz) and
 detectors are `<place>.safetensors` in their folders; so are TD-MPC2's world models, which `tdmpc2_pretrain.py` makes.
 The control rate is that of one robot's decisions on this machine.
---quick pretrains a toy Jackal first, tries most methods in Table II alone and ends within two minutes; its figures mean
-nothing.
+--quick pretrains a toy Jackal first, tries most methods in Table II alone and ends within three minutes; its figures
+mean nothing.
 """
 
 import argparse
@@ -43,7 +43,7 @@ from worlds.world import ENGINES, World
 from nfc_gym.adaptation.threads import limit_threads
 
 REFERENCES = ("random", "unadapted", "oracle")  # what returns are measured by
-LEARNED = ("nfc", "no_nfc", "tdmpc2")  # what takes longest, and goes the same way in both tables
+ADAPTED = ("nfc", "no_nfc", "tdmpc2")  # to what was executed: they take longest, and go the same way in both tables
 PLACES = tuple(f"{robot}{ground}" for robot in paper.ROBOTS for ground in paper.GROUNDS)
 
 
@@ -178,7 +178,7 @@ def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tab
     budget = Budget(args.envs, args.steps, args.budget, args.executed, judged, points, args.threads, args.device,
                     args.ratio)  # fmt: skip
     for table, world, task, seed in asked(args):
-        left_out = REFERENCES if args.beside else LEARNED if args.quick and table == "III" else ()
+        left_out = REFERENCES if args.beside else ADAPTED if args.quick and table == "III" else ()
         for method in [m for m in args.methods if m not in left_out]:
             if args.stop and time.monotonic() - began > args.stop:
                 print("time is up: the same command goes on")

@@ -26,7 +26,7 @@ def merged(arena: Arena, pool: Sequence[Effect], worth: float) -> tuple[tuple[Ef
     """
     effects = arena.current.plant.effects
     for two in combinations([e for e in effects if not e.generic], 2):
-        rivals = [e for e in pool if _may_replace(e, two) and e.id not in {own.id for own in effects}]
+        rivals = [e for e in pool if _may_replace(e, two) and e not in effects]
         if not rivals:
             continue
         without = arena
