@@ -186,5 +186,9 @@ def alternatives(law: Effect, rivals: Sequence[str], pool: Sequence[Effect]) -> 
     """
     known = {e.id: e for e in pool}
     laws = [law, *(known[i] for i in rivals if i in known)]
-    told = dict.fromkeys(i for i in rivals if not any(i in known and contains(known[i], e) for e in laws if e.id != i))
-    return list(told)
+    return [i for i in dict.fromkeys(rivals) if i not in known or not contains_any([known[i]], laws)]
+
+
+def contains_any(laws: Sequence[Effect], others: Sequence[Effect]) -> bool:
+    """Whether one of some laws has one of others as its special case."""
+    return any(contains(e, other) for e in laws for other in others if other is not e)

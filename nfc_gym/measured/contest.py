@@ -34,7 +34,7 @@ def calmed(gains: Array, numbers: NDArray[np.intp]) -> Array:
     """(S,) gains of blocks, those beyond one for each number counted by their logarithm.
 
     Where bodies touch, a foot that lands a moment earlier throws a whole block off, and one such block outweighs all
-    others: a bootstrap of the plain sums then says only whether that block was drawn. A limit that nine blocks in
+    others: a bootstrap of the plain sums then says only whether that block was drawn. A limit that eight blocks in
     seventy reach gains in each of them and hardly loses elsewhere, and should be seen.
 
     Args:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from nfc_gym.measured.arena import Arena, contains
+from nfc_gym.measured.arena import Arena, contains, contains_any
 from nfc_gym.measured.contest import Judged, mechanism, shortlist
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.pairing import promising
@@ -285,12 +285,8 @@ class Contest:
         # Nor is one thing that two bodies could carry, hung on the one farther away.
         rivals = [j for j in rivals if not any(arena.nearer(k, j) for k in (best, *rivals))]
         # A law that has the chosen one, or another rival, as its special case is no further alternative.
-        plainer = [chosen, *(arena.new(j) for j in rivals)]
-        return [
-            arena.label(j)
-            for j in rivals
-            if not any(contains(e, w) for e in arena.new(j) for laws in plainer for w in laws if w is not e)
-        ]
+        laws = [*chosen, *(e for j in rivals for e in arena.new(j))]
+        return [arena.label(j) for j in rivals if not contains_any(arena.new(j), laws)]
 
     def _apart(self, judged: Sequence[Judged]) -> list[Judged]:
         """Values of their own at each place: for what was accepted before, and for the leading laws at several places.

@@ -82,7 +82,7 @@ class Wind(Effect):
     """
 
     family = "wind"
-    covers = ("external_force", "drag_linear")  # a gale on hardly any drag; still air, where drag is alike along all axes
+    covers = ("external_force", "drag_linear")  # a gale on hardly any drag; still air (one drag for all axes)
     summary = "Steady wind"
     PARAMS = (
         *(Param(f"push_{axis}", "N", -1e5, 1e5, probes=(0.1,), ambient=True) for axis in "xyz"),
