@@ -127,12 +127,14 @@ class Contest:
             return []
         asked, own = {arena.label(j) for j in entered}, set(new[0].where)
         like = [e for e in self.pool.values() if e.family == new[0].family and e.id not in asked]
-        wider = [e for e in like if own < set(e.where)]
-        narrower = [e for e in like if set(e.where) < own]
-        found = [self.screen.scout(s, arena.rng, draws=0) for e in (*wider, *narrower) if (s := self._screened(e.id))]
-        able = [s for s in found if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
-        inner = sorted((s for s in able if set(s.effect.where) < own), key=lambda s: -s.gain)[:_NARROWER]
-        return [arena.enter([s]) for s in (*(s for s in able if own < set(s.effect.where)), *inner)]
+
+        def promising(effects: list[Effect]) -> list[Screened]:
+            found = [self.screen.scout(s, arena.rng, draws=0) for e in effects if (s := self._screened(e.id))]
+            return [s for s in found if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
+
+        wider = promising([e for e in like if own < set(e.where)])
+        narrower = sorted(promising([e for e in like if set(e.where) < own]), key=lambda s: -s.gain)
+        return [arena.enter([s]) for s in (*wider, *narrower[:_NARROWER])]
 
     def _challenged(
         self, outcome: Round, judged: list[Judged], believed: list[Judged]
