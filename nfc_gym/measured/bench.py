@@ -10,6 +10,7 @@ import numpy as np
 from nfc_gym import assets
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
+from nfc_gym.measured import foresight
 from nfc_gym.measured.belief import Belief
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.forward import ForwardProblem
@@ -65,17 +66,40 @@ class Bench:
             return kind(model, logs, states, segments.length, max(1, -(-sum(map(len, self.dataset.logs)) // _SAMPLES)))
         return self.rollouts(logs, states, most)
 
+    def searched(self, logs: Sequence[Log], most: int | None = None) -> Problem:
+        """The problem that models are fitted and compared on: as `problem`, but only as far ahead as slopes can follow.
+
+        Args:
+          most: of the mapping's segments; of shorter ones as many as are as long together.
+        """
+        segments = self.dataset.mapping.segments
+        if self.mode != "rollout" or (count := self._followed) == len(segments.horizons):
+            return self.problem(logs, most)
+        horizons, states = segments.horizons[:count], [self.states[log.name] for log in logs]
+        most = None if most is None else round(most * segments.length / horizons[-1])
+        return self.rollouts(logs, states, most, horizons)
+
+    @cached_property
+    def _followed(self) -> int:
+        """How many horizons slopes can follow the nominal model to, in the logs to fit."""
+        problem = self.problem(self.dataset.of("fit"), most=foresight.BLOCKS)
+        return foresight.followed(problem, self.plant, self.plant.null)
+
     def rollouts(
-        self, logs: Sequence[Log], states: Sequence[States], most: int | None = None, length: float | None = None
+        self,
+        logs: Sequence[Log],
+        states: Sequence[States],
+        most: int | None = None,
+        horizons: tuple[float, ...] | None = None,
     ) -> RolloutProblem:
         """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs.
 
         They count as rough where bodies do touch in these logs: a robot that flies over a floor never meets it.
 
         Args:
-          length: s, of each segment, compared at its end; default as the mapping says.
+          horizons: s, at which segments that end at the last are compared; default as the mapping says.
         """
-        whole = self._rollouts(logs, states, length)
+        whole = self._rollouts(logs, states, horizons)
         whole.rough = whole.rough and self._touching
         if most is None or len(whole) <= most:
             return whole
@@ -88,9 +112,11 @@ class Bench:
         every = self._rollouts(logs, [self.states[log.name] for log in logs])
         return every.touches(self.plant, self.plant.null)
 
-    def _rollouts(self, logs: Sequence[Log], states: Sequence[States], length: float | None = None) -> RolloutProblem:
+    def _rollouts(
+        self, logs: Sequence[Log], states: Sequence[States], horizons: tuple[float, ...] | None = None
+    ) -> RolloutProblem:
         segments, model = self.dataset.mapping.segments, self.plant.model
-        length, horizons = (segments.length, segments.horizons) if length is None else (length, (length,))
+        length, horizons = (segments.length, segments.horizons) if horizons is None else (horizons[-1], horizons)
         controls = self.dataset.mapping.controls
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")

@@ -203,10 +203,9 @@ def _fold(
     if not verifying:
         raise InputError("no log verifies: give one `split: verify`, or let `split` divide them")
     # What was selected is refitted on all logs that do not verify.
-    whole = bench.problem([*fitting, *selecting])
-    steps = bench.dataset.mapping.segments.length / bench.plant.model.opt.timestep
-    work = bench.problem(fitting, most=max(40, int(_WORK / steps)))
-    select = bench.problem(selecting, most=max(40, int(_WORK / steps)))
+    whole = bench.searched([*fitting, *selecting])
+    most = max(40, int(_WORK * bench.plant.model.opt.timestep / dataset.mapping.segments.length))
+    work, select = bench.searched(fitting, most), bench.searched(selecting, most)
     found = _search(run, fitting, work, select)
     calibrated, extended, step = _final(run, found, whole)
     final = calibrated, extended
@@ -345,7 +344,7 @@ def _identify(
     bench, plant = run.bench, fitted.plant
     # An instant problem evaluates whole logs: some of them must do.
     some = logs if bench.mode == "rollout" else logs[:: -(-len(logs) // _SOME_LOGS)]
-    problem = bench.problem(some, most=blocks_for(len(pool)))
+    problem = bench.searched(some, blocks_for(len(pool)))
     sigma = problem.covariance(plant, fitted.x)
     lens = Lens(problem, metric(problem, sigma, slack(problem, sigma, plant, fitted.x)), plant, fitted.x)
     count = sum(int(p.mask.sum()) for p in searched)

@@ -106,7 +106,7 @@ def ask(witness: Witness, file: str, bench: "Bench", logs: Sequence[Log], x: Arr
     """
     began = time.monotonic()
     h, dt = witness.horizon, witness.dt
-    problem = bench.rollouts(logs, [bench.states[log.name] for log in logs], length=h * dt)
+    problem = bench.rollouts(logs, [bench.states[log.name] for log in logs], horizons=(h * dt,))
     rolled = bench.plant.shoot(x[None], problem.segments)
     fine = rolled.stable[0]
     if not fine.any():
