@@ -1,5 +1,6 @@
 """Effects of unknown sizes beside psi: where they are absent, a delay that is no mass, and worlds that have them."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -8,9 +9,11 @@ import pytest
 from test_assimilation import driven_in
 
 from nfc_gym import InputError
+from nfc_gym.adaptation.assimilated import Assimilated
 from nfc_gym.adaptation.assimilation import Assimilation
 from nfc_gym.adaptation.imagined import imagined
 from nfc_gym.adaptation.structure import names, structure_of
+from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.physics.effects import build
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.residuals import Given, Residuals
@@ -20,11 +23,20 @@ ID = "nfc_gym/JackalFlat-v0"
 DRIVES = "front_left+front_right+rear_left+rear_right"
 
 
-@pytest.fixture(autouse=True)
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module", autouse=True)
+def few() -> Iterator[None]:
     """Fewer segments and rounds than a mission's, in half the time."""
-    monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 20)
-    monkeypatch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4, 0.2, 0.05))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 20)
+        patch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4, 0.2, 0.05))
+        yield
+
+
+@pytest.fixture(scope="module")
+def delayed(few: None) -> tuple[Assimilation, Trajectory, Assimilated]:
+    """What is inferred of a rover whose commands are late: who infers, from what, and the belief."""
+    q, trajectory = Assimilation(ID), driven_in(late(0.08), {}, 240)
+    return q, trajectory, q.infer(trajectory)
 
 
 def test_sizes_are_absent_at_their_null_and_stay_within_bounds() -> None:
@@ -75,20 +87,20 @@ def late(delay: float) -> Any:
     return ApplyEffects(gym.make(ID, context=["psi"]), [(effect, theta)])
 
 
-def test_a_delay_is_found_and_no_mass_makes_up_for_it() -> None:
-    trajectory = driven_in(late(0.08), {}, 300)
+def test_a_delay_is_found_and_no_mass_makes_up_for_it(delayed: tuple[Assimilation, Trajectory, Assimilated]) -> None:
+    _, trajectory, belief = delayed
     nominal = Machine(ID).space.nominal[0]
     blind = Assimilation(ID, delta_s=False, effects=False).infer(trajectory)
-    seeing = Assimilation(ID)
-    belief = seeing.infer(trajectory)
     found = {e.family: theta for e, theta in belief.effects(500, np.random.default_rng(0))}
     assert abs(np.median(found["delay"]) - 0.08) < 0.03
     off = [abs(q.sample(500, np.random.default_rng(0)).psi[:, 0].mean() - nominal) for q in (blind, belief)]
     assert off[1] < off[0], "the base's mass"
 
 
-def test_worlds_of_a_belief_have_its_effects_each_in_a_size_of_its_own() -> None:
-    belief = Assimilation(ID).infer(driven_in(late(0.08), {}, 120))
+def test_worlds_of_a_belief_have_its_effects_each_in_a_size_of_its_own(
+    delayed: tuple[Assimilation, Trajectory, Assimilated],
+) -> None:
+    belief = delayed[2]
     given: Any = {"hallucinate": True, "beta": 1.0, "episode": 50, "threads": 1, "seed": 0}
     ways = []
     for parts in (("psi", "effects"), ("psi",)):
@@ -128,10 +140,8 @@ def test_sensors_noise_is_found_and_worlds_have_it() -> None:
     assert (off[sd == 0] == 0).all()
 
 
-def test_worlds_are_drawn_where_replays_do_as_was_seen() -> None:
-    q = Assimilation(ID, delta_s=False)
-    trajectory = driven_in(late(0.08), {}, 200)
-    belief = q.infer(trajectory)
+def test_worlds_are_drawn_where_replays_do_as_was_seen(delayed: tuple[Assimilation, Trajectory, Assimilated]) -> None:
+    q, trajectory, belief = delayed
     near = belief.near()
     assert belief.share < 1
     segments, rng = q.segments(trajectory), np.random.default_rng(0)

@@ -98,3 +98,19 @@ def test_a_geom_that_is_asked_for_by_name_stays() -> None:
     assert "base_shell" not in [g.name for g in bare(spec).geoms]
     assert "base_shell" in [g.name for g in bare(spec, {"base_shell"}).geoms]
     assert "base_shell" in [g.name for g in spec.geoms]
+
+
+def test_where_slopes_cannot_follow_segments_are_shorter(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same stretch of the logs, to the last of the horizons that are left; `most` counts the mapping's segments."""
+    dataset = require(build())[0]
+    bench, segments = make_bench(dataset, 1), dataset.mapping.segments
+    logs = dataset.of("fit")
+    whole = bench.searched(logs)
+    assert len(whole) == len(bench.problem(logs))
+    short = make_bench(dataset, 1)
+    monkeypatch.setattr("nfc_gym.measured.foresight.followed", lambda *_: 2)
+    cut = short.searched(logs)
+    assert cut.columns.horizon.max() == segments.horizons[1]
+    assert len(cut) >= len(whole) * segments.length / segments.horizons[1]
+    assert len(short.searched(logs, 2)) == round(2 * segments.length / segments.horizons[1])
+    assert short.problem(logs).columns.horizon.max() == segments.horizons[-1]
