@@ -73,11 +73,16 @@ class Bench:
           most: of the mapping's segments; of shorter ones as many as are as long together.
         """
         segments = self.dataset.mapping.segments
-        if self.mode != "rollout" or (count := self._followed) == len(segments.horizons):
+        if not self.short:
             return self.problem(logs, most)
-        horizons, states = segments.horizons[:count], [self.states[log.name] for log in logs]
+        horizons, states = segments.horizons[: self._followed], [self.states[log.name] for log in logs]
         most = None if most is None else round(most * segments.length / horizons[-1])
         return self.rollouts(logs, states, most, horizons)
+
+    @property
+    def short(self) -> bool:
+        """Whether slopes cannot follow as far as the mapping predicts."""
+        return self.mode == "rollout" and self._followed < len(self.dataset.mapping.segments.horizons)
 
     @cached_property
     def _followed(self) -> int:

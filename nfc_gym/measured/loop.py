@@ -16,6 +16,7 @@ from rich.console import Console
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together
 from nfc_gym.core.log import Log
+from nfc_gym.measured import marginal
 from nfc_gym.measured.advice import advise
 from nfc_gym.measured.belief import read_belief
 from nfc_gym.measured.bench import Bench, candidates, make_bench
@@ -320,13 +321,17 @@ class _Settled:
 def _settled(
     run: _Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = (), starts: int = STARTS
 ) -> _Settled:
-    """Fit a model from where it stands and, where bodies touch, from other places (size,) too."""
+    """Fit a model from where it stands and, where bodies touch, from other places (size,) or over drawn starts too."""
     plant, stage, sigma = start.plant, f"final {name}", None
     if run.stages.get(stage) is None:
         run.say(f"fitting the {name} model on all {len(whole)} segments")
         fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
-        tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
-        ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
+        if run.bench.short:
+            tick = lambda k: run.say(f"fitting the {name} model over drawn starts, turn {k} of {marginal.TURNS}")  # noqa: E731
+            ended = marginal.marginal(whole, under, fitted, run.seed, tick)
+        else:
+            tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
+            ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
         run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "open": ended.open.tolist()})
         sigma = ended.sigma
     x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "open"))
