@@ -226,6 +226,21 @@ def test_the_same_seed_gives_the_same_report(closed: Closed, tmp_path: Path) -> 
     assert (out / "thesis.tex").read_text() == "years of work"
 
 
+def test_where_slopes_cannot_follow_the_same_is_found(
+    closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a robot that crawls: half as far, over drawn starts; errors are told at the mapping's own horizons."""
+    monkeypatch.setattr("nfc_gym.measured.foresight.followed", lambda *_: 2)
+    report = close_loop(closed.mapping, tmp_path / "out", seed=3, jobs=1)
+    assert report["error"]["horizons_s"] == closed.report["error"]["horizons_s"]
+    assert [e["id"] for e in report["effects"]] == ["coulomb:hinge"]
+    (size,) = report["effects"][0]["parameters"].values()
+    assert size["low"] < LOSS < size["high"]
+    assert size["high"] - size["low"] < 0.1
+    (damping,) = report["parameters"]
+    assert damping["low"] < DAMPING < damping["high"]
+
+
 def test_a_machine_that_is_its_model_lacks_nothing(tmp_path: Path) -> None:
     report = close_loop(machine(tmp_path, loss=0, damping=DAMPING), tmp_path / "out", jobs=1)
     assert report["effects"] == []
