@@ -34,30 +34,15 @@ _PARTS = np.array([0.0, 1.0, 0.5, 0.2])  # of a step that are tried
 
 @dataclass(frozen=True)
 class _Turn:
-    """Draws of starts at one place, under the metric: residuals (D, S, m), slopes (D, S, m, f), weights (S, m)."""
+    """What draws of starts at one place tell, from products of what is seen at different ones of them.
 
-    white: Array
-    slopes: Array
-    weight: Array
+    Attributes:
+      hessian: (f, f) by slopes and slopes.
+      scores: (S, f) by slopes and residuals, of each block; their sum is the gradient.
+    """
 
-    @property
-    def hessian(self) -> Array:
-        """(f, f) from products of slopes at different starts."""
-        every = self.slopes.sum(0)
-        same = sum(np.einsum("smi,sm,smj->ij", a, self.weight, a) for a in self.slopes)
-        found = (np.einsum("smi,sm,smj->ij", every, self.weight, every) - same) / self._pairs
-        return 0.5 * (found + found.T)
-
-    @property
-    def gradient(self) -> Array:
-        """(f,) from products of slopes at one start and residuals at another."""
-        every = np.einsum("smi,sm->i", self.slopes.sum(0), self.weight * self.white.sum(0))
-        same = sum(np.einsum("smi,sm->i", a, self.weight * r) for a, r in zip(self.slopes, self.white, strict=True))
-        return (every - same) / self._pairs
-
-    @property
-    def _pairs(self) -> int:
-        return len(self.white) * (len(self.white) - 1)
+    hessian: Array
+    scores: Array
 
 
 def marginal(
@@ -85,7 +70,7 @@ def marginal(
         turn = _looked(drawn, under, limits, limits.x(z, found.x))
         last = [*last[1 - _KEPT :], turn]
         hessian = np.mean([t.hessian for t in last], 0) + np.diag(limits.pull**2)
-        step = _step(hessian, turn.gradient + (z - limits.centre) * limits.pull**2)
+        step = _step(hessian, turn.scores.sum(0) + (z - limits.centre) * limits.pull**2)
         rows = np.clip(z + _PARTS[:, None] * step, limits.floor, limits.roof)
         tried = limits.x(rows, found.x)
         z = rows[int(np.mean([loss(under.whiten(p.residual(found.plant, tried))).sum(-1) for p in drawn], 0).argmin())]
@@ -98,11 +83,17 @@ def marginal(
 
 
 def _looked(drawn: list[RolloutProblem], under: Metric, limits: Box, x: Array) -> _Turn:
-    """Residuals and slopes at x (size,) from each set of starts."""
-    every = np.arange(len(limits.scale))
-    white = np.stack([under.whiten(p.residual(limits.plant, x[None]))[0] for p in drawn])
+    """What sets of starts tell at x (size,)."""
+    every, pairs = np.arange(len(limits.scale)), len(drawn) * (len(drawn) - 1)
+    white = [under.whiten(p.residual(limits.plant, x[None]))[0] for p in drawn]
     slopes = [jacobian(p, under, limits, x, r, every, _STEP) for p, r in zip(drawn, white, strict=True)]
-    return _Turn(white, np.stack(slopes), loss_weight(np.sqrt((white**2).mean(0))) ** 2)
+    weight = loss_weight(np.sqrt(np.mean(np.square(white), 0))) ** 2
+    curved = lambda a: np.einsum("smi,sm,smj->ij", a, weight, a)  # noqa: E731
+    pulled = lambda a, r: np.einsum("smi,sm->si", a, weight * r)  # noqa: E731
+    whole, apart = np.sum(slopes, 0), list(zip(slopes, white, strict=True))
+    hessian = (curved(whole) - sum(map(curved, slopes))) / pairs
+    scores = (pulled(whole, np.sum(white, 0)) - sum(pulled(a, r) for a, r in apart)) / pairs
+    return _Turn(0.5 * (hessian + hessian.T), scores)
 
 
 def _step(hessian: Array, gradient: Array) -> Array:
@@ -125,9 +116,8 @@ def _covariance(last: list[_Turn], limits: Box, blocks: NDArray[np.intp]) -> Arr
     """(f, f) of a model that fits, or, where that is more, of any, from the scatter between clusters of blocks."""
     scale, values, vectors = _principal(np.mean([t.hessian for t in last], 0) + np.diag(limits.pull**2))
     inverse = scale[:, None] * (vectors / np.maximum(values, _FLAT) @ vectors.T) * scale
-    slopes, white = (np.mean(np.concatenate(parts), 0) for parts in ([t.slopes for t in last], [t.white for t in last]))
     clustered = np.zeros((int(blocks.max()) + 1, len(scale)))
-    np.add.at(clustered, blocks, np.einsum("smi,sm->si", slopes, np.mean([t.weight for t in last], 0) * white))
+    np.add.at(clustered, blocks, np.mean([t.scores for t in last], 0))
     robust = inverse @ (clustered.T @ clustered) @ inverse
     wider = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(inverse), 1e-300), 1.0))
     return inverse * wider * wider[:, None]
