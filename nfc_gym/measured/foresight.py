@@ -1,8 +1,8 @@
 """How far ahead of a measured start slopes tell what psi does: where bodies touch, less far than users want to predict.
 
 A foot that lands a step sooner changes all that follows. An ant's motion 0.4 s after its start is no function of a
-leg's mass that any straight line follows: fits end in one of many hollows, hundreds apart in loss. Segments a quarter as
-long, four times as many, cost the same, and their fits end within tens of each other.
+leg's mass that any straight line follows: fits end in one of many hollows, hundreds apart in loss. Segments a quarter
+as long, four times as many, cost the same, and their fits end within tens of each other.
 """
 
 import numpy as np
