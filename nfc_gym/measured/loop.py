@@ -243,7 +243,8 @@ def _fold(
 def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     """Calibrate, then search; a stage after calibration and after every round. A resumed run goes on from the last."""
     bench, plant = run.bench, run.bench.plant
-    run.say(f"{len(work)} segments to fit, {len(select)} to select on")
+    reach = f" of {work.columns.horizon.max():g} s, as far as slopes can follow," if bench.short else ""
+    run.say(f"{len(work)} segments{reach} to fit, {len(select)} to select on")
     # A stage is read back from what is kept of it, just now or by an earlier process: both go on from the same bits.
     if run.stages.get("calibrated") is None:
         run.stages.put("calibrated", calibrate(work, plant, run.seed, run.say, bench.belief, bench.compare))
