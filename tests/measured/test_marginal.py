@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nfc_gym.measured.box import box
 from nfc_gym.measured.elsewhere import Hollows
 from nfc_gym.measured.fit import Fit, stand, uncertainty
 from nfc_gym.measured.marginal import marginal
@@ -79,4 +78,3 @@ def test_what_is_no_roll_out_stays_as_it_is() -> None:
     ended = marginal(other, SimpleNamespace(), before, 0)  # type: ignore[arg-type]
     np.testing.assert_array_equal(ended.x, before.x)
     assert not ended.open.any()
-    assert len(box(before.plant).scale) == 2
