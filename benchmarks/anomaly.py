@@ -248,9 +248,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write the rows here")
     args = parser.parse_args()
     if args.quick:
-        args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 64, 64, 8
-        args.training, args.epochs, args.effects, args.draws, args.levels = 256, 1, 1, 4, 100
-        args.lessons = 80
+        args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 40, 40, 4
+        args.training, args.epochs, args.effects, args.draws, args.levels = 256, 1, 1, 4, 60
+        args.lessons = 60
     return args
 
 

@@ -159,7 +159,7 @@ def main() -> None:
                 for linear in {"linear": (True,), "prior": (False,), "both": (True, False)}[args.base]:
                     known(table, task, density, linear, args)
     if args.latency:
-        latency(table, 10 if args.quick else 25, args.clock, args.device)
+        latency(table, 3 if args.quick else 25, args.clock, args.device)
     if args.json:
         args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
 

@@ -136,9 +136,12 @@ def _judge(
     if verdict != "partly explained":
         return _Judged(verdict, named, [], proposed, taken)
     # What is weak predicts, and stays in the model; that it is the cause of what is missing is not shown.
-    weak = [r | {"nearest": True, "alike": doubted.get(r["id"], [])} for r in named]
-    weak = weak if taken < say.CAUSE else [r for r in weak if r["alike"]]
+    every = [r | {"nearest": True, "alike": doubted.get(r["id"], [])} for r in named]
+    weak = every if taken < say.CAUSE else [r for r in every if r["alike"]]
     causes = [r for r in named if r["id"] not in {w["id"] for w in weak}]
+    # Beside guesses, what is no guess must itself bring the half: a small law that had no rival is not the cause.
+    if weak and sum(r["share_of_excess"] for r in causes) < say.CAUSE:
+        weak, causes = every, []
     return _Judged(verdict if causes else "unexplained", causes, weak, proposed, taken)
 
 

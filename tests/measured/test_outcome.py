@@ -34,13 +34,25 @@ def test_where_nothing_remains_what_was_found_is_the_cause() -> None:
 
 def test_one_guess_among_several_is_no_cause() -> None:
     alike = ["gain:rotor", "payload:base"]
-    out = judged(3.0, 1.5, [*ROWS[:1], {"id": "delay:rotor"}], wind=alike)
-    assert (out.verdict, out.claimed) == ("partly explained", [{"id": "delay:rotor"}])
+    beside = {"id": "delay:rotor", "share_of_excess": 0.6}
+    out = judged(3.0, 1.5, [*ROWS[:1], beside], wind=alike)
+    assert (out.verdict, out.claimed) == ("partly explained", [beside])
     assert out.weak == [ROWS[0] | {"nearest": True, "alike": alike}]
     assert out.share == 0.1  # beside a cause: what comes back when it alone is taken out
     alone = judged(3.0, 1.5, wind=alike)
     assert (alone.verdict, alone.share) == ("unexplained", alone.taken)
     assert judged(1.0, 1.0, wind=alike).claimed == ROWS[:1]
+
+
+def test_what_is_small_beside_guesses_is_no_cause() -> None:
+    small = {"id": "delay:rotor", "share_of_excess": 0.4}
+    out = judged(3.0, 1.5, [*ROWS[:1], small], wind=["gain:rotor", "payload:base"])
+    assert (out.verdict, out.claimed) == ("unexplained", [])
+    assert [(r["id"], r["alike"]) for r in out.weak] == [
+        ("wind:base", ["gain:rotor", "payload:base"]),
+        ("delay:rotor", []),
+    ]
+    assert judged(3.0, 1.5, [small, *ROWS[:1]]).claimed == [small, *ROWS[:1]], "without guesses it may be one of several"
 
 
 def test_a_law_in_words_is_a_proposal_either_way() -> None:

@@ -182,7 +182,7 @@ class Saturation(_OnCommand):
         for where in actuator_places(model, [n for n in plain(model) if n not in ranged]):
             force = max(float(np.median(np.abs(scales.actuation[actuator_ids(model, where)]))), 1e-6)
             # The scale is a root mean square: forces reach two or three times as high, where a limit begins to bite.
-            change = {"probes": (0.7 / force, 1.2 / force), "high": 20 / force, "resolution": 2e-3 / force}
+            change = {"probes": (0.4 / force, 0.7 / force, 1.2 / force), "high": 20 / force, "resolution": 2e-3 / force}
             out.append(cls(where, sized(cls.ON_FORCE, inverse_limit=change)))
         return out
 
