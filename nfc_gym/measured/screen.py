@@ -20,8 +20,8 @@ from nfc_gym.physics.effects.base import Effect, overrides
 
 Array = NDArray[np.float64]
 _FAR = 4.0  # probing sizes beyond which a secant is not believed
-# Of a realistic size, what a scout tries with all else as it is. A limit that few blocks reach does nothing when it is a
-# fifth too wide and harm when it is a fifth too narrow: steps of a half would go over it.
+# Of a realistic size, what a scout tries with all else as it is. A limit that few blocks reach does nothing when it is
+# a fifth too wide and harm when it is a fifth too narrow: steps of a half would go over it.
 _SHARES = 2.0 ** np.arange(-3, 0.01, 0.25)
 _MIMIC, _MIMICS = 0.95, 2  # cosine from which a law does much the same as another one; how many such are refitted
 _SCOUT = 0.7  # spread of a scout's draws, in scaled parameters

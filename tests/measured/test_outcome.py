@@ -52,7 +52,8 @@ def test_what_is_small_beside_guesses_is_no_cause() -> None:
         ("wind:base", ["gain:rotor", "payload:base"]),
         ("delay:rotor", []),
     ]
-    assert judged(3.0, 1.5, [small, *ROWS[:1]]).claimed == [small, *ROWS[:1]], "without guesses it may be one of several"
+    both = [small, *ROWS[:1]]
+    assert judged(3.0, 1.5, both).claimed == both, "without guesses it may be one of several"
 
 
 def test_a_law_in_words_is_a_proposal_either_way() -> None:
