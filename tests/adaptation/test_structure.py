@@ -160,8 +160,8 @@ def test_worlds_are_drawn_where_replays_do_as_was_seen(delayed: tuple[Assimilati
 
 
 def test_what_is_remembered_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 12)
-    monkeypatch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4))
+    monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 8)
+    monkeypatch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4,))
     first, second = (driven_in(late(0.08), {}, 120, seed) for seed in (3, 4))
     q = Assimilation(ID, delta_s=False, memory=2)
     alone = q.infer(second)

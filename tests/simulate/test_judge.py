@@ -60,17 +60,17 @@ def test_bad_evidence() -> None:
 def test_a_bank_with_a_judge_finds_more() -> None:
     machine = Machine(JACKAL)
     heavy, _, slippery, *_ = faults_of(machine)
-    bank = ReplayBank(JACKAL, faults=[heavy, slippery], draws=4)
-    nominal = np.tile(machine.space.nominal, (60, 1))
+    bank = ReplayBank(JACKAL, faults=[heavy, slippery], draws=2)
+    nominal = np.tile(machine.space.nominal, (50, 1))
 
     def evidence(found: dict) -> np.ndarray:
         return bank.evidence(found["states"], found["actions"])
 
     lessons = evidence(trials(machine, nominal, 0)), evidence(faulty(machine, nominal, 1))
-    assert lessons[0].shape == (60, 5)
+    assert lessons[0].shape == (50, 5)
     judged = bank.judged(*lessons)
     assert bank.judge is None
-    healthy, broken = trials(machine, nominal[:40], 2), faulty(machine, nominal[:40], 3)
+    healthy, broken = trials(machine, nominal[:25], 2), faulty(machine, nominal[:25], 3)
     np.testing.assert_allclose(bank.gains(healthy["states"], healthy["actions"]), evidence(healthy)[:, :3])
     scores = [judged.score(w["states"], w["actions"]) for w in (healthy, broken)]
     assert auroc(scores[0], scores[1])[0] > 0.7
