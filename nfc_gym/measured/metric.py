@@ -55,11 +55,16 @@ def taken(before: Array, after: Array, noise: Array) -> float:
     The geometric mean over those that the noise does not make up alone; 1 where it makes up all.
     Chi-squared will not do: where sensors are far better than any model, it is the same great number before and after.
     """
-    shows = noise < _SEEN * before
+    shows = beyond(before, noise)
     before, after, noise = before[shows], after[shows], noise[shows]
     with np.errstate(over="ignore"):  # a model that runs away takes nothing away
         left = np.maximum(after - noise, np.maximum(_NOTHING * noise, 1e-12 * before)) / (before - noise)
         return 1 - float(np.exp(np.log(left).mean())) if shows.any() else 1.0
+
+
+def beyond(error: Array, noise: Array) -> NDArray[np.bool_]:
+    """(k,) mean squared errors that the noise does not make up alone."""
+    return noise < _SEEN * error
 
 
 def unexplained_variance(problem: Problem, residual: Array, sigma: Array) -> Array:

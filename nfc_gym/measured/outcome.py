@@ -132,7 +132,7 @@ def _judge(
 ) -> _Judged:
     """Divide what was found into causes and proposals; `laws` are the ids of those without a name (see `doubt`)."""
     named, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
-    verdict, taken = say.verdict(v, len(named), generic or bool(proposed)), say.taken_away(errors)
+    verdict, taken = say.verdict(v, len(named), generic or bool(proposed)), say.taken_away(v, errors)
     if verdict != "partly explained":
         return _Judged(verdict, named, [], proposed, taken)
     # What is weak predicts, and stays in the model; that it is the cause of what is missing is not shown.

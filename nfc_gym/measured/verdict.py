@@ -11,7 +11,7 @@ from scipy.stats import t as student
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured.contest import bootstrap, clusters
 from nfc_gym.measured.fit import Fit, uncertainty
-from nfc_gym.measured.metric import metric, taken
+from nfc_gym.measured.metric import beyond, metric, taken
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.ranking import Round
 from nfc_gym.physics.effects.conditions import Conditioned
@@ -105,13 +105,21 @@ def errors(v: Verified) -> dict[str, Any]:
     return {"horizons_s": levels, "groups": groups}
 
 
-def taken_away(errors: dict[str, Any]) -> float:
-    """Share of the error beyond the noise that the extended model takes away (see `taken`), of all `errors` groups."""
+def taken_away(v: Verified, errors: dict[str, Any]) -> float:
+    """Share of the error beyond the noise that the extended model takes away (see `taken`), of all `errors` groups.
+
+    Where noise makes up every one of these errors, what is missing shows in all numbers together alone: then it is the
+    share of the excess chi-squared.
+    """
     names = ("calibrated", "extended", "noise_floor")
     rows = [row for r in errors["groups"].values() for row in zip(*(r[n] for n in names), strict=True)]
     known = np.array([row for row in rows if None not in row], float).reshape(-1, 3)
     with np.errstate(over="ignore"):
-        return taken(*(known**2).T)
+        before, after, noise = (known**2).T
+    if beyond(before, noise).any():
+        return taken(before, after, noise)
+    whole = v.chi2("calibrated")
+    return (whole - v.chi2("extended")) / max(whole - _floor(v), 1e-9)
 
 
 def _rms(values: Array, where: NDArray[np.bool_]) -> float | None:
@@ -133,6 +141,11 @@ def verdict(v: Verified, effects: int, generic: bool) -> str:
     if effects:
         return "explained" if settled and not generic else "partly explained"
     return "nothing missing" if settled and not generic else "unexplained"
+
+
+def _floor(v: Verified) -> float:
+    """Mean chi-squared of a perfect model."""
+    return float(v.null.mean()) if len(v.null) else 1.0
 
 
 def null_bound(v: Verified) -> float:
@@ -209,8 +222,7 @@ def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[st
 def excess_shares(v: Verified, problem: Problem, fitted: Fit, calibrated: tuple[Plant, Array]) -> dict[str, float]:
     """Share of the excess chi-squared that comes back when each effect alone is taken out, on the verification logs."""
     measure = metric(problem, v.sigma)
-    floor = float(v.null.mean()) if len(v.null) else 1.0
-    excess = max(v.chi2("calibrated") - floor, 1e-9)
+    excess = max(v.chi2("calibrated") - _floor(v), 1e-9)
     shares = {}
     for effect in fitted.plant.effects:
         x = fitted.x.copy()
