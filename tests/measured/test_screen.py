@@ -97,6 +97,15 @@ def test_a_ladder_keeps_to_bounds_and_to_the_side_that_was_found(side: float) ->
     assert (np.diff(np.abs(rungs), axis=0) > 0).all()
 
 
+def test_a_limit_is_met_by_some_rung_within_a_tenth() -> None:
+    """Whatever it is, between an eighth of the realistic size and all of it: steps of a half went over a leg's knees."""
+    law = build("saturation", "motor", {"removed": 0.0})[0]
+    rungs = ladder(law, np.array([0.3]))[:, 0]
+    whole = law.params[0].probes[1]
+    for size in np.linspace(whole / 8, whole, 50):
+        assert np.abs(rungs / size - 1).min() < 0.1
+
+
 def test_what_repeats_is_what_two_columns_share() -> None:
     one = np.eye(3)
     np.testing.assert_allclose(repeated(one, np.array([[2.0, 0, 0], [0, -1.0, 1.0], [0, 0, 1.0]])), [1, 0, 0.5**0.5])
