@@ -98,7 +98,7 @@ def test_a_ladder_keeps_to_bounds_and_to_the_side_that_was_found(side: float) ->
 
 
 def test_a_limit_is_met_by_some_rung_within_a_tenth() -> None:
-    """Whatever it is, between an eighth of the realistic size and all of it: steps of a half went over a leg's knees."""
+    """Whatever it is, between an eighth of the realistic size and all of it: halving went over a limit of the knees."""
     law = build("saturation", "motor", {"removed": 0.0})[0]
     rungs = ladder(law, np.array([0.3]))[:, 0]
     whole = law.params[0].probes[1]
