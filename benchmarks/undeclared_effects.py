@@ -40,6 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     planned_count = len(tasks)
     if args.kept:
         tasks = [t for t in tasks if kept.get(t) is not None]
+    if args.most is not None:
+        left = [t for t in tasks if kept.get(t) is None][args.most :]
+        tasks = [t for t in tasks if t not in left]
     print(f"seed {seed} (drawn at run time unless given); {len(tasks)} trials, {args.jobs} at a time", flush=True)
     threads = args.threads if args.threads is not None else (0 if args.jobs == 1 else 1)
     began = time.monotonic()
@@ -75,6 +78,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--threads", type=int, help="of a trial; default 1, all cores with --jobs 1")
     add("--out", type=Path, metavar="DIR", help="keeps finished trials: a killed run goes on, a longer one adds")
     add("--begin", type=Path, metavar="FILE", help="take over seed and trials that an earlier run's --json wrote")
+    add("--most", type=int, metavar="N", help="of trials that are not finished only the first N of the plan")
     add("--kept", action="store_true", help="no new trials: figures of those that --out holds")
     add("--json", type=Path, metavar="FILE", help="figures {name, value, unit, baseline, goal, holds, seeds, ...}")
     return parser.parse_args(argv)
