@@ -240,6 +240,9 @@ def _fold(
     return outcome
 
 
+_TOLD = ("generic", "nearest", "dropped", "doubted", "misshapen")  # of `Found`, kept as it is
+
+
 def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     """Calibrate, then search; a stage after calibration and after every round. A resumed run goes on from the last."""
     bench, plant = run.bench, run.bench.plant
@@ -261,7 +264,7 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     assert state is not None  # every effect that was found is one of the pool's
     under = metric(work, sigma, np.array(kept["slack"], float))
     extended = stand(work, under, state.plant, state.x)
-    names = {name: kept[name] for name in ("generic", "nearest", "dropped", "doubted")}
+    names = {name: kept[name] for name in _TOLD}
     found = Found(calibrated, extended, np.array(kept["slack"], float), list(state.rounds), **names)
     found.rest = search.rest(found)
     return found
@@ -291,7 +294,7 @@ def _hunt(run: _Run, search: Search, calibrated: Fit, pool: list[Effect]) -> Fou
 
 def _keep_found(stages: Stages, found: Found) -> None:
     state = State(found.extended.plant, found.extended.x, tuple(found.rounds))
-    names = {"generic": found.generic, "nearest": found.nearest, "dropped": found.dropped, "doubted": found.doubted}
+    names = {name: getattr(found, name) for name in _TOLD}
     stages.put("found", pack_state(state) | {"slack": found.slack.tolist()} | names)
 
 

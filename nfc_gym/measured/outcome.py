@@ -64,7 +64,7 @@ def report(
     rows = say.effect_rows(extended, found.rounds, sd, shares)
     errors = say.errors(v)
     laws = {e.id for e in extended.plant.effects if e.generic}
-    judged = _judge(v, rows, laws, found.generic is not None, found.doubted, errors)
+    judged = _judge(v, rows, laws, found, errors)
     left = judged.verdict in ("unexplained", "partly explained")
     assert found.rest is not None
     parameters = say.parameter_rows(extended, nominal[1], sd)
@@ -126,18 +126,22 @@ def _judge(
     v: say.Verified,
     rows: Sequence[dict[str, Any]],
     laws: Container[str],
-    generic: bool,
-    doubted: dict[str, list[str]],
+    found: Found,
     errors: dict[str, Any],
 ) -> _Judged:
-    """Divide what was found into causes and proposals; `laws` are the ids of those without a name (see `doubt`)."""
+    """Divide what was found into causes and proposals; `laws` are the ids of those without a name.
+
+    See `doubt` for what leads its rivals by too little, `form` for what has another's form.
+    """
     named, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
-    verdict, taken = say.verdict(v, len(named), generic or bool(proposed)), say.taken_away(v, errors)
+    generic = found.generic is not None or bool(proposed)
+    verdict, taken = say.verdict(v, len(named), generic), say.taken_away(v, errors)
     if verdict != "partly explained":
         return _Judged(verdict, named, [], proposed, taken)
     # What is weak predicts, and stays in the model; that it is the cause of what is missing is not shown.
-    every = [r | {"nearest": True, "alike": doubted.get(r["id"], [])} for r in named]
-    weak = every if taken < say.CAUSE else [r for r in every if r["alike"]]
+    every = [r | {"nearest": True, "alike": found.doubted.get(r["id"], [])} for r in named]
+    every = [r | ({"mended_by": by} if (by := found.misshapen.get(r["id"])) else {}) for r in every]
+    weak = every if taken < say.CAUSE else [r for r in every if r["alike"] or "mended_by" in r]
     causes = [r for r in named if r["id"] not in {w["id"] for w in weak}]
     # Beside guesses, what is no guess must itself bring the half: a small law that had no rival is not the cause.
     if weak and sum(r["share_of_excess"] for r in causes) < say.CAUSE:

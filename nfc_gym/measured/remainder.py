@@ -4,7 +4,7 @@ A law that is believed goes into the extended model as a proposal: it predicts, 
 explains clearly more than all named effects together, none of them is claimed.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 from nfc_gym.measured.arena import Arena
@@ -13,6 +13,7 @@ from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.laws import Scanned, scan
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.screen import Screen
+from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.law import Law
 
 SILENT = 0.04  # nats a number beyond the noise, below which nothing is left to explain (chi-squared about 1.08)
@@ -61,19 +62,28 @@ class LawSearch:
         self.scanned: Scanned | None = None
         self.rounds: list[Round] = []
 
-    def run(self, arena: Arena, calibrated: Fit) -> Remainder:
-        """Add laws to an arena's model while they are believed; first ask whether one alone outdoes what it has."""
+    def run(self, arena: Arena, calibrated: Fit, refuted: Collection[str] = (), sure: bool = False) -> Remainder:
+        """Add laws to an arena's model while they are believed; first ask whether one alone outdoes what it has.
+
+        Args:
+          arena: whose model the laws are added to.
+          calibrated: psi alone, fitted.
+          refuted: ids of its effects whose form is not that of what is at work there (see `form`).
+          sure: whether something is known to be left, however little it is beside all that is measured.
+        """
         out = Remainder(arena.current)
-        if arena.leftover < SILENT or not self.laws:
+        if not self.laws or (arena.leftover < SILENT and not sure):
             return out
-        if arena.current.plant.effects and (rival := self._alone(arena, calibrated)) is not None:
-            arena.say("a law alone explains clearly more than all named effects: none is claimed")
-            out.dropped = [e.id for e in arena.current.plant.effects]
+        effects = [e for e in arena.current.plant.effects if not refuted or e.id in refuted]
+        if effects and (rival := self._instead(arena, calibrated, effects if refuted else [])) is not None:
+            out.dropped = [e.id for e in effects]
+            arena.say(f"a law explains more than {', '.join(out.dropped)}, which is not claimed")
             out.scanned = self.scanned
             arena = self.settle(rival.fitted)
         for _ in range(_MOST):
             laws = [e for e in arena.current.plant.effects if isinstance(e, Law)]
-            if len(laws) >= _MOST or arena.leftover < (_FURTHER if laws else SILENT):
+            little = arena.leftover < (_FURTHER if laws else SILENT)
+            if len(laws) >= _MOST or (little and (laws or not sure)):
                 break
             best = self._best(arena)
             out.scanned = out.scanned or self.scanned
@@ -103,11 +113,18 @@ class LawSearch:
         self.rounds.append(outcome)
         return best
 
-    def _alone(self, arena: Arena, calibrated: Fit) -> Judged | None:
-        """A law that by itself explains clearly more than all named effects together."""
-        bare = arena.facing(fit(arena.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6))
+    def _instead(self, arena: Arena, calibrated: Fit, refuted: Sequence[Effect]) -> Judged | None:
+        """A law that does better in place of effects whose form is refuted, or clearly better than all effects."""
+        bare = arena
+        for effect in refuted:
+            bare = bare.without(effect)
+        if not refuted:
+            bare = arena.facing(fit(arena.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6))
         rival = self._best(bare)
         if rival is None:
             return None
-        named = bare.judge(arena.current)
-        return rival if rival.total > CLEARLY * named.total and not bare.ties(rival, named) else None
+        named, least = bare.judge(arena.current), CLEARLY
+        if refuted:  # the common metric takes what the effects leave for noise, in which the two are equals
+            bare = bare.sharper(rival.fitted)
+            (rival, named), least = map(bare.enter_again, (rival, named)), 1.0
+        return rival if rival.total > least * named.total and not bare.ties(rival, named) else None

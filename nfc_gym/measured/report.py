@@ -167,6 +167,7 @@ def _effect(effect: Row, effects: Sequence[Row]) -> Row:
         "sentence": effect.get("sentence") or story.what(effect),
         "nearest": bool(effect.get("nearest")),
         "alike": effect.get("alike") or [],
+        "mended_by": wording.smooth(effect["mended_by"]) if "mended_by" in effect else "",
         "share": share,
         "meter": charts.meter(share, 1.0, "extended"),
         "equivalents": story.rivals_of(effect, effects),

@@ -14,6 +14,7 @@ from nfc_gym.measured.arena import Arena, alternatives
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.doubt import doubted
 from nfc_gym.measured.fit import Fit, differs, fit
+from nfc_gym.measured.form import misshapen
 from nfc_gym.measured.halved import artefacts
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.merging import merged
@@ -88,6 +89,7 @@ class Found:
       nearest: id of the candidate that led the last round's screening, whatever it gained; None where there was none.
       dropped: named effects that a generic alternative alone outdid.
       doubted: accepted effects that lead rivals by less than they leave over, with these (see `doubt`).
+      misshapen: accepted effects whose law is not the one at work there, with what says so (see `form`).
       rest: what the named effects left, and the laws that are proposed for it; None until it was looked for.
     """
 
@@ -99,6 +101,7 @@ class Found:
     nearest: str | None
     dropped: list[str] = field(default_factory=list)
     doubted: dict[str, list[str]] = field(default_factory=dict)
+    misshapen: dict[str, str] = field(default_factory=dict)
     rest: Remainder | None = None
 
 
@@ -161,7 +164,10 @@ class Search:
         if confirmed is not arena:
             arena, screen = confirmed, Screen(self.fit_data.problem, confirmed.under, confirmed.current)
         dropped: list[str] = []
+        odd = misshapen(arena, self.generics, self.options.worth)
+        mended = max(odd.values(), key=lambda j: j.total, default=None)
         generic = self._generic(arena, screen, outcome) if arena.leftover > SILENT else None
+        generic = mended if generic is None else generic
         label = None if generic is None else arena.label(generic)
         if generic is not None and arena.current.plant.effects and self._outdone(arena, generic, calibrated):
             self.say("a generic law explains clearly more than all named effects: none is claimed")
@@ -170,7 +176,8 @@ class Search:
             arena = self.settle(bare.plant, bare.x, polished=True)
         nearest = screened[0].effect.id if screened else None
         doubts = doubted(arena, rounds, self.named) if arena.leftover > SILENT else {}
-        return Found(calibrated, arena.current, arena.extra, rounds, label, nearest, dropped, doubts)
+        shapes = {i: arena.label(j) for i, j in odd.items() if i not in dropped}
+        return Found(calibrated, arena.current, arena.extra, rounds, label, nearest, dropped, doubts, shapes)
 
     def _contest(self, arena: Arena, screen: Screen, begins: bool) -> tuple[list[Screened], Round, Judged | None]:
         """The contest of one round: its screening, what is reported of it, and what it accepted.
@@ -201,7 +208,7 @@ class Search:
         under = metric(data.problem, data.sigma, found.slack)
         arena = Arena(data, self.select, found.extended, under, found.slack, self.rng, self.say)
         laws = LawSearch(self.laws, self.options.worth, lambda f: self.settle(f.plant, f.x), self._prune)
-        out = laws.run(arena, found.calibrated)
+        out = laws.run(arena, found.calibrated, found.misshapen, sure=found.generic is not None)
         out.dropped = out.dropped or found.dropped
         return out
 

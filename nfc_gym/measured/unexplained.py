@@ -5,6 +5,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from nfc_gym.measured import wording
 from nfc_gym.measured.laws import Proposal
 from nfc_gym.measured.search import Found
 from nfc_gym.measured.verdict import Verified
@@ -36,7 +37,13 @@ def unexplained(
     if weak:
         near += " together with that" if laws else ""
         alike = list(dict.fromkeys(i for r in weak for i in r["alike"]))
-        near += f", but {', '.join(alike)} would explain nearly as much" if alike else ", too little to be the cause"
+        mended = list(dict.fromkeys(r["mended_by"] for r in weak if "mended_by" in r))
+        if mended:
+            near += f", but {' and '.join(map(wording.smooth, mended))} mends much of what that leaves"
+        elif alike:
+            near += f", but {', '.join(alike)} would explain nearly as much"
+        else:
+            near += ", too little to be the cause"
     assert found.rest is not None
     scanned = found.rest.scanned
     reason = found.rounds[-1].reason or "no effect of the library explains it"

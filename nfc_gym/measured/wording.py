@@ -103,3 +103,17 @@ def listed(names: Sequence[Any], most: int = 6) -> str:
 def counted(n: int, one: str, many: str | None = None) -> str:
     """`1 log`, `3 logs`."""
     return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+_BY = {
+    "generic_position": "position",
+    "generic_velocity": "speed",
+    "generic_time": "time",
+    "generic_memory": "its past",
+}
+
+
+def smooth(generic: str) -> str:
+    """A generic law's id in words."""
+    family, _, joint = generic.partition(":")
+    return f"a smooth force by {_BY[family.removeprefix('generic_')]} at {joint}"

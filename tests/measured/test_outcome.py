@@ -11,12 +11,19 @@ from nfc_gym.measured.outcome import _judge
 ROWS: list[dict[str, Any]] = [{"id": "wind:base", "share_of_excess": 0.1}, {"id": "law_power:base"}]
 
 
-def judged(chi2: float, after: float, rows: list[dict[str, Any]] = ROWS[:1], **doubted: list[str]) -> Any:
+def judged(
+    chi2: float,
+    after: float,
+    rows: list[dict[str, Any]] = ROWS[:1],
+    misshapen: dict[str, str] | None = None,
+    **doubted: list[str],
+) -> Any:
     """Of models that leave `after` beyond a noise of 1, where calibration leaves 5, with this chi-squared."""
     row = {"calibrated": [5.0], "extended": [after], "noise_floor": [1.0]}
     v: Any = SimpleNamespace(null=np.ones(6), chi2=lambda stage: chi2)
     doubts = {f"{family}:base": ids for family, ids in doubted.items()}
-    return _judge(v, rows, {"law_power:base"}, False, doubts, {"groups": {"angle": row}})
+    found: Any = SimpleNamespace(generic=None, doubted=doubts, misshapen=misshapen or {})
+    return _judge(v, rows, {"law_power:base"}, found, {"groups": {"angle": row}})
 
 
 @pytest.mark.parametrize(("after", "claimed"), [(np.sqrt(12.5), True), (np.sqrt(13.5), False)])
@@ -54,6 +61,16 @@ def test_what_is_small_beside_guesses_is_no_cause() -> None:
     ]
     both = [small, *ROWS[:1]]
     assert judged(3.0, 1.5, both).claimed == both, "without guesses it may be one of several"
+
+
+def test_a_law_of_another_form_is_no_cause() -> None:
+    of = {"spring_offset:knee": "generic_memory:knee"}
+    spring, friction = ({"id": i, "share_of_excess": 0.6} for i in (*of, "coulomb:hip"))
+    out = judged(3.0, 1.5, [spring, friction], of)
+    assert (out.verdict, out.claimed) == ("partly explained", [friction])
+    assert out.weak == [spring | {"nearest": True, "alike": [], "mended_by": "generic_memory:knee"}]
+    assert judged(3.0, 1.5, [spring], of).verdict == "unexplained"
+    assert judged(1.0, 1.0, [spring], of).claimed == [spring], "nothing remains that a form could be told by"
 
 
 def test_a_law_in_words_is_a_proposal_either_way() -> None:

@@ -14,8 +14,12 @@ from hidden_laws import WHEEL, Machine, record, swing
 from rich.console import Console
 
 from nfc_gym.measured import rounds
+from nfc_gym.measured.bench import candidates, make_bench
+from nfc_gym.measured.dataset import load
 from nfc_gym.measured.loop import close_loop
+from nfc_gym.measured.owned import Data
 from nfc_gym.measured.rounds import Contest
+from nfc_gym.measured.search import Found, Options, Search
 from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.measured.verdict import verdict
 from nfc_gym.physics.effects.saved import from_row
@@ -51,6 +55,16 @@ class Closed:
     size: float
 
 
+def write_case(folder: Path, machine: Machine, family: str) -> None:
+    """Logs of a wheel, with the mapping and the model beside them; effects of one family are looked among."""
+    for seed, name in enumerate(("fit_0", "fit_1", "fit_2", "select", "verify")):
+        log = record(machine, 71 + seed, 2.5)
+        joint = {k: log.channels[f"joint:wheel:{n}"].values for k, n in (("q", "pos"), ("v", "vel"))}
+        np.savez(folder / f"{name}.npz", t=log.time, u=log.controls["ctrl:motor"], **joint)
+    (folder / "wheel.xml").write_text(WHEEL.format(known=machine.given))
+    (folder / "mapping.yaml").write_text(MAPPING.replace("coulomb", family))
+
+
 @pytest.fixture(scope="module")
 def closed(tmp_path_factory: pytest.TempPathFactory) -> Closed:
     folder, rng = tmp_path_factory.mktemp("cogging"), np.random.default_rng(71)
@@ -59,13 +73,7 @@ def closed(tmp_path_factory: pytest.TempPathFactory) -> Closed:
     def push(model, data) -> None:
         data.qfrc_applied[0] = size * np.cos(order * data.qpos[0] - 1)
 
-    machine = Machine(WHEEL, 0.01, 0.012, swing(0.1), push)
-    for seed, name in enumerate(("fit_0", "fit_1", "fit_2", "select", "verify")):
-        log = record(machine, 71 + seed, 2.5)
-        joint = {k: log.channels[f"joint:wheel:{n}"].values for k, n in (("q", "pos"), ("v", "vel"))}
-        np.savez(folder / f"{name}.npz", t=log.time, u=log.controls["ctrl:motor"], **joint)
-    (folder / "wheel.xml").write_text(WHEEL.format(known=0.01))
-    (folder / "mapping.yaml").write_text(MAPPING)
+    write_case(folder, Machine(WHEEL, 0.01, 0.012, swing(0.1), push), "coulomb")
     told = io.StringIO()
     report = close_loop(folder / "mapping.yaml", folder / "out", jobs=1, console=Console(file=told, width=500))
     return Closed(folder / "out", report, told.getvalue(), order, size)
@@ -125,6 +133,33 @@ def test_even_without_a_law_the_worst_place_is_named() -> None:
     assert left["coordinate"] == "joint:b (joint speed)"
     assert left["description"].startswith("largest share of the remaining misfit: 90%; too small; the nearest named")
     assert (left["nearest"], left["nearest_share"]) == ("lag:m", 0.12)
+
+
+def test_a_law_takes_the_place_of_an_effect_whose_form_is_refuted(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    order, size = rng.uniform(3, 5), rng.uniform(0.04, 0.06)
+
+    def push(model, data) -> None:
+        data.qfrc_applied[0] = -size * np.sin(order * data.qpos[0] + 0.3)
+
+    little = lambda t, d, p: [0.03 * (np.sin(2.1 * t + p[0]) + 0.6 * np.sin(5.3 * t + p[1]))]  # noqa: E731
+    write_case(tmp_path, Machine(WHEEL, 0.01, 0.012, little, push), "spring_offset")
+    bench = make_bench(load(tmp_path / "mapping.yaml"), nthread=1)
+    data = []
+    for split in ("fit", "select"):
+        problem = bench.problem(bench.dataset.of(split))
+        data.append(Data(problem, problem.covariance(bench.plant, bench.plant.null)))
+    search = Search(data[0], data[1], candidates(bench, bench.dataset.of("fit")), Options(), lambda text: None)
+    (spring,) = search.named
+    plant = bench.plant.with_effects([spring])
+    calibrated, arena = search.settle(bench.plant, bench.plant.null).current, search.settle(plant, plant.null)
+    by = "generic_position:wheel"
+    refuted = Found(calibrated, arena.current, arena.extra, [], by, None, misshapen={spring.id: by})
+    rest = search.rest(refuted)
+    assert rest.dropped == [spring.id]
+    assert [law.id for law in rest.laws] == ["law_harmonic:wheel"] == [e.id for e in rest.fitted.plant.effects]
+    cosine, sine, found = rest.fitted.x[-3:]
+    assert (np.hypot(cosine, sine), found) == (pytest.approx(size, rel=0.05), pytest.approx(order, abs=0.1))
 
 
 class _Alike:
