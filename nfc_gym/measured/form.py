@@ -19,8 +19,7 @@ from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.names import names
 
 _TRIED = 2  # smooth functions that are fitted beside a claim: straight lines do not rank them surely
-_MENDS = 0.05  # of the loss that a claim takes away: what a smooth function beside it brings where its form is another's
-
+_MENDS = 0.05  # of the loss that a claim takes away: what such a function brings where the claim's form is another's
 _NEEDED = 0.5  # of it: what a claim whose form is right still brings beside that function
 
 
