@@ -216,6 +216,7 @@ def _fold(
     known = _identify(run, final[1], [*fitting, *selecting], [work, select], pool)
     outcome = report(bench, fold, found, final, step, bench.problem(verifying), whole, seed, tell)
     outcome["posterior"] = compared(bench, stages.get("calibrated"), extended, whole, outcome["parameters"])
+    tell(f"what these logs could have shown of {len(close)} candidates")
     began_table = time.monotonic()
     outcome["identifiability"] = table(known.lens, close, known.stakes)
     tabled = time.monotonic() - began_table
@@ -349,7 +350,6 @@ def _identify(
     run: _Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem], pool: Sequence[Effect]
 ) -> Present:
     """The logs that the search worked with, seen from the fitted model, and what it charged."""
-    run.say("what these logs could have shown")
     bench, plant = run.bench, fitted.plant
     # An instant problem evaluates whole logs: some of them must do.
     some = logs if bench.mode == "rollout" else logs[:: -(-len(logs) // _SOME_LOGS)]
