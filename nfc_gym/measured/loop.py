@@ -265,7 +265,7 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     assert state is not None  # every effect that was found is one of the pool's
     under = metric(work, sigma, np.array(kept["slack"], float))
     extended = stand(work, under, state.plant, state.x)
-    names = {name: kept[name] for name in _TOLD}
+    names = {name: kept[name] for name in _TOLD if name in kept}
     found = Found(calibrated, extended, np.array(kept["slack"], float), list(state.rounds), **names)
     found.rest = search.rest(found)
     return found
