@@ -81,7 +81,10 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--most", type=int, metavar="N", help="of trials that are not finished only the first N of the plan")
     add("--kept", action="store_true", help="no new trials: figures of those that --out holds")
     add("--json", type=Path, metavar="FILE", help="figures {name, value, unit, baseline, goal, holds, seeds, ...}")
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if args.most is not None and args.most < 0:
+        parser.error(f"--most {args.most}: it must be 0 or more trials")
+    return args
 
 
 def master_seed(args: argparse.Namespace) -> int:

@@ -1,7 +1,8 @@
 """What is left when no named effect gains any more: a law in words, which the same contest must believe.
 
 A law that is believed goes into the extended model as a proposal: it predicts, and claims no cause. If a law alone
-explains clearly more than all named effects together, none of them is claimed.
+explains clearly more than all named effects together, none of them is claimed. An effect whose form is refuted (`form`)
+gives way to any law that does better in its place.
 """
 
 from collections.abc import Callable, Collection, Sequence

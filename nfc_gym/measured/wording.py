@@ -116,4 +116,4 @@ _BY = {
 def smooth(generic: str) -> str:
     """A generic law's id in words."""
     family, _, joint = generic.partition(":")
-    return f"a smooth force by {_BY[family.removeprefix('generic_')]} at {joint}"
+    return f"a smooth force by {_BY[family]} at {joint}"

@@ -17,7 +17,7 @@ MODEL = """<mujoco><worldbody><body><joint name="knee"/><geom size="0.1"/></body
 RANKED = {"id": "coulomb:knee", "generic": False, "share": 0.3}
 
 
-def said(generic: str | None, weak: tuple[str, ...] = (), alike: tuple[str, ...] = ()) -> dict[str, Any]:
+def said(generic: str | None, weak: tuple[str, ...] = (), alike: tuple[str, ...] = (), **more: str) -> dict[str, Any]:
     model = mujoco.MjModel.from_xml_string(MODEL)
     plant = Plant(model, ParameterSpace(model, []), nthread=1)
     rest = Remainder(fitted=None)  # type: ignore[arg-type]
@@ -25,7 +25,7 @@ def said(generic: str | None, weak: tuple[str, ...] = (), alike: tuple[str, ...]
     columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
     v: Any = SimpleNamespace(problem=problem, white={"extended": np.array([[1.0, 3.0]])})
-    return unexplained(v, found, plant, [], [{"id": i, "alike": list(alike)} for i in weak], 0.06)
+    return unexplained(v, found, plant, [], [{"id": i, "alike": list(alike)} | more for i in weak], 0.06)
 
 
 def test_memory_in_a_joint_is_said_as_such() -> None:
@@ -44,3 +44,8 @@ def test_what_takes_away_too_little_is_named_as_the_nearest_and_no_cause() -> No
     )
     guesses = said(None, ("wind:base",), ("gain:rotor", "payload:base"))["description"]
     assert guesses.endswith("explains 6%, but gain:rotor, payload:base would explain nearly as much")
+
+
+def test_what_mends_a_claim_of_another_form_is_said() -> None:
+    text = said(None, ("spring_offset:knee",), mended_by="generic_position:knee")["description"]
+    assert "but a smooth force by position at knee mends much of what that leaves" in text

@@ -3,10 +3,14 @@
 import math
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 from nfc_gym.measured import wording
+from nfc_gym.physics.effects import propose
+from nfc_gym.physics.effects.base import Scales
+from nfc_gym.physics.effects.law import Law
 
 
 @pytest.mark.parametrize(
@@ -35,3 +39,13 @@ def test_units_of_one_are_not_written() -> None:
     assert wording.quantity(0.4, "1") == "0.400"
     assert wording.quantity(0.4, "m/s") == "0.400\N{NO-BREAK SPACE}m/s"
     assert wording.quantity(None, "m") == "–"
+
+
+def test_every_smooth_law_of_one_variable_has_words() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="knee"/><geom size="0.1"/></body></worldbody></mujoco>'
+    )
+    scales = Scales(*(np.ones(1) for _ in range(4)), 0.01)
+    smooth = [e.id for e in propose(model, scales) if e.generic and not isinstance(e, Law)]
+    assert len({wording.smooth(i) for i in smooth}) == len(smooth) > 0
+    assert wording.smooth("generic_memory:knee") == "a smooth force by its past at knee"
