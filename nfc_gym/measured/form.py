@@ -2,7 +2,7 @@
 
 A law that stands in for another one at the same joint takes most of it away and leaves there what differs: a motor that
 cogs and turns little is nearly a spring, and so is a hysteresis within its travel. A smooth function of the joint's
-position, speed, time or past then brings a good part of what the claim brought, and beside it the claim is hardly needed.
+position, speed, time or past then brings a good part of what the claim brought, and beside it the claim is not needed.
 Beside a law that is at work it brings next to nothing, however far the rest of the model is from the machine.
 """
 
