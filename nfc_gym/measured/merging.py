@@ -35,8 +35,7 @@ def merged(arena: Arena, pool: Sequence[Effect], worth: float) -> tuple[tuple[Ef
         screen = Screen(arena.fit_data.problem, without.under, without.current)
         best = max((screen.try_one(e) for e in rivals), key=lambda s: s.gain)
         rival = without.enter([best])
-        believed = without.worth(rival, worth) and without.plausible(rival) and without.told_apart(rival)
-        if believed and rival.total > without.judge(arena.current).total:
+        if without.believed(rival, worth) and rival.total > without.judge(arena.current).total:
             return two, rival
     return None
 

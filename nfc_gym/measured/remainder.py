@@ -103,7 +103,7 @@ class LawSearch:
         self.scanned = scan(problem, arena.under, current, self.laws, arena.rng)
         screen = Screen(problem, arena.under, current)
         entered = [arena.enter([screen.try_one(p.law)]) for p in self.scanned.proposals[:_ENTERED]]
-        believed = [j for j in entered if arena.worth(j, self.worth) and arena.plausible(j) and arena.told_apart(j)]
+        believed = [j for j in entered if arena.believed(j, self.worth)]
         best = max(believed, key=lambda j: j.total, default=None)
         outcome = Round([], 0.0, [arena.row(j) for j in sorted(entered, key=lambda j: -j.total)])
         if best is not None:

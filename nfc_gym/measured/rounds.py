@@ -86,7 +86,8 @@ class Contest:
         outcome.ranking = [arena.row(j) for j in pairs] + outcome.ranking
         believed = self._together(pairs, believed, judged) or believed
         if not believed:
-            outcome.reason = f"the best candidate, {arena.label(judged[0])}, gains no more on unseen logs than chance"
+            objection = arena.objection(judged[0], self.worth)
+            outcome.reason = f"the best candidate, {arena.label(judged[0])}, {objection}"
             return outcome, None
         best, judged, believed = self._challenged(outcome, judged, believed)
         beaten = [arena.judge(j.fitted) for j in beaten if j.total > far]
@@ -308,8 +309,7 @@ class Contest:
         return [j for j in found if j is not None]
 
     def _believed(self, j: Judged) -> bool:
-        arena = self.arena
-        return arena.worth(j, self.worth) and arena.plausible(j) and arena.told_apart(j)
+        return self.arena.believed(j, self.worth)
 
     def _pairs(self, judged: Sequence[Judged], entered: Sequence[Judged]) -> list[Judged]:
         """Two laws at once: one may show only when the other is there.

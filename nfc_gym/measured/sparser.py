@@ -42,8 +42,7 @@ def sparser(arena: Arena, pool: Sequence[Effect], worth: float) -> tuple[Each, J
         common = np.median(np.delete(values, odd, 0), axis=0)
         start = [common, np.clip(single.null + values[odd] - common, single.low, single.high)]
         rival = without.enter_at([shared, single], start)
-        believed = without.worth(rival, worth) and without.plausible(rival) and without.told_apart(rival)
-        if believed and rival.total > without.judge(arena.current).total:
+        if without.believed(rival, worth) and rival.total > without.judge(arena.current).total:
             return effect, rival
     return None
 

@@ -67,7 +67,7 @@ def swapped(
         screen = Screen(without.fit_data.problem, without.under, without.current)
         for pick in _picked(lookout, screen, effect, others, asked is None):
             rival = without.enter([pick])
-            if not (without.worth(rival, worth) and without.plausible(rival) and without.told_apart(rival)):
+            if not without.believed(rival, worth):
                 continue
             if rival.total > kept.total and not without.ties(rival, kept):
                 say(f"{pick.effect.id} in place of {effect.id}: together they explain more")

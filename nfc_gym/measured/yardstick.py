@@ -158,13 +158,36 @@ class Yardstick:
 
     # ---- verdicts ---------------------------------------------------------------------------------------------------
 
-    def worth(self, j: Judged, share: float) -> bool:
-        """Whether a gain holds on unseen logs and is a share of the misfit worth naming.
+    def sure(self, j: Judged) -> bool:
+        """Whether a gain holds on unseen logs.
 
         The selection logs may show nothing of it (a limit that they never reach), but must not speak against it by
         more than the noise of one number.
         """
-        return j.lower > 0 and j.gain > -dispersion(self.current) and j.total > share * self.misfit
+        return j.lower > 0 and j.gain > -dispersion(self.current)
+
+    def worth(self, j: Judged, share: float) -> bool:
+        """Whether a gain holds on unseen logs and is a share of the misfit worth naming."""
+        return self.sure(j) and j.total > share * self.misfit
+
+    def objection(self, j: Judged, share: float) -> str:
+        """Why a candidate is not believed, in words; empty where nothing speaks against it.
+
+        Args:
+          j: the candidate.
+          share: of the misfit that an effect must explain to be named.
+        """
+        if not self.sure(j):
+            return "gains no more on unseen logs than chance"
+        if not self.worth(j, share):
+            return f"gains less than its numbers cost and {100 * share:.2g} % of what is left"
+        if not self.plausible(j):
+            return "ends at the edge of what is plausible"
+        return "" if self.told_apart(j) else "does what the other parameters could do together"
+
+    def believed(self, j: Judged, share: float) -> bool:
+        """Whether nothing speaks against a candidate, see `objection`."""
+        return not self.objection(j, share)
 
     @property
     def misfit(self) -> float:
@@ -220,7 +243,14 @@ class Yardstick:
         )
 
     def told_apart(self, j: Judged) -> bool:
-        """Whether any of a candidate's parameters moves the motion in a way that the others could not imitate."""
+        """Whether any of a candidate's parameters moves the motion in a way that the others could not imitate.
+
+        Asked where bodies touch: fits end in one of many hollows there, and a candidate may gain by leading to another.
+        Elsewhere what others could imitate they have done in the model to beat, and a gain is the candidate's own: a
+        friction that bends with speed hardly differs from a straight one in its slopes, and by much in what it leaves.
+        """
+        if not self.fit_data.problem.rough:
+            return True
         new = {id(e) for e in self.new(j)}
         plant = j.fitted.plant
         of = np.concatenate(

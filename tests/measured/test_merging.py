@@ -37,8 +37,7 @@ def asked(
         return SimpleNamespace(
             current=SimpleNamespace(plant=plant), under=None, fit_data=SimpleNamespace(problem=None),
             without=lambda gone: arena([e for e in effects if e is not gone]), enter=enter,
-            judge=lambda fitted: SimpleNamespace(total=100.0), worth=lambda j, share: believed,
-            plausible=lambda j: True, told_apart=lambda j: True,
+            judge=lambda fitted: SimpleNamespace(total=100.0), believed=lambda j, share: believed,
         )  # fmt: skip
 
     monkeypatch.setattr(merging, "Screen", Screen)

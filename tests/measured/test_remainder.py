@@ -170,7 +170,7 @@ class _Alike:
     current = SimpleNamespace(plant=SimpleNamespace(effects=()), x=np.zeros(0))
 
     def __getattr__(self, name: str) -> Any:
-        return {"worth": True, "plausible": True, "told_apart": True, "ties": True, "unexplained": 0.0}.get(name)
+        return {"believed": True, "ties": True, "unexplained": 0.0}.get(name)
 
     def enter(self, picks: list) -> Any:
         plant = SimpleNamespace(effects=(picks[0].effect,))
@@ -188,7 +188,7 @@ class _Alike:
 def test_more_than_three_families_that_do_alike_are_no_claim(families: tuple, claimed: bool, monkeypatch) -> None:
     """Pretend arena, real contest: only the number of families that tie differs."""
     arena: Any = _Alike()
-    for name in ("worth", "plausible", "told_apart", "ties"):
+    for name in ("believed", "plausible", "ties"):
         setattr(arena, name, lambda *a, **k: True)
     arena.nearer = lambda one, other: False
     arena.unexplained, arena.say, arena.likelier = (lambda f: 0.0), (lambda t: None), (lambda j: True)

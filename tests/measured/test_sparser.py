@@ -22,9 +22,7 @@ def asked(places: str, values: list[float], total: float, pool: list[str]) -> tu
         return SimpleNamespace(total=total)
 
     yes = lambda *_: True  # noqa: E731
-    without = SimpleNamespace(
-        enter_at=enter, judge=lambda fitted: SimpleNamespace(total=100.0), worth=yes, plausible=yes, told_apart=yes
-    )
+    without = SimpleNamespace(enter_at=enter, judge=lambda fitted: SimpleNamespace(total=100.0), believed=yes)
     plant = SimpleNamespace(effects=[law], split=lambda x: (np.zeros(0), [x]))
     arena: Any = SimpleNamespace(
         current=SimpleNamespace(plant=plant, x=np.array(values)), without=lambda effect: without

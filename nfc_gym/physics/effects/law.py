@@ -164,11 +164,6 @@ def pushed(model: mujoco.MjModel, scales: Scales) -> list[tuple[str, int, int | 
     ]
 
 
-def spread(value: float, sd: float | None) -> str:
-    """` ± 0.02`, or nothing where the spread is not known."""
-    return "" if sd is None or not np.isfinite(sd) else f" ± {1.96 * sd:.2g}"
-
-
 class OfVariable(Law):
     """A law of the coordinate that the last name in `where` says."""
 

@@ -1,0 +1,23 @@
+"""Numbers as a reader wants them: to the digits that are known."""
+
+import math
+
+_SMALL, _LARGE, _PLACES = 1e-4, 1e6, 6  # between which numbers are written without a power of ten; decimals at most
+
+
+def measured(value: float, sd: float | None = None) -> str:
+    """`20.31 ± 0.34`: a value and the half width of its 95 % interval, to two digits of that; a bare value to three.
+
+    Args:
+      value: in any unit.
+      sd: its standard deviation; None, NaN or infinite where it is not known.
+    """
+    if sd is None or not math.isfinite(sd) or sd <= 0:
+        return f"{value:.3g}"
+    mantissa, _, power = f"{1.96 * sd:.1e}".partition("e")
+    half = float(f"{mantissa}e{power}")
+    places = -int(power) + (not mantissa.endswith(".0"))
+    if not _SMALL <= max(abs(value), half) < _LARGE or places > _PLACES:
+        return f"{value:.3g} ± {half:.2g}"
+    decimals = max(places, 0)
+    return f"{round(value, places) + 0.0:.{decimals}f} ± {half:.{decimals}f}"
