@@ -103,14 +103,15 @@ class LawSearch:
         self.scanned = scan(problem, arena.under, current, self.laws, arena.rng)
         screen = Screen(problem, arena.under, current)
         entered = [arena.enter([screen.try_one(p.law)]) for p in self.scanned.proposals[:_ENTERED]]
-        believed = [j for j in entered if arena.believed(j, self.worth)]
+        # A law is there to be read: one beside its likeness, of like size and against it, says nothing.
+        believed = [j for j in entered if arena.believed(j, self.worth) and arena.told_apart(j)]
         best = max(believed, key=lambda j: j.total, default=None)
         outcome = Round([], 0.0, [arena.row(j) for j in sorted(entered, key=lambda j: -j.total)])
         if best is not None:
             arena.say(f"proposed {arena.label(best)}")
             outcome.accepted, outcome.share = [arena.label(best)], best.gain / max(float(arena.base.sum()), 1e-9)
         else:
-            outcome.reason = "no law gains more on unseen logs than chance"
+            outcome.reason = "no law gains more on unseen logs than chance and does what the others could not"
         self.rounds.append(outcome)
         return best
 

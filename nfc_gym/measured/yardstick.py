@@ -173,6 +173,11 @@ class Yardstick:
     def objection(self, j: Judged, share: float) -> str:
         """Why a candidate is not believed, in words; empty where nothing speaks against it.
 
+        Whether others could imitate it is asked where bodies touch: fits end in one of many hollows there, and a
+        candidate may gain by leading to another. Elsewhere what others could do they have done in the model to beat,
+        and a gain is the candidate's own: a friction that bends with speed hardly differs from a straight one in its
+        slopes, and by much in what it leaves.
+
         Args:
           j: the candidate.
           share: of the misfit that an effect must explain to be named.
@@ -183,7 +188,9 @@ class Yardstick:
             return f"gains less than its numbers cost and {100 * share:.2g} % of what is left"
         if not self.plausible(j):
             return "ends at the edge of what is plausible"
-        return "" if self.told_apart(j) else "does what the other parameters could do together"
+        if self.fit_data.problem.rough and not self.told_apart(j):
+            return "does what the other parameters could do together"
+        return ""
 
     def believed(self, j: Judged, share: float) -> bool:
         """Whether nothing speaks against a candidate, see `objection`."""
@@ -243,14 +250,7 @@ class Yardstick:
         )
 
     def told_apart(self, j: Judged) -> bool:
-        """Whether any of a candidate's parameters moves the motion in a way that the others could not imitate.
-
-        Asked where bodies touch: fits end in one of many hollows there, and a candidate may gain by leading to another.
-        Elsewhere what others could imitate they have done in the model to beat, and a gain is the candidate's own: a
-        friction that bends with speed hardly differs from a straight one in its slopes, and by much in what it leaves.
-        """
-        if not self.fit_data.problem.rough:
-            return True
+        """Whether any of a candidate's parameters moves the motion in a way that the others could not imitate."""
         new = {id(e) for e in self.new(j)}
         plant = j.fitted.plant
         of = np.concatenate(
