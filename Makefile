@@ -18,7 +18,8 @@ $(STAMP): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or later found: install one, or say 'make $(MAKECMDGOALS) PYTHON=/path/to/python3.11'." >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || { rm -rf .venv; \
 	  echo "Could not create .venv: on Debian and Ubuntu, 'apt install python3-venv'." >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[$(EXTRAS)]"
+	@# Python compiles what is imported; compiling everything takes pip nearly as long again as installing it.
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e ".[$(EXTRAS)]"
 	@touch $@
 
 demo: setup ## run the whole loop on a simulated stand-in machine; the report lands in demo/

@@ -248,9 +248,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write the rows here")
     args = parser.parse_args()
     if args.quick:
-        args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 40, 40, 4
-        args.training, args.epochs, args.effects, args.draws, args.levels = 256, 1, 1, 4, 60
-        args.lessons = 60
+        args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 20, 20, 4
+        args.training, args.epochs, args.effects, args.draws, args.levels = 64, 1, 1, 4, 30
+        args.lessons = 30
     return args
 
 

@@ -20,7 +20,7 @@ SIZES = {
     "Quadcopter": (21, 0, 9, 4),
     "Jackal": (15, 2, 17, 2),
 }
-RESETS = 500
+RESETS = 250
 
 
 def test_ten_ids() -> None:

@@ -154,7 +154,7 @@ def test_probes_lie_within_bounds() -> None:
 
 def test_say_names_value_and_unit() -> None:
     effect = CANDIDATES["coulomb"][0]
-    assert "0.25 ± 0.02 N m" in effect.say(np.array([0.25]), np.array([0.01]))
+    assert "0.250 ± 0.020 N m" in effect.say(np.array([0.25]), np.array([0.01]))
 
 
 def test_what_only_sets_a_unit_is_said_without_an_interval() -> None:

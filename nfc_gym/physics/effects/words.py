@@ -14,9 +14,8 @@ def measured(value: float, sd: float | None = None) -> str:
     """
     if sd is None or not math.isfinite(sd) or sd <= 0:
         return f"{value:.3g}"
-    mantissa, _, power = f"{1.96 * sd:.1e}".partition("e")
-    half = float(f"{mantissa}e{power}")
-    places = -int(power) + (not mantissa.endswith(".0"))
+    half = float(f"{1.96 * sd:.1e}")
+    places = 1 - math.floor(math.log10(half))
     if not _SMALL <= max(abs(value), half) < _LARGE or places > _PLACES:
         return f"{value:.3g} ± {half:.2g}"
     decimals = max(places, 0)
