@@ -27,17 +27,17 @@ _SETTLED = 2  # fits in a row that end where others have: more of them would too
 
 
 @dataclass(frozen=True)
-class Hollows:
+class Ended:
     """Where fits of one model to the same data ended.
 
     Attributes:
       x: (size,) the likeliest.
-      open: (size,) root mean square distance of the others from it: what the search for it leaves open.
+      unsure: (size,) root mean square distance of the others from it: what the search for it leaves open.
       sigma: (S, m, m) the noise that it expects itself, where hollows were compared by theirs on all blocks.
     """
 
     x: Array
-    open: Array
+    unsure: Array
     sigma: Array | None = None
 
 
@@ -50,7 +50,7 @@ def hollows(
     others: tuple[Array, ...] = (),
     starts: int = STARTS,
     tick: Callable[[int], None] = lambda start: None,
-) -> Hollows:
+) -> Ended:
     """Fit again from starts about a fit, and keep the likeliest, each by the noise that it expects itself.
 
     It ends early where fits keep ending in hollows that others have found.
@@ -66,7 +66,7 @@ def hollows(
       tick: called with the number of each start, from 1.
     """
     if not problem.rough:
-        return Hollows(found.x, np.zeros(len(found.x)))
+        return Ended(found.x, np.zeros(len(found.x)))
     plant, limits = found.plant, box(found.plant)
     around = np.random.default_rng(seed).normal(size=(starts, len(limits.scale)))
     z = np.clip(limits.at(found.x) + _AWAY * around, limits.floor, limits.roof)
@@ -87,7 +87,7 @@ def hollows(
         if (value := float(surprises(problem, expected, extra, plant, x).sum())) < least:
             best, sigma, least = x, expected, value
     away = np.stack([x for x in ends if x is not best] or [best]) - best
-    return Hollows(best, np.sqrt((away**2).mean(0)), sigma)
+    return Ended(best, np.sqrt((away**2).mean(0)), sigma)
 
 
 def _errors_between(found: Fit, limits: Box, a: Array, b: Array) -> float:

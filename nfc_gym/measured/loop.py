@@ -310,7 +310,7 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit, Array]:
         # What psi alone went to is another place for the same psi to begin.
         psi = calibrated.fitted.x[: len(last.plant.space)]
         extended = _settled(run, "extended", last, whole, (np.concatenate([psi, last.x[len(psi) :]]),))
-    unsure = np.hypot(step_error(whole, extended.under, extended.fitted), extended.open)
+    unsure = np.hypot(step_error(whole, extended.under, extended.fitted), extended.unsure)
     return calibrated.fitted, extended.fitted, unsure
 
 
@@ -320,7 +320,7 @@ class _Settled:
 
     fitted: Fit
     under: Metric
-    open: Array
+    unsure: Array
 
 
 def _settled(
@@ -337,9 +337,9 @@ def _settled(
         else:
             tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
             ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
-        run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "open": ended.open.tolist()})
+        run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "unsure": ended.unsure.tolist()})
         sigma = ended.sigma
-    x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "open"))
+    x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "unsure"))
     if sigma is None:
         sigma = whole.covariance(plant, x if whole.rough else start.x)
     under = metric(whole, sigma, extra)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.measured.box import Box, box
 from nfc_gym.measured.contest import clusters
-from nfc_gym.measured.elsewhere import Hollows
+from nfc_gym.measured.elsewhere import Ended
 from nfc_gym.measured.fit import Fit, jacobian
 from nfc_gym.measured.metric import Metric, loss, loss_weight
 from nfc_gym.measured.problem import Problem
@@ -47,7 +47,7 @@ class _Turn:
 
 def marginal(
     problem: Problem, under: Metric, found: Fit, seed: int, tick: Callable[[int], None] = lambda turn: None
-) -> Hollows:
+) -> Ended:
     """Go on from a fit by Gauss-Newton steps over drawn starts.
 
     Args:
@@ -58,11 +58,11 @@ def marginal(
       tick: called with the number of each turn, from 1.
 
     Returns:
-      The mean of the last turns; as `open` the standard deviations by these products, with what the turns differ by.
+      The mean of the last turns; as `unsure` the standard deviations by these products, with what the turns differ by.
     """
     limits = box(found.plant)
     if not isinstance(problem, RolloutProblem) or not len(limits.scale):
-        return Hollows(found.x, np.zeros(len(found.x)))
+        return Ended(found.x, np.zeros(len(found.x)))
     z, last, places = limits.at(found.x), [], []
     for number in range(TURNS):
         tick(number + 1)
@@ -79,7 +79,7 @@ def marginal(
     x = limits.x(places.mean(0), found.x)
     variance = _covariance(last, limits, clusters(problem)) + np.cov(places, rowvar=False).reshape(len(z), len(z))
     slopes = limits.slopes(x)
-    return Hollows(x, np.sqrt(np.einsum("ni,ij,nj->n", slopes, variance, slopes)))
+    return Ended(x, np.sqrt(np.einsum("ni,ij,nj->n", slopes, variance, slopes)))
 
 
 def _looked(drawn: list[RolloutProblem], under: Metric, limits: Box, x: Array) -> _Turn:

@@ -57,7 +57,7 @@ def test_the_deeper_hollow_is_kept_and_the_other_says_what_is_open() -> None:
     under, shallow = stood(problem, 1.0)
     found = hollows(problem, under, np.zeros(2), shallow, 0, (np.array([-0.8]),))
     assert found.x == pytest.approx(-1.0, abs=0.02)
-    assert 0.5 < found.open[0] < 2.1  # the fit at hand, at least, is two away
+    assert 0.5 < found.unsure[0] < 2.1  # the fit at hand, at least, is two away
 
 
 @pytest.mark.parametrize(("loud", "end"), [(0.2, 1.0), (1.0, -1.0)])
@@ -86,7 +86,7 @@ def test_where_nothing_touches_the_fit_at_hand_is_the_answer() -> None:
     under, shallow = stood(problem, 1.0)
     found = hollows(problem, under, np.zeros(2), shallow, 0, (np.array([-0.8]),))
     assert found.x == 1.0
-    assert found.open == 0.0
+    assert found.unsure == 0.0
 
 
 def test_fits_that_end_in_one_hollow_are_not_compared_and_soon_suffice() -> None:
@@ -97,4 +97,4 @@ def test_fits_that_end_in_one_hollow_are_not_compared_and_soon_suffice() -> None
     found = hollows(problem, under, np.zeros(2), deep, 0, starts=6, tick=begun.append)
     assert begun == [1, 2]
     assert found.x == pytest.approx(-1.0, abs=0.02)
-    assert found.open < 0.02
+    assert found.unsure < 0.02

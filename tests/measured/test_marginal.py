@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nfc_gym.measured.elsewhere import Hollows
+from nfc_gym.measured.elsewhere import Ended
 from nfc_gym.measured.fit import Fit, stand, uncertainty
 from nfc_gym.measured.marginal import marginal
 from nfc_gym.measured.metric import metric
@@ -44,7 +44,7 @@ class Jumps(RolloutProblem):
         return out
 
 
-def found(noise: int, at: np.ndarray) -> tuple[Fit, Hollows]:
+def found(noise: int, at: np.ndarray) -> tuple[Fit, Ended]:
     space = SimpleNamespace(low=np.full(2, -2.0), high=np.full(2, 2.0), free=np.ones(2, bool))
     same = lambda x: x  # noqa: E731
     plant: Any = SimpleNamespace(space=space, effects=(), null=np.zeros(2), chart=same, unchart=same, size=2)
@@ -57,19 +57,19 @@ def found(noise: int, at: np.ndarray) -> tuple[Fit, Hollows]:
 @pytest.mark.parametrize("noise", range(3))
 def test_a_slope_below_the_jumps_is_found_and_its_doubt_is_honest(noise: int) -> None:
     before, after = found(noise, np.array([0.6, 0.7]))
-    assert (np.abs(after.x - TRUE) < 3 * after.open).all()
+    assert (np.abs(after.x - TRUE) < 3 * after.unsure).all()
     assert abs(after.x[1] - TRUE[1]) < 0.4
     # a slope of 0.3 in 1200 numbers of unit noise is known to a tenth, and what makes up for jumps comes on top
-    assert 0.05 < after.open[1] < 0.4
-    assert after.open[0] < 0.02
+    assert 0.05 < after.unsure[1] < 0.4
+    assert after.unsure[0] < 0.02
     plain = uncertainty(before, np.arange(BLOCKS))
-    assert plain[1] < 0.5 * after.open[1], "the squares of jumps count as slopes in it"
+    assert plain[1] < 0.5 * after.unsure[1], "the squares of jumps count as slopes in it"
 
 
 def test_the_same_seed_ends_with_the_same_bits() -> None:
     one, two = (found(1, np.array([0.6, 0.7]))[1] for _ in range(2))
     np.testing.assert_array_equal(one.x, two.x)
-    np.testing.assert_array_equal(one.open, two.open)
+    np.testing.assert_array_equal(one.unsure, two.unsure)
 
 
 def test_what_is_no_roll_out_stays_as_it_is() -> None:
@@ -77,4 +77,4 @@ def test_what_is_no_roll_out_stays_as_it_is() -> None:
     other: Any = SimpleNamespace(rough=True)
     ended = marginal(other, SimpleNamespace(), before, 0)  # type: ignore[arg-type]
     np.testing.assert_array_equal(ended.x, before.x)
-    assert not ended.open.any()
+    assert not ended.unsure.any()
