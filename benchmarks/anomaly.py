@@ -249,8 +249,8 @@ def _arguments() -> argparse.Namespace:
     args = parser.parse_args()
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 20, 20, 4
-        args.training, args.epochs, args.effects, args.draws, args.levels = 64, 1, 1, 4, 30
-        args.lessons = 30
+        args.training, args.epochs, args.effects, args.draws, args.levels = 64, 1, 1, 4, 50
+        args.lessons = 50
     return args
 
 
