@@ -78,7 +78,7 @@ def test_noise_of_the_maps_is_averaged_and_told(driven: tuple[Trajectory, Height
 def test_the_belief_is_as_with_the_true_ground(
     driven: tuple[Trajectory, Heightfield], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 5)
+    monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 7)
     monkeypatch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4))
     trajectory, true = driven
     perceived, given = (

@@ -27,7 +27,7 @@ DRIVES = "front_left+front_right+rear_left+rear_right"
 def few() -> Iterator[None]:
     """Fewer segments and rounds than a mission's, in half the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 12)
+        patch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 20)
         patch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4, 0.2, 0.05))
         yield
 
