@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import Judged
-from nfc_gym.measured.fit import Fit, differs, fit
+from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.laws import Scanned, scan
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.screen import Screen
@@ -93,18 +93,15 @@ class LawSearch:
             further = self.settle(best.fitted)
             if (kept := self.prune(further)) is not further.current:
                 further = self.settle(kept)
-            if vague := self._vague(further):
-                arena.say(f"{arena.label(best)} is left out: sizes of {', '.join(vague)} would not differ from nothing")
-                self.rounds[-1].accepted, self.rounds[-1].reason = [], "a law and its likeness take from each other"
+            # A swing beside one of nearly its frequency may be of any size against it, and neither says anything.
+            if vague := [e.id for e in further.vague() if isinstance(e, Law)]:
+                last, why = self.rounds[-1], f"sizes of {', '.join(vague)} would not differ from nothing"
+                arena.say(f"{arena.label(best)} is left out: {why}")
+                last.accepted, last.share, last.reason = [], 0.0, why
                 break
             arena = further
         out.fitted, out.rounds = arena.current, self.rounds
         return out
-
-    def _vague(self, arena: Arena) -> list[str]:
-        """Laws that say nothing: a swing beside one of nearly its frequency, each of any size against the other."""
-        current, laws = arena.current, [e for e in arena.current.plant.effects if isinstance(e, Law)]
-        return [law.id for law in laws if not differs(current, arena.blocks[0], law)]
 
     def _best(self, arena: Arena) -> Judged | None:
         """The law that adds most to an arena's model, if it is believed."""

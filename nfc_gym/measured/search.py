@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nfc_gym.measured.arena import Arena, alternatives
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.doubt import doubted
-from nfc_gym.measured.fit import Fit, differs, fit
+from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.form import misshapen
 from nfc_gym.measured.halved import artefacts
 from nfc_gym.measured.lookout import Lookout
@@ -248,7 +248,7 @@ class Search:
         """An accepted effect that had better not be claimed, and why."""
         if found := artefacts(arena, self.options.worth):
             return found[0], "at half the physics step it explains nothing worth naming"
-        vague = [e for e in arena.current.plant.effects if not differs(arena.current, arena.blocks[0], e)]
+        vague = arena.vague()
         return (vague[-1], "its fitted sizes do not differ from nothing") if vague else None
 
     def _exchange(self, arena: Arena, rounds: list[Round]) -> Fit | None:

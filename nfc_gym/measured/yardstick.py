@@ -20,7 +20,7 @@ from nfc_gym.measured.contest import (
     not_worse,
     price,
 )
-from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.fit import Fit, differs
 from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
 from nfc_gym.measured.owned import Data, Owned, owned
 from nfc_gym.measured.screen import Screened
@@ -248,6 +248,10 @@ class Yardstick:
         return not any(
             _at_edge(p, value) for e in self.new(j) for p, value in zip(e.params, thetas[id(e)], strict=True)
         )
+
+    def vague(self) -> list[Effect]:
+        """Effects of the model to beat whose fitted sizes do not differ from nothing."""
+        return [e for e in self.current.plant.effects if not differs(self.current, self.blocks[0], e)]
 
     def told_apart(self, j: Judged) -> bool:
         """Whether any of a candidate's parameters moves the motion in a way that the others could not imitate."""

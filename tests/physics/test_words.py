@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from nfc_gym.physics.effects.words import measured
+from nfc_gym.physics.effects.words import with_spread
 
 
 @pytest.mark.parametrize(
@@ -25,9 +25,9 @@ from nfc_gym.physics.effects.words import measured
     ],
 )
 def test_to_the_digits_that_are_known(value: float, half: float, said: str) -> None:
-    assert measured(value, half / 1.96) == said
+    assert with_spread(value, half / 1.96) == said
 
 
 @pytest.mark.parametrize("sd", [None, math.nan, math.inf, 0.0])
 def test_without_an_interval(sd: float | None) -> None:
-    assert measured(0.123456, sd) == "0.123"
+    assert with_spread(0.123456, sd) == "0.123"

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.words import measured
+from nfc_gym.physics.effects.words import with_spread
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.names import names as names_in
 
@@ -303,7 +303,7 @@ class Effect(ABC):
         """One sentence with units."""
         parts = []
         for i, p in enumerate(self.params):
-            size = measured(theta[i], None if sd is None or p.given else sd[i])
+            size = with_spread(theta[i], None if sd is None or p.given else sd[i])
             unit = "" if p.unit == "1" else f" {p.unit}"
             parts.append(f"{p.name.replace('_', ' ')} {size}{unit}")
         return f"{self.summary} at {' and '.join(self.where)}: {', '.join(parts)}."

@@ -9,7 +9,7 @@ from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales, 
 from nfc_gym.physics.effects.drive import command_unit
 from nfc_gym.physics.effects.generic import TIME
 from nfc_gym.physics.effects.law import Law, OfVariable, degrees, kind_of, pushed, time_of, turns
-from nfc_gym.physics.effects.words import measured
+from nfc_gym.physics.effects.words import with_spread
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
@@ -30,7 +30,7 @@ class _Linear(Law):
         return self.where[-1]
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
-        size = f"{measured(theta[0], None if sd is None else sd[0])} {self.params[0].unit}"
+        size = f"{with_spread(theta[0], None if sd is None else sd[0])} {self.params[0].unit}"
         return f"A {self.noun} in proportion to {self.cause}: {size}."
 
 
@@ -166,8 +166,8 @@ class LawPower(Law):
         wide = (None, None) if sd is None else (sd[0], sd[1])
         at = "1 rad/s" if self.params[0].unit == "N m" else "1 m/s"
         return (
-            f"A {self.noun} {sides} its speed to the power {measured(theta[1], wide[1])}: "
-            f"{measured(abs(theta[0]), wide[0])} {self.params[0].unit} at {at}."
+            f"A {self.noun} {sides} its speed to the power {with_spread(theta[1], wide[1])}: "
+            f"{with_spread(abs(theta[0]), wide[0])} {self.params[0].unit} at {at}."
         )
 
     @classmethod
@@ -194,7 +194,7 @@ class LawPolynomial(OfVariable):
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
         sizes = zip(self.params, theta, (None,) * 3 if sd is None else sd, strict=True)
-        parts = [f"{p.name} {measured(t, s)} {p.unit}" for p, t, s in sizes]
+        parts = [f"{p.name} {with_spread(t, s)} {p.unit}" for p, t, s in sizes]
         return f"A {self.noun} that bends with its position: {', '.join(parts)}."
 
     @classmethod

@@ -8,7 +8,7 @@ import numpy as np
 from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales
 from nfc_gym.physics.effects.ground import ground_geoms, touching_geoms
 from nfc_gym.physics.effects.law import OfVariable, degrees, ends_of, kind_of, pushed
-from nfc_gym.physics.effects.words import measured
+from nfc_gym.physics.effects.words import with_spread
 
 _SLIDE, _FREE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_FREE)
 _STICK = 0.02  # m/s or rad/s over which a proposed dry friction turns from one side to the other
@@ -47,7 +47,7 @@ class _Patch(OfVariable):
         return f"while {self.where[1]} is between"
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
-        size = f"{measured(theta[0], None if sd is None else sd[0])} {self.params[0].unit}"
+        size = f"{with_spread(theta[0], None if sd is None else sd[0])} {self.params[0].unit}"
         return f"A {self.noun} {self.between} {theta[1]:.3g} and {theta[2]:.3g} {self.params[1].unit}: {size}."
 
     @classmethod
@@ -123,7 +123,7 @@ class LawHeight(OfVariable):
         return "f(z)"
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
-        size = f"{measured(theta[0], None if sd is None else sd[0])} {self.params[0].unit}"
+        size = f"{with_spread(theta[0], None if sd is None else sd[0])} {self.params[0].unit}"
         return f"A {self.noun} that fades with height: {size} on the ground, half of it at {theta[1]:.3g} m."
 
     @classmethod

@@ -8,7 +8,7 @@ import numpy as np
 from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales
 from nfc_gym.physics.effects.generic import TIME
 from nfc_gym.physics.effects.law import Law, OfVariable, degrees, ends_of, kind_of, pushed, time_of
-from nfc_gym.physics.effects.words import measured
+from nfc_gym.physics.effects.words import with_spread
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _MOST = 1200  # values of one rate that are looked at
@@ -45,7 +45,7 @@ class _Wave(Law):
         size = float(np.hypot(c, s))
         wide = None if sd is None else float(np.hypot(c * sd[0], s * sd[1]) / max(size, 1e-12))
         phase = np.degrees(np.arctan2(s, c)) % 360
-        return f"{measured(size, wide)} {self.params[0].unit}, phase {phase:.0f} deg"
+        return f"{with_spread(size, wide)} {self.params[0].unit}, phase {phase:.0f} deg"
 
 
 class LawHarmonic(OfVariable, _Wave):

@@ -5,7 +5,7 @@ import math
 _SMALL, _LARGE, _PLACES = 1e-4, 1e6, 6  # between which numbers are written without a power of ten; decimals at most
 
 
-def measured(value: float, sd: float | None = None) -> str:
+def with_spread(value: float, sd: float | None = None) -> str:
     """`20.31 ± 0.34`: a value and the half width of its 95 % interval, to two digits of that; a bare value to three.
 
     Args:
