@@ -29,6 +29,7 @@ from nfc_gym.measured.sparser import sparser
 from nfc_gym.measured.suspects import Suspects
 from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.generic_ground import GenericGrip
 from nfc_gym.physics.effects.law import Law
 from nfc_gym.physics.rollout import Plant
 
@@ -166,7 +167,7 @@ class Search:
         dropped: list[str] = []
         odd = misshapen(arena, self.generics, self.options.worth)
         mended = max(odd.values(), key=lambda j: j.total, default=None)
-        generic = self._generic(arena, screen, outcome) if arena.leftover > SILENT else None
+        generic = self._generic(arena, screen, outcome)
         generic = mended if generic is None else generic
         label = None if generic is None else arena.label(generic)
         if generic is not None and arena.current.plant.effects and self._outdone(arena, generic, calibrated):
@@ -210,7 +211,19 @@ class Search:
         laws = LawSearch(self.laws, self.options.worth, lambda f: self.settle(f.plant, f.x), self._prune)
         out = laws.run(arena, found.calibrated, found.misshapen, sure=found.generic is not None)
         out.dropped = out.dropped or found.dropped
+        ground = next((g for g in self.generics if g.id == found.generic and isinstance(g, GenericGrip)), None)
+        if ground is not None and out.laws and self._grounded(arena, ground, out.fitted):
+            out = Remainder(arena.current, out.scanned, found.dropped, out.rounds)
         return out
+
+    def _grounded(self, arena: Arena, ground: Effect, laws: Fit) -> bool:
+        """Whether the ground's grip does better than proposed laws: pushes by place stand in for floors that slip."""
+        screen = Screen(arena.fit_data.problem, arena.under, arena.current)
+        grip, named = arena.enter([screen.try_one(ground)]), arena.judge(laws)
+        if grip.total <= named.total:
+            return False
+        arena.say(f"{ground.id} explains more than the proposed laws, which are left out")
+        return True
 
     def _confirmed(self, arena: Arena, rounds: list[Round]) -> Arena:
         """The arena without the effects that do not outlive half the physics step, or whose sizes may be nothing."""
@@ -308,8 +321,15 @@ class Search:
     # ---- generic alternatives ---------------------------------------------------------------------------------------
 
     def _generic(self, arena: Arena, screen: Screen, outcome: Round) -> Judged | None:
-        """The smooth law of position, speed or time that still adds most to the accepted effects, if it is believed."""
-        screened = self.lookout.screen(screen, self.generics, _GENERICS)
+        """The smooth law that still adds most to the accepted effects, if it is believed.
+
+        Where next to nothing is left the ground's grip alone is asked: the medians by which that is measured hide what
+        is wrong in one part of the world.
+        """
+        pool = self.generics if arena.leftover > SILENT else [g for g in self.generics if isinstance(g, GenericGrip)]
+        if not pool:
+            return None
+        screened = self.lookout.screen(screen, pool, _GENERICS)
         worth = self.options.worth
         hopeful = [s for s in screened[:3] if s.gain > 0 and arena.promises(s) > arena.asked(s, worth)]
         judged = sorted((arena.enter([s]) for s in hopeful), key=lambda j: -j.total)

@@ -11,6 +11,8 @@ from nfc_gym.measured.search import Found
 from nfc_gym.measured.verdict import Verified
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.generic import GenericMemory
+from nfc_gym.physics.effects.generic_ground import GenericGrip
+from nfc_gym.physics.effects.ground import base_on_ground
 from nfc_gym.physics.effects.law import Law, degrees
 from nfc_gym.physics.rollout import Plant
 
@@ -55,6 +57,11 @@ def unexplained(
     if family == GenericMemory.family:
         text = f"looks like a force with memory in {joint}, of no law of the library{near}"
         return {"coordinate": f"joint:{joint}:pos", "where": f"joint:{joint}"} | out | {"description": text}
+    if family == GenericGrip.family:
+        told = next(r["sentence"] for round_ in found.rounds for r in round_.ranking if r["id"] == found.generic)
+        root = mujoco.mj_id2name(plant.model, mujoco.mjtObj.mjOBJ_BODY, base_on_ground(plant.model))
+        text = f"looks like {_inner(told)}, of no law of the library{near}"
+        return {"coordinate": f"body:{root}:pos", "where": "ground"} | out | {"description": text}
     if scanned is not None and scanned.nearest is not None:
         law = scanned.nearest.law
         law.bind(plant.model)

@@ -51,6 +51,26 @@ class OnGround(Effect):
             self.touching = np.array([names.index(n) for n in self.where], np.intp)
         rank = np.asarray(model.geom_priority)
         self.above = rank[self.touching] - rank[self.ground].max()
+        self.ruled = self.touching[self.above >= 0]
+
+    def grip(self, fields: Mapping[str, Array], factor: Array, there: Array) -> None:
+        """Give each geom that the ground does not rule a share of the sliding friction that it would meet there.
+
+        Between geoms of one priority MuJoCo takes the larger friction: they take over the ground's, and the ground's
+        is 0 for the step.
+
+        Args:
+          fields: has `geom_friction`, (..., ngeom, 3), which is written to.
+          factor: (..., n) for each of the `ruled` geoms.
+          there: (..., 1) whether any of the factors is another than 1.
+        """
+        equal = self.above[self.above >= 0] == 0
+        sliding = fields["geom_friction"][..., 0]
+        own = sliding[..., self.ruled]
+        of_ground = sliding[..., self.ground].max(-1, keepdims=True)
+        sliding[..., self.ruled] = np.where(there & equal, np.maximum(own, of_ground), own) * factor
+        if equal.any():
+            sliding[..., self.ground] = np.where(there, 0.0, sliding[..., self.ground])
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -78,20 +98,11 @@ class FrictionPatch(OnGround):
     )
 
     def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
-        ruled = self.above >= 0
-        geoms, equal = self.touching[ruled], self.above[ruled] == 0
-        place = ctx.data("geom_xpos")[..., geoms, :2] - theta[..., None, 1:3]
+        place = ctx.data("geom_xpos")[..., self.ruled, :2] - theta[..., None, 1:3]
         away = np.sqrt(((place / theta[..., None, 3:5]) ** 2).sum(-1))
         rise = np.minimum(np.maximum((1 + _EDGE / 2 - away) / _EDGE, 0.0), 1.0)
         lost = theta[..., 0:1] * rise * rise * (3 - 2 * rise)
-        sliding = fields["geom_friction"][..., 0]
-        own = sliding[..., geoms]
-        inside = (lost != 0).any(-1, keepdims=True)
-        of_ground = sliding[..., self.ground].max(-1, keepdims=True)
-        whole = np.where(inside & equal, np.maximum(own, of_ground), own)
-        sliding[..., geoms] = whole * (1 - lost)
-        if equal.any():
-            sliding[..., self.ground] = np.where(inside, 0.0, sliding[..., self.ground])
+        self.grip(fields, 1 - lost, (lost != 0).any(-1, keepdims=True))
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
         how = "less" if theta[0] >= 0 else "more"
@@ -125,15 +136,20 @@ class FrictionPatch(OnGround):
         return [cls(("ground",), sized(cls.PARAMS, **changes))]
 
 
+def base_on_ground(model: mujoco.MjModel) -> int | None:
+    """Id of the base that has most geoms to stand on; None where nothing touches the ground."""
+    standing = np.asarray(model.body_rootid)[model.geom_bodyid[touching_geoms(model, ground_geoms(model))]].tolist()
+    return max(set(standing), key=standing.count) if standing else None
+
+
 def roamed(model: mujoco.MjModel, scales: Scales) -> tuple[Array, Array] | None:
     """Least and largest x and y in the world, (2,) each, of the base that has most geoms to stand on.
 
     None where no base moves freely in x and y, on a free joint or on two slides, or where its motion is unknown.
     """
-    standing = np.asarray(model.body_rootid)[model.geom_bodyid[touching_geoms(model, ground_geoms(model))]].tolist()
-    if not standing or scales.low is None or scales.high is None:
+    root = base_on_ground(model)
+    if root is None or scales.low is None or scales.high is None:
         return None
-    root = max(set(standing), key=standing.count)
     found: list[tuple[int, float]] = []  # coordinate, and what is to be added to it
     for j in np.flatnonzero(np.asarray(model.body_rootid)[model.jnt_bodyid] == root):
         at, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
