@@ -13,15 +13,24 @@ from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
-MODEL = """<mujoco><worldbody><body><joint name="knee"/><geom size="0.1"/></body></worldbody></mujoco>"""
+MODEL = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+<body pos="0 0 1"><joint name="knee"/><geom size="0.1" contype="0" conaffinity="0"/></body>
+<body name="car" pos="0 0 0.1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
 RANKED = {"id": "coulomb:knee", "generic": False, "share": 0.3}
 
 
-def said(generic: str | None, weak: tuple[str, ...] = (), alike: tuple[str, ...] = (), **more: str) -> dict[str, Any]:
+def said(
+    generic: str | None,
+    weak: tuple[str, ...] = (),
+    alike: tuple[str, ...] = (),
+    ranked: dict[str, Any] | None = None,
+    **more: str,
+) -> dict[str, Any]:
     model = mujoco.MjModel.from_xml_string(MODEL)
     plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    rows = [RANKED] if ranked is None else [RANKED, ranked]
     rest = Remainder(fitted=None)  # type: ignore[arg-type]
-    found: Any = SimpleNamespace(generic=generic, rest=rest, rounds=[Round([], 0.0, [RANKED])], nearest=None)
+    found: Any = SimpleNamespace(generic=generic, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
     columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
     v: Any = SimpleNamespace(problem=problem, white={"extended": np.array([[1.0, 3.0]])})
@@ -33,6 +42,13 @@ def test_memory_in_a_joint_is_said_as_such() -> None:
     assert (found["coordinate"], found["where"]) == ("joint:knee:pos", "joint:knee")
     assert found["description"].startswith("looks like a force with memory in knee, of no law of the library")
     assert (found["nearest"], found["nearest_share"]) == ("coulomb:knee", pytest.approx(0.3))
+
+
+def test_ground_that_grips_otherwise_in_places_is_said_as_such() -> None:
+    told = "Friction of the ground that depends on the place: beside the middle, 0.8 times about (1.0, 0.0) m."
+    found = said("generic_grip:ground", ranked={"id": "generic_grip:ground", "generic": True, "sentence": told})
+    assert (found["coordinate"], found["where"]) == ("body:car:pos", "ground")
+    assert "friction of the ground that depends on the place: beside the middle, 0.8 times" in found["description"]
 
 
 def test_what_takes_away_too_little_is_named_as_the_nearest_and_no_cause() -> None:

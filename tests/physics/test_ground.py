@@ -10,6 +10,7 @@ from test_slip import WHEEL
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects import Scales
+from nfc_gym.physics.effects.generic_ground import GenericGrip
 from nfc_gym.physics.effects.ground import FrictionPatch
 from nfc_gym.physics.fields import ModelFields
 
@@ -64,6 +65,31 @@ def test_only_the_geoms_inside_feel_the_patch() -> None:
     assert abs(straight) < 0.01
     with pytest.raises(InputError, match=r"no geom 'floor' touches the ground; there are: a, b, c"):
         make("friction_patch", "floor", {"lost": 0.9} | HERE)[0].bind(model)
+
+
+@pytest.mark.parametrize(("floor", "feet", "priority"), [(0.6, 0.2, 0), (0.2, 0.6, 0), (0.9, 0.6, 1)])
+def test_grip_by_place_brakes_a_sled_by_the_friction_at_each_place(floor: float, feet: float, priority: int) -> None:
+    """mu(x) = mu exp(c u) with u = x / 2 m: each foot's friction times its way adds up to m v^2 / 2."""
+    model = mujoco.MjModel.from_xml_string(SLED.format(floor, feet, priority))
+    effect = GenericGrip(("ground",))
+    effect.reach = np.full(2, 2.0)
+    theta = np.array([-0.8, 0.0, 0.0, 0.0, 0.0])
+    x = run(model, effect, theta, 900, qvel=[2, 0, 0, 0, 0, 0]).qpos[0, 0, :, 0]
+    way = np.linspace(0, 1, 10001)
+    braking = 0.6 * G * sum(0.5 * np.exp(-0.8 * (way + foot) / 2) for foot in (0.2, -0.2))
+    spent = np.concatenate([[0], np.cumsum((braking[1:] + braking[:-1]) / 2 * way[1])])
+    assert x[-1] == pytest.approx(float(np.interp(2.0**2 / 2, spent, way)), rel=0.02)
+    assert "55.1% less about (2.0, 0.0) m" in effect.say(theta)
+
+
+def test_grip_by_place_is_looked_for_where_the_machine_was() -> None:
+    model = mujoco.MjModel.from_xml_string(SLED.format(0.6, 0.2, 0))
+    one, low, high = np.ones(model.nv), model.qpos0.copy(), model.qpos0.copy()
+    low[:2], high[:2] = [-1.0, 0.5], [4.0, 1.5]
+    scales = Scales(one, one, np.ones(0), np.ones(0), 0.01, low=low, high=high)
+    (effect,) = GenericGrip.propose(model, scales)
+    np.testing.assert_allclose(effect.basis(np.array([4.0, 0.5])), [1, -1, 1, -1, 1])
+    assert GenericGrip.propose(model, Scales(one, one, np.ones(0), np.ones(0), 0.01)) == []
 
 
 def test_patches_are_looked_for_where_the_machine_was() -> None:

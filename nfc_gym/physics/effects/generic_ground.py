@@ -43,10 +43,10 @@ class GenericGrip(OnGround):
     def say(self, theta: Array, sd: Array | None = None) -> str:
         turn, out = np.meshgrid(np.linspace(0, 2 * np.pi, 24, endpoint=False), [0.5, 1.0])
         place = self.middle + self.reach * np.stack([out * np.cos(turn), out * np.sin(turn)], -1).reshape(-1, 2)
-        share = np.exp(np.clip(self.basis(place) @ theta, -_MOST, _MOST))
-        least, most = (f"{share[i]:.2g} times about ({place[i, 0]:.1f}, {place[i, 1]:.1f}) m"
-                       for i in (int(share.argmin()), int(share.argmax())))  # fmt: skip
-        return f"{self.summary}: beside that in the middle of what the logs roamed, {least} and {most}."
+        more = np.exp(np.clip(self.basis(place) @ theta, -_MOST, _MOST)) - 1
+        where = (f"{abs(more[i]):.1%} {'more' if more[i] > 0 else 'less'} about ({place[i, 0]:.1f}, {place[i, 1]:.1f}) m"
+                 for i in (int(more.argmin()), int(more.argmax())))  # fmt: skip
+        return f"{self.summary}: {' and '.join(where)} than in the middle of what the logs roamed."
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
