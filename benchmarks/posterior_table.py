@@ -33,6 +33,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its c
 
 import torch
 from posteriors import extras, plots, report
+from posteriors.cases import WAYS
 from posteriors.ceilings import ceiling_of
 from posteriors.fit import Plan, fit
 from posteriors.judge import judge, latency
@@ -174,6 +175,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--ceiling-draws", nargs=2, type=int, default=[256, 32], metavar=("CLOUD", "PAIRS"))
     parser.add_argument("--truths", type=int, default=20, help="of the sequential rounds")
     parser.add_argument("--round", type=int, default=10_000, help="simulations a round")
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=["on"], help="in which second rounds train")
     parser.add_argument("--few", type=int, default=200, help="windows that are replayed, or whose maps are drawn")
     parser.add_argument("--axles", type=int, default=100, help="windows with a lost axle")
     parser.add_argument("--quick", action="store_true", help="a toy: Jackal on flat ground, in a minute")

@@ -1,5 +1,7 @@
 """Two cases of their own: a Jackal that lost an axle, and sequential rounds against one."""
 
+from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,8 @@ from posteriors.methods import METHODS, OURS, network_config
 
 FIRST, ONE = "first", "one"  # networks of the first round, and of one round of twice as many
 HELD_OUT = 0.1  # of each round's windows
+# How a second round trains: see `SequentialConfig`.
+WAYS = {"on": {}, "anew": {"anew": True}, "inside": {"inside": True}, "anew inside": {"anew": True, "inside": True}}
 AXLE = "front_left_wheel_damping"  # the gain kv of its servo: 0 is a lost axle
 
 
@@ -75,8 +79,9 @@ def before(
 
 
 def rounds(
-    env: str, truth: int, size: int, training: TrainConfig, jobs: int, device: torch.device, folder: Path
-) -> dict[str, Any]:
+    env: str, truth: int, size: int, training: TrainConfig, ways: Sequence[str], jobs: int, device: torch.device,
+    folder: Path,
+) -> dict[str, Any]:  # fmt: skip
     """One truth: two rounds of `size` simulations against one of twice as many; gain of the true psi, nats a parameter.
 
     Args:
@@ -84,6 +89,7 @@ def rounds(
       truth: its seed.
       size: simulations a round.
       training: of the second round.
+      ways: of WAYS, in which it trains, each from the same simulations.
       jobs: processes of the simulation.
       device: to train on.
       folder: what `before` wrote.
@@ -100,18 +106,24 @@ def rounds(
         return float(given.log_prob(Fidelity(psi))[0] + prior.log_volume) / prior.size
 
     alone, once = gain(NeuralPosterior(one).given(window)), gain(NeuralPosterior(first).given(window))
-    how = SequentialConfig(2, size, narrows=-np.inf, held_out=HELD_OUT, seed=mixed(truth, 2))
-    two = sequential(first, simulate, window, how, training, begun=begun, device=device, scales=False)
-    return {"two": gain(two.posterior), "one": alone, "first": once, "kept": two.kept[1]}
+    out: dict[str, Any] = {"one": alone, "first": once}
+    for way in ways:
+        how = SequentialConfig(2, size, narrows=-np.inf, held_out=HELD_OUT, seed=mixed(truth, 2), **WAYS[way])
+        network = deepcopy(first)
+        two = sequential(network, simulate, window, how, training, begun=begun, device=device, scales=False)
+        out |= {way: gain(two.posterior), "kept": two.kept[1]}
+    return out
 
 
 def summed(found: list[dict[str, Any]]) -> dict[str, Any]:
     """The truths together."""
-    two, one, first = (np.array([f[k] for f in found]) for k in ("two", "one", "first"))
-    return {
+    one, first = (np.array([f[k] for f in found]) for k in ("one", "first"))
+    out = {
         "truths": len(found),
         "the first round alone, gain a parameter": metrics.mean(first),
-        "two rounds, gain a parameter": metrics.mean(two),
         "one round of twice as many": metrics.mean(one),
-        "two less one": metrics.mean(two - one),
     }
+    for way in (w for w in WAYS if w in found[0]):
+        two = np.array([f[way] for f in found])
+        out |= {f"two rounds, trained {way}": metrics.mean(two), f"... less one ({way})": metrics.mean(two - one)}
+    return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -54,10 +54,13 @@ def _rounds(run: Run, robot: str, terrain: str, sets: Sets) -> None:
     cases.before(env, prior_of(env), args.round, training, args.small, args.jobs, run.device, folder)
     at_once = min(args.truths, args.jobs or os.cpu_count() or 1)
     if run.device.type == "cuda":
-        at_once = max(1, min(at_once, torch.cuda.mem_get_info(run.device)[1] // ROOM))
+        # Others may work on the same GPU: what is free now is what there is.
+        at_once = max(1, min(at_once, torch.cuda.mem_get_info(run.device)[0] // ROOM))
     with ProcessPoolExecutor(at_once, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)) as pool:
         asked = {
-            pool.submit(_round, run.kept, f"{name}_{t}", env, t, args.round, training, run.device, folder, run.ends)
+            pool.submit(
+                _round, run.kept, f"{name}_{t}", env, t, args.round, training, args.ways, run.device, folder, run.ends
+            )
             for t in range(args.truths)
         }
         found = [done for future in as_completed(asked) if (done := future.result())]
@@ -66,13 +69,15 @@ def _rounds(run: Run, robot: str, terrain: str, sets: Sets) -> None:
 
 
 def _round(
-    kept: Kept, name: str, env: str, truth: int, size: int, training: TrainConfig, device: torch.device, folder: Path,
-    ends: float,
+    kept: Kept, name: str, env: str, truth: int, size: int, training: TrainConfig, ways: Sequence[str],
+    device: torch.device, folder: Path, ends: float,
 ) -> dict[str, Any]:  # fmt: skip
     """One truth, unless time is up."""
     if time.monotonic() > ends:
         return {}
-    return kept.once(name, lambda: cases.rounds(env, truth, size, training, 1, device, folder), round=size)
+    return kept.once(
+        name, lambda: cases.rounds(env, truth, size, training, ways, 1, device, folder), round=size, ways=list(ways)
+    )
 
 
 def _plots(run: Run, robot: str, terrain: str, sets: Sets) -> None:

@@ -20,6 +20,7 @@ from nfc_gym.inference.data import Batch, TensorWindows
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
+from nfc_gym.inference.random import mixed
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
 
@@ -41,7 +42,10 @@ class SequentialConfig:
       oversampling: candidates for each proposal that importance resampling chooses from.
       narrows: nats of entropy that a round must take from the posterior for another to follow.
       held_out: share of each round that is held out.
-      seed: of proposals and simulations.
+      anew: whether every later round trains a network of new weights; one that goes on from the last round's may learn
+        what is new less well (Ash and Adams, On warm-starting neural network training, NeurIPS 2020).
+      inside: whether later rounds learn only from those earlier windows whose psi the present proposal could draw.
+      seed: of proposals, simulations and new weights.
     """
 
     rounds: int = 5
@@ -51,6 +55,8 @@ class SequentialConfig:
     oversampling: int = 16
     narrows: float = _NARROWS
     held_out: float = 0.1
+    anew: bool = False
+    inside: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -69,7 +75,7 @@ class Rounds:
       entropy: of the posterior after each round, nats, relative to the prior (0 is the prior; lower is narrower).
       kept: share of the prior's volume that each round's proposal was drawn from.
       outcomes: of each round's training.
-      windows: all that was simulated.
+      windows: what the last round learned from, held out windows too.
       stopped: "rounds" or "no longer narrows".
     """
 
@@ -117,6 +123,10 @@ class TruncatedPrior:
     def _gain(self, psi: Array) -> Array:
         return self.posterior.log_prob(Fidelity(psi)) + self.posterior.prior.log_volume
 
+    def holds(self, psi: Array) -> NDArray[np.bool_]:
+        """(n,) which psi (n, d), physical units, could be drawn."""
+        return self._gain(psi) > self.threshold
+
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """(n, d) psi, physical units."""
         free = np.array(self.posterior.prior.free)
@@ -132,7 +142,7 @@ class TruncatedPrior:
         for _ in range(4):
             u = rng.uniform(self.low, self.high, (n * self.config.oversampling, len(self.low)))
             psi = self.posterior.prior.psi_of(u)
-            found.append(psi[self._gain(psi) > self.threshold])
+            found.append(psi[self.holds(psi)])
             if sum(map(len, found)) >= n:
                 break
         return np.concatenate(found)[:n]
@@ -177,6 +187,12 @@ def sequential(
             proposal = TruncatedPrior(out.posterior, config, rng)
             out.kept.append(proposal.kept)
             new = _simulated(network.prior, simulate, proposal.sample(config.simulations, rng), rng)
+            if config.inside:
+                assert train_set is not None  # the first round made both
+                assert held_out is not None
+                train_set, held_out = (_within(w, proposal, network.prior) for w in (train_set, held_out))
+            if config.anew:
+                _renew(network, mixed(config.seed, r))
         else:
             out.kept.append(1.0)
             new = begun or _simulated(network.prior, simulate, _prior(network.prior, config.simulations, rng), rng)
@@ -196,6 +212,22 @@ def sequential(
     assert held_out is not None
     out.windows = train_set.append(held_out)
     return out
+
+
+def _within(windows: TensorWindows, proposal: TruncatedPrior, prior: PriorBox) -> TensorWindows:
+    """Those of the windows whose psi a proposal could draw; all of them where it could draw none."""
+    inside = torch.as_tensor(proposal.holds(prior.psi_of(windows.tensors["psi"].double().cpu().numpy())))
+    if not inside.any():
+        return windows
+    return TensorWindows({k: t[inside.to(t.device)] for k, t in windows.tensors.items()}, windows.manifest)
+
+
+def _renew(network: Network, seed: int) -> None:
+    """Give a network the weights that a new one begins with; its scales stay."""
+    new = Network(network.config, network.sizes, network.prior, seed)
+    with torch.no_grad():
+        for own, other in zip(network.parameters(), new.parameters(), strict=True):
+            own.copy_(other)
 
 
 def _prior(prior: PriorBox, n: int, rng: np.random.Generator) -> Array:

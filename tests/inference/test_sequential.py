@@ -107,6 +107,33 @@ def test_windows_of_the_prior_that_were_learned_before_are_the_first_round() -> 
     assert (gains > proposal.threshold).mean() < 1
 
 
+def test_a_later_round_may_train_new_weights_and_leave_out_what_it_could_not_draw() -> None:
+    begun = linear_windows(400)
+    training = TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95)
+    learned = network(begun, linear=True)
+    train(learned, *begun.split(0.1), training)
+    of = {"rounds": 2, "simulations": 300, "samples": 150, "oversampling": 4, "narrows": -np.inf}
+    untrained = TrainConfig(epochs=1, batch=64, rate=1e-12, warmup=10, average=0.95)
+    before = [w.clone() for w in learned.parameters()]
+    same, new = (
+        sequential(net, simulate, OBSERVED, SequentialConfig(anew=anew, inside=anew, **of), untrained, begun=begun)
+        for net, anew in ((deepcopy(learned), False), (deepcopy(learned), True))
+    )
+    apart = [
+        max(
+            float((w - b).detach().abs().max()) for w, b in zip(out.posterior.network.parameters(), before, strict=True)
+        )
+        for out in (same, new)
+    ]
+    assert apart[0] < 1e-6 < apart[1]
+    assert len(same.windows) == 700
+    # All that is drawn lies inside what the proposal can draw, and so does what is left of the prior's windows.
+    assert 310 < len(new.windows) < 690
+    old = new.windows.tensors["psi"].shape[0] - 300
+    spread = [w.tensors["psi"].std(0).mean() for w in (begun, new.windows)]
+    assert spread[1] < 0.8 * spread[0], old
+
+
 def test_bad_settings_are_refused() -> None:
     with pytest.raises(InputError, match="rounds >= 1"):
         SequentialConfig(rounds=0)

@@ -44,8 +44,8 @@ class GenericGrip(OnGround):
         turn, out = np.meshgrid(np.linspace(0, 2 * np.pi, 24, endpoint=False), [0.5, 1.0])
         place = self.middle + self.reach * np.stack([out * np.cos(turn), out * np.sin(turn)], -1).reshape(-1, 2)
         more = np.exp(np.clip(self.basis(place) @ theta, -_MOST, _MOST)) - 1
-        where = (f"{abs(more[i]):.1%} {'more' if more[i] > 0 else 'less'} about ({place[i, 0]:.1f}, {place[i, 1]:.1f}) m"
-                 for i in (int(more.argmin()), int(more.argmax())))  # fmt: skip
+        ends = [(more[i], *place[i]) for i in (int(more.argmin()), int(more.argmax()))]
+        where = [f"{abs(m):.1%} {'more' if m > 0 else 'less'} about ({x:.1f}, {y:.1f}) m" for m, x, y in ends]
         return f"{self.summary}: {' and '.join(where)} than in the middle of what the logs roamed."
 
     @classmethod
