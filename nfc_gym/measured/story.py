@@ -169,7 +169,7 @@ def headline(report: dict[str, Any]) -> str:
     effects = report.get("effects") or []
     word = report.get("verdict")
     left = (report.get("unexplained") or {}).get("coordinate")
-    at = f", the largest share at {left}" if left else ""
+    at = f", most plainly at {left}" if left else ""
     proposals = report.get("proposals") or []
     if near := [what(e) for e in proposals if e.get("nearest")]:
         share = percent((report.get("unexplained") or {}).get("nearest_share") or 0.0)

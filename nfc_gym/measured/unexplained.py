@@ -8,7 +8,7 @@ import numpy as np
 from nfc_gym.measured import wording
 from nfc_gym.measured.laws import Proposal
 from nfc_gym.measured.search import Found
-from nfc_gym.measured.verdict import Verified
+from nfc_gym.measured.verdict import Verified, column_means
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.generic import GenericMemory
 from nfc_gym.physics.effects.generic_ground import GenericGrip
@@ -66,9 +66,9 @@ def unexplained(
         law = scanned.nearest.law
         law.bind(plant.model)
         return _place(plant.model, law) | out | {"description": f"{_guess(scanned.nearest)}; {reason}{near}"}
-    place, group, part = _worst(v)
+    place, group, times = _worst(v)
     coordinate = place if place.startswith("sensor") else f"{place} ({group})"
-    text = f"largest share of the remaining misfit: {part:.0%}; {reason}{near}"
+    text = f"furthest beyond the noise, with {times:.3g} times its mean square; {reason}{near}"
     return {"coordinate": coordinate, "where": place} | out | {"description": text}
 
 
@@ -110,9 +110,17 @@ def _nearest(found: Found) -> tuple[str | None, float]:
 
 
 def _worst(v: Verified) -> tuple[str, str, float]:
-    """(place, group, share) of the columns with the largest share of the remaining misfit."""
-    squares = np.where(v.problem.mask, np.minimum(v.white["extended"] ** 2, 1e6), 0.0)
+    """(place, group, times) of the columns whose misfit is most times what a perfect model would show there.
+
+    A wrong joint shows most in itself, however small a part of all the misfit that is: what it moves is the whole
+    machine, in many more numbers.
+    """
+    found, floor = column_means(v.problem, v.white["extended"]), np.maximum(v.floor, 1e-6)
+    count = v.problem.mask.sum(0)
     keys = list(zip(v.problem.columns.place, v.problem.columns.group, strict=True))
-    sums = {key: float(squares[:, [k == key for k in keys]].sum()) for key in dict.fromkeys(keys)}
-    place, group = max(sums, key=lambda k: sums[k])
-    return place, group, sums[(place, group)] / max(sum(sums.values()), 1e-9)
+    times = {}
+    for key in dict.fromkeys(keys):
+        of = np.array([k == key for k in keys])
+        times[key] = float((count * found)[of].sum() / max((count * floor)[of].sum(), 1e-9))
+    place, group = max(times, key=lambda k: times[k])
+    return place, group, times[(place, group)]

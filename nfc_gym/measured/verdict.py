@@ -39,7 +39,8 @@ class Models:
 class Verified:
     """Residuals on the verification logs, in their own units and whitened by the noise alone.
 
-    residual and white: stage -> (S, m); null: (K,) chi-squared of models without any unknown effect.
+    residual and white: stage -> (S, m); null: (K,) chi-squared of models without any unknown effect; floor: (m,) mean
+    square of each number, whitened, of such models.
     """
 
     problem: Problem
@@ -47,6 +48,7 @@ class Verified:
     white: dict[str, Array]
     sigma: Array
     null: Array
+    floor: Array
 
     def chi2(self, stage: str) -> float:
         """Mean square whitened residual; about 1 where noise explains it."""
@@ -57,6 +59,12 @@ def mean_square(problem: Problem, white: Array) -> float:
     """Mean of whitened squares over what counts; a block's share is bounded so that one wild block does not decide."""
     squares = np.minimum(white**2, 1e6)
     return float(squares[problem.mask].mean())
+
+
+def column_means(problem: Problem, white: Array) -> Array:
+    """(m,) mean of whitened squares (S, m) of each compared number over the blocks in which it counts; 0 in none."""
+    squares = np.where(problem.mask, np.minimum(white**2, 1e6), 0.0)
+    return squares.sum(0) / np.maximum(problem.mask.sum(0), 1)
 
 
 def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Generator) -> Verified:
@@ -74,7 +82,7 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
     for stage, p, v in models.items():
         r = problem.residual(p, v[None])
         residual[stage], white[stage] = r[0], measure.whiten(r)[0]
-    null = []
+    null, floors = [], []
     for _ in range(replicas):
         twin = problem.synthetic(plant, x, rng)
         if not len(twin):
@@ -85,8 +93,11 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
         # Where bodies touch a covariance is dear, and a twin starts within the noise of what it is the twin of.
         alike = problem.rough and len(twin) == len(problem)
         under = measure if alike else metric(twin, twin.covariance(plant, x))
-        null.append(mean_square(twin, under.whiten(twin.residual(plant, x[None]))[0]))
-    return Verified(problem, residual, white, sigma, np.array(null))
+        seen = under.whiten(twin.residual(plant, x[None]))[0]
+        null.append(mean_square(twin, seen))
+        floors.append(column_means(twin, seen))
+    floor = np.mean(floors, 0) if floors else np.ones(problem.mask.shape[1])
+    return Verified(problem, residual, white, sigma, np.array(null), floor)
 
 
 def errors(v: Verified) -> dict[str, Any]:

@@ -125,13 +125,14 @@ def test_a_law_never_makes_a_verdict_explained() -> None:
 def test_even_without_a_law_the_worst_place_is_named() -> None:
     columns = SimpleNamespace(place=("joint:a", "joint:b"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(mask=np.ones((5, 2), bool), columns=columns)
-    v = SimpleNamespace(problem=problem, white={"extended": np.tile([1.0, 3.0], (5, 1))})
+    # The first misses by more, the second by more of what noise alone would make it miss.
+    v = SimpleNamespace(problem=problem, white={"extended": np.tile([4.0, 3.0], (5, 1))}, floor=np.array([8.0, 0.9]))
     last = SimpleNamespace(ranking=[{"id": "lag:m", "generic": False, "share": 0.12}], reason="too small")
     found = SimpleNamespace(rounds=[last], rest=SimpleNamespace(dropped=[], scanned=None), generic=None)
     left = unexplained(v, found, SimpleNamespace(effects=(), model=None), [], [], 0.0)  # pyright: ignore[reportArgumentType]
     assert left["where"] == "joint:b"
     assert left["coordinate"] == "joint:b (joint speed)"
-    assert left["description"].startswith("largest share of the remaining misfit: 90%; too small; the nearest named")
+    assert left["description"].startswith("furthest beyond the noise, with 10 times its mean square; too small; the")
     assert (left["nearest"], left["nearest_share"]) == ("lag:m", 0.12)
 
 

@@ -33,7 +33,7 @@ def said(
     found: Any = SimpleNamespace(generic=generic, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
     columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
-    v: Any = SimpleNamespace(problem=problem, white={"extended": np.array([[1.0, 3.0]])})
+    v: Any = SimpleNamespace(problem=problem, white={"extended": np.array([[1.0, 3.0]])}, floor=np.ones(2))
     return unexplained(v, found, plant, [], [{"id": i, "alike": list(alike)} | more for i in weak], 0.06)
 
 
