@@ -67,7 +67,7 @@ def play(
         path.parent.mkdir(parents=True, exist_ok=True)
         write = video if path.suffix.lower() in VIDEOS else sheet
         write(path, frames)
-        console.print(f"{path}: {len(frames)} frames")
+        console.print(f"{path}: {len(frames)} frames", markup=False, emoji=False)
     return found
 
 

@@ -87,7 +87,7 @@ class Record:
         """A line that the next one replaces on a terminal."""
         if self.console is not None:
             end = "\r" if self.console.is_terminal and not last else "\n"
-            self.console.print(text, end=end, highlight=False, markup=False, soft_wrap=True)
+            self.console.print(text, end=end, highlight=False, markup=False, emoji=False, soft_wrap=True)
 
     def say(self, text: str) -> None:
         """A line that stays."""

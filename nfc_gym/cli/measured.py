@@ -52,7 +52,7 @@ def _print_findings(findings: "list[Finding]") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
+    console = Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 140)
     if not findings:
         console.print("Nothing wrong found.")
         return

@@ -105,7 +105,7 @@ def _print_learned(report: Mapping[str, Any], folder: Path) -> None:
     """What `learned.json` says: a row for each figure, before and after; else why nothing changed."""
     from rich.table import Table
 
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
+    console = Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 140)
     table = Table("", "judged by", "before", "after")
     for what in ("detector", "posterior"):
         found = report.get(what, {})
@@ -118,8 +118,8 @@ def _print_learned(report: Mapping[str, Any], folder: Path) -> None:
         if what in report:
             found = report[what]
             said = "changed" if found["changed"] else f"not changed: {found['why']}"
-            console.print(f"{what}: {said}", markup=False, soft_wrap=True)
-    console.print(f"all of it is in {folder}", markup=False, soft_wrap=True)
+            console.print(f"{what}: {said}", markup=False, emoji=False, soft_wrap=True)
+    console.print(f"all of it is in {folder}", markup=False, emoji=False, soft_wrap=True)
 
 
 def _figure(value: list[float]) -> str:

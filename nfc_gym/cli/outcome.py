@@ -66,7 +66,7 @@ def _terminable() -> Iterator[None]:
 
 
 def _fail(ctx: typer.Context, code: int, message: str) -> NoReturn:
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
     if ctx.obj:
         console.print(traceback.format_exc(), markup=False)
     console.print(f"nfc-gym {ctx.info_name}: {printable(message)}", markup=False)

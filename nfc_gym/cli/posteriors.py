@@ -202,7 +202,7 @@ def infer(
             note = "  not shown" if each.width >= jobs.AS_WIDE else ""
             interval = f"{each.low:.4g} to {each.high:.4g}"
             table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
-        Console(highlight=False, width=None if sys.stdout.isatty() else 140).print(table)
+        Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 140).print(table)
 
 
 def _window(posterior: Path, mapping: Path, log: str | None, until: float | None) -> "Window":

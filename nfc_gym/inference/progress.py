@@ -49,4 +49,4 @@ class Spoken:
 
     def message(self, text: str) -> None:
         """One line."""
-        self.console.print(text, highlight=False)
+        self.console.print(text, highlight=False, markup=False, emoji=False)

@@ -247,5 +247,7 @@ def _show(console: Console, content: Mapping[str, Any], report: Mapping[str, Any
     console.print(words[outcome])
     console.print(
         f"The report: {out / 'report' / 'report.html'}. The machine was simulated; on yours: "
-        "nfc-gym close-loop MAPPING.yaml --out DIR"
+        "nfc-gym close-loop MAPPING.yaml --out DIR",
+        markup=False,
+        emoji=False,
     )

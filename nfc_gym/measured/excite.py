@@ -26,6 +26,7 @@ from nfc_gym.measured.fit import fit
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.proposal_page import render
 from nfc_gym.measured.questions import Present, Visible
+from nfc_gym.measured.telling import teller
 
 Array = NDArray[np.float64]
 _ROUNDS = 8  # iterations of a rival's refit to the simulated recording
@@ -82,12 +83,7 @@ def excite(
         raise InputError(f"--seconds {seconds:g}: want {_SHORTEST:g} to {_LONGEST:g}")
     out = _outputs(out if out is not None else mapping.with_name("excite.csv"), overwrite)
     mujoco.set_mju_user_warning(lambda message: None)
-    began = time.monotonic()
-
-    def say(text: str) -> None:
-        if console:
-            console.print(f"[dim]{time.monotonic() - began:6.1f} s[/dim]  {text}", highlight=False)
-
+    say = teller(console, time.monotonic())
     bench = make_bench(require(mapping)[0], jobs)
     task, report = _task(bench, fit, seconds, seed, say)
     stage = task.design.stage

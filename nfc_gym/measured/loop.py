@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.text import Text
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together
@@ -44,6 +45,7 @@ from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
 from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
+from nfc_gym.measured.telling import teller
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.untimed import untimed
 
@@ -147,7 +149,7 @@ def _close_loop(
     reports = {}
     for f in folds:
         if console:
-            console.print(f"[bold]fold {f.name}[/bold] ({len(reports) + 1} of {len(folds)})")
+            console.print(Text.assemble((f"fold {f.name}", "bold"), f" ({len(reports) + 1} of {len(folds)})"))
         if finished(f, done):
             reports[f.name] = json.loads((out / f.name / "report.json").read_text(encoding="utf-8"))
         else:
@@ -195,10 +197,7 @@ def _fold(
     began = time.monotonic()
     stages = Stages(out, key, overwrite, resume)
 
-    def tell(text: str) -> None:
-        if console:
-            console.print(f"[dim]{time.monotonic() - began:6.1f} s[/dim]  {text}")
-
+    tell = teller(console, began)
     run = _Run(bench, stages, seed, tell)
     fitting, selecting, verifying = (dataset.of(s, fold) for s in ("fit", "select", "verify"))
     if not verifying:
@@ -228,14 +227,12 @@ def _fold(
     outcome["seconds"] = round(time.monotonic() - began, 1)
     write(out, bench, final, outcome)
     stages.finish()
-    tell(
-        f"[bold]{outcome['verdict']}[/bold]: "
-        + ("; ".join(e["sentence"] for e in outcome["effects"]) or "no effect claimed")
-    )
+    claimed = "; ".join(e["sentence"] for e in outcome["effects"]) or "no effect claimed"
+    tell(f": {claimed}", lead=outcome["verdict"])
     if outcome["unexplained"]:
         left = outcome["unexplained"]
-        word = "[bold]UNEXPLAINED[/bold]" if outcome["verdict"] == "unexplained" else "left unexplained"
-        tell(f"{word} at {left['coordinate']}: {left['description']}")
+        lead, word = ("UNEXPLAINED", "") if outcome["verdict"] == "unexplained" else ("", "left unexplained")
+        tell(f"{word} at {left['coordinate']}: {left['description']}", lead=lead)
     for finding in outcome["findings"]:
         tell(finding["text"])
     return outcome

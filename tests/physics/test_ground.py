@@ -79,7 +79,7 @@ def test_grip_by_place_brakes_a_sled_by_the_friction_at_each_place(floor: float,
     braking = 0.6 * G * sum(0.5 * np.exp(-0.8 * (way + foot) / 2) for foot in (0.2, -0.2))
     spent = np.concatenate([[0], np.cumsum((braking[1:] + braking[:-1]) / 2 * way[1])])
     assert x[-1] == pytest.approx(float(np.interp(2.0**2 / 2, spent, way)), rel=0.02)
-    assert "55.1% less about (2.0, 0.0) m" in effect.say(theta)
+    assert "33.0% less about (1.0, 0.0) m" in effect.say(theta)
 
 
 def test_grip_by_place_is_looked_for_where_the_machine_was() -> None:

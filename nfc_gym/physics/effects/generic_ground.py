@@ -41,8 +41,8 @@ class GenericGrip(OnGround):
         self.grip(fields, np.exp(np.clip(share, -_MOST, _MOST)), (theta != 0).any(-1, keepdims=True))
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
-        turn, out = np.meshgrid(np.linspace(0, 2 * np.pi, 24, endpoint=False), [0.5, 1.0])
-        place = self.middle + self.reach * np.stack([out * np.cos(turn), out * np.sin(turn)], -1).reshape(-1, 2)
+        turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # half-way out: what lies further was seldom seen
+        place = self.middle + 0.5 * self.reach * np.stack([np.cos(turn), np.sin(turn)], -1)
         more = np.exp(np.clip(self.basis(place) @ theta, -_MOST, _MOST)) - 1
         ends = [(more[i], *place[i]) for i in (int(more.argmin()), int(more.argmax()))]
         where = [f"{abs(m):.1%} {'more' if m > 0 else 'less'} about ({x:.1f}, {y:.1f}) m" for m, x, y in ends]
