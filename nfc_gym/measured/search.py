@@ -326,10 +326,10 @@ class Search:
         Where next to nothing is left the ground's grip alone is asked: the medians by which that is measured hide what
         is wrong in one part of the world.
         """
-        pool = self.generics if arena.leftover > SILENT else [g for g in self.generics if isinstance(g, GenericGrip)]
-        if not pool:
-            return None
-        screened = self.lookout.screen(screen, pool, _GENERICS)
+        if arena.leftover > SILENT:
+            screened = self.lookout.screen(screen, self.generics, _GENERICS)
+        else:
+            screened = [screen.try_one(g) for g in self.generics if isinstance(g, GenericGrip)]
         worth = self.options.worth
         hopeful = [s for s in screened[:3] if s.gain > 0 and arena.promises(s) > arena.asked(s, worth)]
         judged = sorted((arena.enter([s]) for s in hopeful), key=lambda j: -j.total)
