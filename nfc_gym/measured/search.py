@@ -213,6 +213,8 @@ class Search:
         out.dropped = out.dropped or found.dropped
         ground = next((g for g in self.generics if g.id == found.generic and isinstance(g, GenericGrip)), None)
         if ground is not None and out.laws and self._grounded(arena, ground, out.fitted):
+            for law in out.rounds:
+                law.accepted, law.share, law.reason = [], 0.0, f"{ground.id} explains more"
             out = Remainder(arena.current, out.scanned, found.dropped, out.rounds)
         return out
 
