@@ -3,7 +3,8 @@
 A law that stands in for another one at the same joint takes most of it away and leaves there what differs: a motor that
 cogs and turns little is nearly a spring, and so is a hysteresis within its travel. A smooth function of the joint's
 position, speed, time or past then brings a good part of what the claim brought, and beside it the claim is not needed.
-Beside a law that is at work it brings next to nothing, however far the rest of the model is from the machine.
+Beside a law that is at work it brings next to nothing, however far the rest of the model is from the machine. A
+spring that yields is itself a function of the joint's past: of its form, and not of the cause, a better one speaks.
 """
 
 from collections.abc import Sequence
@@ -16,6 +17,8 @@ from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import loss, metric
 from nfc_gym.measured.screen import Screen
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.generic import GenericMemory
+from nfc_gym.physics.effects.hysteresis import Hysteresis
 from nfc_gym.physics.names import names
 
 _TRIED = 2  # smooth functions that are fitted beside a claim: straight lines do not rank them surely
@@ -38,7 +41,8 @@ def misshapen(arena: Arena, generics: Sequence[Effect], worth: float) -> dict[st
     screen = Screen(arena.fit_data.problem, arena.under, arena.current)
     for effect in arena.current.plant.effects:
         at = _joints(arena.current.plant.model, effect.where)
-        tried = sorted((screen.try_one(g) for g in generics if g.where[0] in at), key=lambda s: -s.gain)
+        asked = [g for g in generics if g.where[0] in at and not _of_its_kind(effect, g)]
+        tried = sorted((screen.try_one(g) for g in asked), key=lambda s: -s.gain)
         hopeful = [s for s in tried[:_TRIED] if arena.promises(s) > arena.asked(s, worth)]
         if not hopeful:
             continue
@@ -55,6 +59,11 @@ def misshapen(arena: Arena, generics: Sequence[Effect], worth: float) -> dict[st
         if _loss(arena, bare.enter([again]).fitted) - mended < _NEEDED * (without - alone):
             out[effect.id] = beside
     return out
+
+
+def _of_its_kind(effect: Effect, generic: Effect) -> bool:
+    """Whether a smooth function has an effect as one of its terms, whatever it mends of what that leaves."""
+    return effect.family == Hysteresis.family and isinstance(generic, GenericMemory)
 
 
 def _loss(arena: Arena, fitted: Fit) -> float:
