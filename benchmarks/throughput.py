@@ -337,10 +337,10 @@ def main() -> None:
     args = parser.parse_args()
     quick = args.quick
     use_clock(args.clock)
-    turns = 3 if quick else 25
+    turns = 2 if quick else 25
     robots = ["Jackal"] if quick else ["Jackal", "Quadcopter", "Quadruped", "Ant", "Humanoid"]
     grounds = [f"{robot}{ground}" for robot in robots for ground in ("Flat", "Rough")]
-    sizes = [16, 256] if quick else [1, 16, 256, 1024]
+    sizes = [64] if quick else [1, 16, 256, 1024]
     versions = ", ".join(f"{m.__name__} {m.__version__}" for m in (mujoco, gymnasium, np))
     print(f"{versions}; {CORES} cores, {args.clock} time")
     table = Table()
@@ -348,7 +348,7 @@ def main() -> None:
         "vector": lambda: vector(table, grounds, sizes, turns),
         "elevation": lambda: elevation(table, turns),
         "async": lambda: asynchronous(table, 64, turns),
-        "ant": lambda: ant(table, [16, 256] if quick else [16, 256, 1024], turns),
+        "ant": lambda: ant(table, [64] if quick else [16, 256, 1024], turns),
         "single": lambda: single(table, [f"{robot}Flat" for robot in robots] + ["Ant-v5"], turns),
         "torchrl": lambda: torchrl(table, turns),
         "memory": lambda: memory(table, [256 if quick else 1024]),
