@@ -61,7 +61,8 @@ def unexplained(
         told = next(r["sentence"] for round_ in found.rounds for r in round_.ranking if r["id"] == found.generic)
         root = mujoco.mj_id2name(plant.model, mujoco.mjtObj.mjOBJ_BODY, base_on_ground(plant.model))
         text = f"looks like {_inner(told)}, of no law of the library{near}"
-        return {"coordinate": f"body:{root}:pos", "where": "ground"} | out | {"description": text}
+        coordinate = f"body:{root}:pos" if root else "ground"  # a base without a name has no channel
+        return {"coordinate": coordinate, "where": "ground"} | out | {"description": text}
     if scanned is not None and scanned.nearest is not None:
         law = scanned.nearest.law
         law.bind(plant.model)
