@@ -29,7 +29,6 @@ from nfc_gym.measured.sparser import sparser
 from nfc_gym.measured.suspects import Suspects
 from nfc_gym.measured.swap import swapped
 from nfc_gym.physics.effects.base import Effect
-from nfc_gym.physics.effects.generic_ground import GenericGrip
 from nfc_gym.physics.effects.law import Law
 from nfc_gym.physics.rollout import Plant
 
@@ -211,7 +210,7 @@ class Search:
         laws = LawSearch(self.laws, self.options.worth, lambda f: self.settle(f.plant, f.x), self._prune)
         out = laws.run(arena, found.calibrated, found.misshapen, sure=found.generic is not None)
         out.dropped = out.dropped or found.dropped
-        ground = next((g for g in self.generics if g.id == found.generic and isinstance(g, GenericGrip)), None)
+        ground = next((g for g in self.generics if g.id == found.generic and g.patchy), None)
         if ground is not None and out.laws and self._grounded(arena, ground, out.fitted):
             for law in out.rounds:
                 law.accepted, law.share, law.reason = [], 0.0, f"{ground.id} explains more"
@@ -331,7 +330,7 @@ class Search:
         if arena.leftover > SILENT:
             screened = self.lookout.screen(screen, self.generics, _GENERICS)
         else:
-            screened = [screen.try_one(g) for g in self.generics if isinstance(g, GenericGrip)]
+            screened = [screen.try_one(g) for g in self.generics if g.patchy]
         worth = self.options.worth
         hopeful = [s for s in screened[:3] if s.gain > 0 and arena.promises(s) > arena.asked(s, worth)]
         judged = sorted((arena.enter([s]) for s in hopeful), key=lambda j: -j.total)

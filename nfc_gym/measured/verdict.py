@@ -20,6 +20,7 @@ from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 CAUSE = 0.5  # of the error beyond the noise: what claims must take away of it to be causes where something remains
+_WILD = 1e6  # of a squared whitened number: more counts as this much
 
 
 @dataclass(frozen=True)
@@ -55,15 +56,19 @@ class Verified:
         return mean_square(self.problem, self.white[stage])
 
 
+def squared(white: Array) -> Array:
+    """Squares of whitened numbers, bounded so that one wild block does not decide."""
+    return np.minimum(white**2, _WILD)
+
+
 def mean_square(problem: Problem, white: Array) -> float:
-    """Mean of whitened squares over what counts; a block's share is bounded so that one wild block does not decide."""
-    squares = np.minimum(white**2, 1e6)
-    return float(squares[problem.mask].mean())
+    """Mean of whitened squares over what counts."""
+    return float(squared(white)[problem.mask].mean())
 
 
 def column_means(problem: Problem, white: Array) -> Array:
     """(m,) mean of whitened squares (S, m) of each compared number over the blocks in which it counts; 0 in none."""
-    squares = np.where(problem.mask, np.minimum(white**2, 1e6), 0.0)
+    squares = np.where(problem.mask, squared(white), 0.0)
     return squares.sum(0) / np.maximum(problem.mask.sum(0), 1)
 
 
@@ -250,8 +255,8 @@ def excess_shares(v: Verified, problem: Problem, fitted: Fit, calibrated: tuple[
 def gain_interval(v: Verified, rng: np.random.Generator) -> tuple[float, float]:
     """95 % interval of the ratio of extended to calibrated chi-squared over the verification logs."""
     blocks = clusters(v.problem)
-    before = np.minimum(v.white["calibrated"] ** 2, 1e6).sum(1)
-    after = np.minimum(v.white["extended"] ** 2, 1e6).sum(1)
+    before = squared(v.white["calibrated"]).sum(1)
+    after = squared(v.white["extended"]).sum(1)
     seed = int(rng.integers(2**31))
     ratio = bootstrap(after, blocks, np.random.default_rng(seed)) / np.maximum(
         bootstrap(before, blocks, np.random.default_rng(seed)), 1e-12

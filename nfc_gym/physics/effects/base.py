@@ -142,6 +142,8 @@ class Effect(ABC):
     summary: ClassVar[str]
     # A member of the generic alternatives takes part in every contest but is never claimed by name.
     generic: ClassVar[bool] = False
+    # Whether it acts in some places of the world alone, so that medians over all of a log hide what it leaves.
+    patchy: ClassVar[bool] = False
     # Families that together do the same at the same place unless this law's own feature shows; else claimed instead.
     simpler: ClassVar[tuple[tuple[str, ...], ...]] = ()
     # Families that are special cases of this law at the same place: beside them it is no further alternative.

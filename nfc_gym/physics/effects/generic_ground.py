@@ -27,6 +27,7 @@ class GenericGrip(OnGround):
     family = "generic_grip"
     summary = "Friction of the ground that depends on the place"
     generic = True
+    patchy = True
     MODULATES = ("geom_friction",)
     PARAMS = tuple(Param(f"c{k}", "1", -3.0, 3.0, probes=(0.1,)) for k in range(5))
     middle, reach = np.zeros(2), np.ones(2)
