@@ -29,7 +29,10 @@ from posteriors.methods import METHODS, OURS, network_config
 FIRST, ONE = "first", "one"  # networks of the first round, and of one round of twice as many
 HELD_OUT = 0.1  # of each round's windows
 # How a second round trains: see `SequentialConfig`.
-WAYS = {"on": {}, "anew": {"anew": True}, "inside": {"inside": True}, "anew inside": {"anew": True, "inside": True}}
+WAYS = {
+    "on": {}, "anew": {"anew": True}, "posterior": {"proposal": "posterior"},
+    "anew posterior": {"anew": True, "proposal": "posterior"},
+}  # fmt: skip
 AXLE = "front_left_wheel_damping"  # the gain kv of its servo: 0 is a lost axle
 
 

@@ -14,7 +14,8 @@ from nfc_gym.adaptation.trajectory import Dataset, Trajectory
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
 from nfc_gym.inference.posterior import NeuralPosterior
-from nfc_gym.inference.sequential import SequentialConfig, sequential
+from nfc_gym.inference.proposals import TRUNCATED, SequentialConfig
+from nfc_gym.inference.sequential import sequential
 from nfc_gym.inference.train import TrainConfig
 
 
@@ -62,12 +63,22 @@ class Sequential:
       simulate: psi -> windows, `nfc_gym.simulate.Simulator` of the environment.
       rounds: see `inference.sequential`; the first draws from the prior, later ones where the posterior has mass.
       training: of each round.
+
+    Raises:
+      InputError: rounds of a posterior's own draws: what is corrected for one window misleads about the next.
     """
 
     posterior: NeuralPosterior
     simulate: Any
     rounds: SequentialConfig = field(default_factory=lambda: SequentialConfig(rounds=2))
     training: TrainConfig = field(default_factory=lambda: TrainConfig(epochs=20))
+
+    def __post_init__(self) -> None:
+        if self.rounds.proposal != TRUNCATED:
+            raise InputError(
+                f"Sequential: rounds want proposal={TRUNCATED!r}, got {self.rounds.proposal!r}: what a network learns "
+                "from a posterior's own draws is right for one window alone, and the next trajectory is another"
+            )
 
     def infer(self, trajectory: Trajectory) -> Sampler:
         """See `Inference`."""

@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 
 from nfc_gym.measured.contest import clusters
 from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.forced import forced
 from nfc_gym.measured.impulse import Tensor, impulse
 from nfc_gym.measured.metric import Metric
 from nfc_gym.measured.problem import Problem
@@ -51,11 +52,13 @@ class Scanned:
       proposals: beyond chance, best first, one a family.
       nearest: the best of all, beyond chance or not; None where no law moves anything.
       places: share of the misfit that the best law on each degree of freedom takes away, largest first.
+      evidence: of a force of any course on each joint, nats, largest first (`forced`).
     """
 
     proposals: list[Proposal]
     nearest: Proposal | None
     places: dict[str, float]
+    evidence: dict[str, float]
 
 
 class _Scan:
@@ -136,11 +139,13 @@ def scan(problem: Problem, metric: Metric, current: Fit, laws: Sequence[Law], rn
     laws = [law for law in free if law is not None and law.id not in taken]
     for law in laws:
         law.bind(model)
-    tensor = impulse(problem, metric, current, _sizes(laws)) if laws else None
+    sizes = _sizes(laws)
+    tensor = impulse(problem, metric, current, sizes) if laws else None
     if tensor is None:
-        return Scanned([], None, {})
+        return Scanned([], None, {}, {})
     part = Fit(current.plant, current.x, current.white[tensor.index], current.jacobian[tensor.index])
-    run = _Scan(tensor, Screen(problem.take(tensor.index), metric.take(tensor.index), part), rng)
+    screen = Screen(problem.take(tensor.index), metric.take(tensor.index), part)
+    run = _Scan(tensor, screen, rng)
     found = sorted(((*run.best(law), law) for law in laws), key=lambda f: -f[0])
     refined = [run.refined(law, shape) for gain, shape, law in found[:_REFINED] if gain > 0]
     refined.sort(key=lambda p: -p.share)
@@ -151,7 +156,9 @@ def scan(problem: Problem, metric: Metric, current: Fit, laws: Sequence[Law], rn
     chance = float(run.luck.max()) / run.total
     kept = {p.law.family: p for p in reversed(refined) if p.share > chance}
     proposals = sorted(kept.values(), key=lambda p: -p.share)
-    return Scanned(proposals, refined[0] if refined else None, dict(sorted(places.items(), key=lambda kv: -kv[1])))
+    places = dict(sorted(places.items(), key=lambda kv: -kv[1]))
+    evidence = forced(model, run.tensor, sizes, screen.projected.reshape(part.white.shape))
+    return Scanned(proposals, refined[0] if refined else None, places, evidence)
 
 
 def _sizes(laws: Sequence[Law]) -> dict[int, float]:

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from nfc_gym.measured import wording
+from nfc_gym.measured.forced import surest
 from nfc_gym.measured.laws import Proposal
 from nfc_gym.measured.search import Found
 from nfc_gym.measured.verdict import Verified, column_means
@@ -63,6 +64,9 @@ def unexplained(
         text = f"looks like {_inner(told)}, of no law of the library{near}"
         coordinate = f"body:{root}:pos" if root else "ground"  # a base without a name has no channel
         return {"coordinate": coordinate, "where": "ground"} | out | {"description": text}
+    if scanned is not None and (joint := surest(scanned.evidence)) is not None:
+        text = f"a force of some course on {joint} explains it best, of which no law is sure; {reason}{near}"
+        return _joint(plant.model, joint) | out | {"description": text}
     if scanned is not None and scanned.nearest is not None:
         law = scanned.nearest.law
         law.bind(plant.model)
@@ -94,6 +98,15 @@ def _place(model: mujoco.MjModel, law: Effect) -> dict[str, str]:
     body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.dof_bodyid[dof]))
     kind = ("linvel" if i < 3 else "angvel") if law.family in _SPEEDS else ("pos" if i < 3 else "quat")
     return {"coordinate": f"body:{body}:{kind}[{i % 3}]", "where": f"joint:{name}"}
+
+
+def _joint(model: mujoco.MjModel, joint: str) -> dict[str, str]:
+    """`coordinate` and `where` of a joint; of a free one its body's place."""
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+    if index < 0 or model.jnt_type[index] != mujoco.mjtJoint.mjJNT_FREE:
+        return {"coordinate": f"joint:{joint}:pos", "where": f"joint:{joint}"}
+    body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.jnt_bodyid[index]))
+    return {"coordinate": f"body:{body}:pos", "where": f"joint:{joint}"}
 
 
 def _nearest(found: Found) -> tuple[str | None, float]:

@@ -1,4 +1,4 @@
-"""Truncated proposals on a posterior that is known."""
+"""Proposals of later rounds on a posterior that is known."""
 
 from copy import deepcopy
 
@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 from problems import NOISE, box, gaussian, linear_windows, mix, network
+from scipy.stats import kstest, norm
 
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.inference.posterior import NeuralPosterior, Window
-from nfc_gym.inference.sequential import SequentialConfig, TruncatedPrior, sequential
+from nfc_gym.inference.proposals import Corrected, Proposed, SequentialConfig, TruncatedPrior, told
+from nfc_gym.inference.sequential import sequential
 from nfc_gym.inference.train import TrainConfig, train
 
 X = torch.tensor([[0.8, -0.5, 0.3]])
@@ -33,11 +35,11 @@ def test_proposals_are_the_prior_where_the_posterior_has_mass(way: str) -> None:
     psi = getattr(proposal, way)(400, np.random.default_rng(1))
     assert psi.shape == (400, 3)
     # all above the threshold
-    assert (proposal._gain(psi) > proposal.threshold).all()
+    assert (told(proposal.posterior, psi) > proposal.threshold).all()
     # and as the prior is there: the same means and spreads as brute rejection from it
     rng, prior = np.random.default_rng(2), given().prior
     brute = prior.psi_of(rng.uniform(size=(40000, 3)))
-    brute = brute[proposal._gain(brute) > proposal.threshold]
+    brute = brute[told(proposal.posterior, brute) > proposal.threshold]
     assert proposal.kept == pytest.approx(len(brute) / 40000, rel=0.2)
     u, v = prior.u_of(psi), prior.u_of(brute)
     tolerance = 0.02 if way == "_rejected" else 0.05  # resampled draws thin out at the edge
@@ -48,7 +50,7 @@ def test_proposals_are_the_prior_where_the_posterior_has_mass(way: str) -> None:
 def test_the_truth_is_hardly_ever_cut_off() -> None:
     proposal = TruncatedPrior(given(), SequentialConfig(), np.random.default_rng(0))
     truths = gaussian(X[0]).sample((4000,)).double().numpy()
-    inside = proposal._gain(box(3).from_z(truths)) > proposal.threshold
+    inside = told(proposal.posterior, box(3).from_z(truths)) > proposal.threshold
     assert inside.mean() > 0.995
 
 
@@ -107,31 +109,101 @@ def test_windows_of_the_prior_that_were_learned_before_are_the_first_round() -> 
     assert (gains > proposal.threshold).mean() < 1
 
 
-def test_a_later_round_may_train_new_weights_and_leave_out_what_it_could_not_draw() -> None:
+def test_a_later_round_may_train_new_weights() -> None:
     begun = linear_windows(400)
-    training = TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95)
     learned = network(begun, linear=True)
-    train(learned, *begun.split(0.1), training)
+    train(learned, *begun.split(0.1), TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95))
     of = {"rounds": 2, "simulations": 300, "samples": 150, "oversampling": 4, "narrows": -np.inf}
     untrained = TrainConfig(epochs=1, batch=64, rate=1e-12, warmup=10, average=0.95)
     before = [w.clone() for w in learned.parameters()]
-    same, new = (
-        sequential(net, simulate, OBSERVED, SequentialConfig(anew=anew, inside=anew, **of), untrained, begun=begun)
-        for net, anew in ((deepcopy(learned), False), (deepcopy(learned), True))
-    )
     apart = [
         max(
             float((w - b).detach().abs().max()) for w, b in zip(out.posterior.network.parameters(), before, strict=True)
         )
-        for out in (same, new)
+        for out in (
+            sequential(deepcopy(learned), simulate, OBSERVED, SequentialConfig(anew=anew, **of), untrained, begun=begun)
+            for anew in (False, True)
+        )
     ]
     assert apart[0] < 1e-6 < apart[1]
-    assert len(same.windows) == 700
-    # All that is drawn lies inside what the proposal can draw, and so does what is left of the prior's windows.
-    assert 310 < len(new.windows) < 690
-    old = new.windows.tensors["psi"].shape[0] - 300
-    spread = [w.tensors["psi"].std(0).mean() for w in (begun, new.windows)]
-    assert spread[1] < 0.8 * spread[0], old
+
+
+class Normal:
+    """A posterior of one parameter in [-1, 0], normal in probit space."""
+
+    prior = box(1)
+
+    def __init__(self, mean: float, sd: float) -> None:
+        self.mean, self.sd = mean, sd
+
+    def log_prob(self, x: Fidelity) -> np.ndarray:
+        z = self.prior.to_z(np.atleast_2d(x.psi))[:, 0]
+        change = (z**2 + np.log(2 * np.pi)) / 2 - self.prior.log_volume
+        return norm.logpdf(z, self.mean, self.sd) + change
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        return Fidelity(self.prior.from_z(self.mean + self.sd * rng.normal(size=(n, 1))))
+
+
+class Tilted(Normal):
+    """What is learned if half of the windows are draws of `proposed`: times (1 + proposed / prior) / 2."""
+
+    def __init__(self, mean: float, sd: float, proposed: Normal) -> None:
+        super().__init__(mean, sd)
+        self.proposed, self.grid = proposed, np.linspace(-6, 6, 40001)
+        at = Fidelity(self.prior.from_z(self.grid[:, None]))
+        change = (self.grid**2 + np.log(2 * np.pi)) / 2 - self.prior.log_volume
+        weight = np.exp(super().log_prob(at) - change) * (1 + np.exp(told(proposed, at.psi))) / 2
+        self.total = weight.sum() * (self.grid[1] - self.grid[0])
+        self.share = np.cumsum(weight) / weight.sum()
+
+    def log_prob(self, x: Fidelity) -> np.ndarray:
+        return super().log_prob(x) + np.log((1 + np.exp(told(self.proposed, x.psi))) / 2) - np.log(self.total)
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        return Fidelity(self.prior.from_z(np.interp(rng.uniform(size=(n, 1)), self.share, self.grid)))
+
+
+@pytest.mark.parametrize(
+    "proposed", [Normal(0.5, 0.3), Normal(-0.3, 0.2)]
+)  # as good as the posterior, and far beside it
+def test_what_was_learned_from_a_posteriors_draws_is_corrected(proposed: Normal) -> None:
+    truth = Normal(0.6, 0.3)
+    config = SequentialConfig(samples=20000, oversampling=16)
+    corrected = Corrected(Tilted(0.6, 0.3, proposed), [(proposed, 300)], 300, config, np.random.default_rng(0))
+    at = truth.sample(200, np.random.default_rng(1))
+    np.testing.assert_allclose(corrected.log_prob(at), truth.log_prob(at), atol=0.03)
+    z = box(1).to_z(corrected.sample(2000, np.random.default_rng(2)).psi)[:, 0]
+    assert kstest(z, norm(0.6, 0.3).cdf).statistic < 0.05
+    # without the correction it is another one
+    assert np.abs(corrected.learned.log_prob(at) - truth.log_prob(at)).max() > 0.2
+
+
+def test_draws_of_a_posterior_are_proposed() -> None:
+    proposal = Proposed(Normal(0.5, 0.3), SequentialConfig(), np.random.default_rng(0))
+    assert kstest(box(1).to_z(proposal.sample(2000, np.random.default_rng(1)))[:, 0], norm(0.5, 0.3).cdf).pvalue > 0.01
+    # e to the entropy relative to the prior, which is a standard normal there
+    gain = -np.log(0.3) - 0.5 + (0.5**2 + 0.3**2) / 2
+    assert proposal.kept == pytest.approx(np.exp(-gain), rel=0.05)
+
+
+def test_rounds_of_a_posteriors_draws_come_to_the_posterior() -> None:
+    net = network(linear_windows(300), linear=True, density="mixture", components=3)
+    config = SequentialConfig(rounds=3, simulations=300, samples=500, proposal="posterior", narrows=-np.inf)
+    training = TrainConfig(epochs=20, batch=64, rate=2e-3, warmup=10, average=0.95)
+    out = sequential(net, simulate, OBSERVED, config, training)
+    assert isinstance(out.posterior, Corrected)
+    assert [n for _, n in out.posterior.proposals] == [300, 300]
+    assert len(out.windows) == 900
+    exact = gaussian(X[0])
+    z = box(3).to_z(out.posterior.sample(3000, np.random.default_rng(0)).psi)
+    sd = exact.covariance_matrix.diagonal().sqrt().numpy()
+    assert np.abs((z.mean(0) - exact.mean.numpy()) / sd).max() < 0.3
+    assert np.abs(np.log(z.std(0) / sd)).max() < 0.25
+    # The third round's draws come of the second's posterior, which is kept as it was then.
+    second = out.posterior.proposals[1][0]
+    assert second.network is not net
+    assert isinstance(second, Corrected)
 
 
 def test_bad_settings_are_refused() -> None:
@@ -139,3 +211,5 @@ def test_bad_settings_are_refused() -> None:
         SequentialConfig(rounds=0)
     with pytest.raises(InputError, match="quantile"):
         SequentialConfig(quantile=0.0)
+    with pytest.raises(InputError, match="truncated, posterior, got 'prior'"):
+        SequentialConfig(proposal="prior")

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from nfc_gym.measured.laws import Scanned
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.remainder import Remainder
 from nfc_gym.measured.unexplained import unexplained
@@ -15,7 +16,7 @@ from nfc_gym.physics.rollout import Plant
 
 MODEL = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
 <body pos="0 0 1"><joint name="knee"/><geom size="0.1" contype="0" conaffinity="0"/></body>
-<body name="car" pos="0 0 0.1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
+<body name="car" pos="0 0 0.1"><freejoint name="root"/><geom size="0.1"/></body></worldbody></mujoco>"""
 RANKED = {"id": "coulomb:knee", "generic": False, "share": 0.3}
 
 
@@ -24,12 +25,13 @@ def said(
     weak: tuple[str, ...] = (),
     alike: tuple[str, ...] = (),
     ranked: dict[str, Any] | None = None,
+    evidence: dict[str, float] | None = None,
     **more: str,
 ) -> dict[str, Any]:
     model = mujoco.MjModel.from_xml_string(MODEL)
     plant = Plant(model, ParameterSpace(model, []), nthread=1)
     rows = [RANKED] if ranked is None else [RANKED, ranked]
-    rest = Remainder(fitted=None)  # type: ignore[arg-type]
+    rest = Remainder(fitted=None, scanned=Scanned([], None, {}, evidence or {}))  # type: ignore[arg-type]
     found: Any = SimpleNamespace(generic=generic, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
     columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
@@ -65,3 +67,13 @@ def test_what_takes_away_too_little_is_named_as_the_nearest_and_no_cause() -> No
 def test_what_mends_a_claim_of_another_form_is_said() -> None:
     text = said(None, ("spring_offset:knee",), mended_by="generic_position:knee")["description"]
     assert "but a smooth force by position at knee mends much of what that leaves" in text
+
+
+def test_a_force_without_a_law_is_placed_where_its_evidence_leads() -> None:
+    found = said(None, evidence={"root": 300.0, "knee": 160.0})
+    assert (found["coordinate"], found["where"]) == ("body:car:pos", "joint:root")
+    assert found["description"].startswith("a force of some course on root explains it best, of which no law is sure")
+    found = said(None, evidence={"knee": 300.0, "root": 160.0})
+    assert (found["coordinate"], found["where"]) == ("joint:knee:pos", "joint:knee")
+    # a lead that is no lead: where the misfit is most times the noise
+    assert said(None, evidence={"root": 300.0, "knee": 295.0})["coordinate"] == "joint:knee (joint speed)"

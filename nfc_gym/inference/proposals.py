@@ -1,0 +1,199 @@
+"""What later rounds simulate: the prior where a posterior has mass, or draws of the posterior itself.
+
+Draws of a posterior teach a network the posterior under another prior than the box. That prior is known, since every
+round's proposal has a density, and so is the way back (Papamakarios and Murray 2016); as the first round's windows are
+of the box, the correction is bounded (a defensive mixture: Hesterberg 1995), whatever the posterior got wrong.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.inference.posterior import NeuralPosterior
+from nfc_gym.inference.space import PriorBox
+
+Array = NDArray[np.float64]
+TRUNCATED, POSTERIOR = PROPOSALS = ("truncated", "posterior")
+QUANTILE = 5e-4  # of the posterior's density, below which nothing is proposed
+_NARROWS = 0.05  # nats of posterior entropy that a round must win, or the rounds end
+
+
+@dataclass(frozen=True)
+class SequentialConfig:
+    """How rounds are made.
+
+    Attributes:
+      rounds: at most.
+      simulations: a round.
+      quantile: of the posterior's density, below which truncated proposals have nothing.
+      samples: posterior draws that set the threshold and the bounding box, or the normaliser of a corrected posterior.
+      oversampling: candidates for each draw that importance resampling chooses from.
+      narrows: nats of entropy that a round must take from the posterior for another to follow.
+      held_out: share of each round that is held out.
+      anew: whether every later round trains a network of new weights; one that goes on from the last round's may learn
+        what is new less well (Ash and Adams, On warm-starting neural network training, NeurIPS 2020).
+      proposal: of later rounds: "truncated", the prior where the posterior has mass, or "posterior", draws of it.
+      seed: of proposals, simulations and new weights.
+    """
+
+    rounds: int = 5
+    simulations: int = 1000
+    quantile: float = QUANTILE
+    samples: int = 2000
+    oversampling: int = 16
+    narrows: float = _NARROWS
+    held_out: float = 0.1
+    anew: bool = False
+    proposal: str = TRUNCATED
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1 or self.simulations < 20 or self.samples < 100 or self.oversampling < 1:
+            raise InputError("sequential: want rounds >= 1, simulations >= 20, samples >= 100 and oversampling >= 1")
+        if not 0 < self.quantile < 0.5 or not 0 < self.held_out < 1:
+            raise InputError(f"sequential: quantile in (0, 0.5), held_out in (0, 1): {self.quantile}, {self.held_out}")
+        if self.proposal not in PROPOSALS:
+            raise InputError(f"sequential: proposal is one of {', '.join(PROPOSALS)}, got {self.proposal!r}")
+
+
+class TruncatedPrior:
+    """The uniform prior, where a posterior's density exceeds a quantile of its own draws' densities.
+
+    Plain rejection from the prior accepts one in e^gain: never, in 37 dimensions. Rejection inside the bounding box of
+    the posterior's draws is exact and used where it accepts enough; elsewhere posterior draws above the threshold are
+    resampled with weights prior / posterior.
+
+    Args:
+      posterior: given a window.
+      config: see `SequentialConfig`.
+      rng: of the draws that set the threshold.
+
+    Attributes:
+      threshold: log density, relative to the prior, that a proposal exceeds.
+      kept: share of the prior's volume above it, estimated from posterior draws.
+    """
+
+    def __init__(self, posterior: NeuralPosterior, config: SequentialConfig, rng: np.random.Generator) -> None:
+        self.posterior, self.config = posterior, config
+        psi = drawn(posterior, config.samples, rng)
+        gain = told(posterior, psi)
+        self.threshold = float(np.quantile(gain, config.quantile))
+        u = posterior.prior.u_of(psi)
+        margin = (u.max(0) - u.min(0)) / config.samples  # a bounding box of draws is a little too small
+        self.low, self.high = np.clip(u.min(0) - margin, 0, 1), np.clip(u.max(0) + margin, 0, 1)
+        inside = gain > self.threshold
+        self.kept = float(min(1.0, np.exp(-gain[inside]).sum() / config.samples))
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """(n, d) psi, physical units."""
+        free = np.array(self.posterior.prior.free)
+        share = self.kept / max(float(np.prod((self.high - self.low)[free])), 1e-300)
+        if share * self.config.oversampling >= 1:
+            found = self._rejected(n, rng)
+            if len(found) == n:
+                return found
+        return self._resampled(n, rng)
+
+    def _rejected(self, n: int, rng: np.random.Generator) -> Array:
+        found: list[Array] = []
+        for _ in range(4):
+            u = rng.uniform(self.low, self.high, (n * self.config.oversampling, len(self.low)))
+            psi = self.posterior.prior.psi_of(u)
+            found.append(psi[told(self.posterior, psi) > self.threshold])
+            if sum(map(len, found)) >= n:
+                break
+        return np.concatenate(found)[:n]
+
+    def _resampled(self, n: int, rng: np.random.Generator) -> Array:
+        psi = drawn(self.posterior, n * self.config.oversampling, rng)
+        gain = told(self.posterior, psi)
+        return psi[chosen(np.where(gain > self.threshold, -gain, -np.inf), n, rng)]
+
+
+class Corrected:
+    """The posterior under the prior's box, of a network that learned from draws of earlier posteriors too.
+
+    With shares c_i of all windows from proposals g_i and the rest from the prior p the network learns the likelihood
+    times r p, where r = c_0 + sum_i c_i g_i / p is at least c_0. Dividing by r is what is left to do.
+
+    Args:
+      learned: what the network says, given the window.
+      proposals: (posterior given the same window, number of windows drawn from it).
+      first: number of windows drawn from the prior.
+      config: `samples` draws set the normaliser; `oversampling` candidates are drawn for each sample.
+      rng: of these draws.
+    """
+
+    def __init__(
+        self, learned: NeuralPosterior, proposals: "Sequence[tuple[Believed, int]]", first: int,
+        config: SequentialConfig, rng: np.random.Generator,
+    ) -> None:  # fmt: skip
+        self.learned, self.proposals, self.first, self.config = learned, tuple(proposals), first, config
+        self._log_norm = float(np.log(np.exp(-self._log_ratio(drawn(learned, config.samples, rng))).mean()))
+
+    @property
+    def network(self) -> Any:
+        """The network that learned."""
+        return self.learned.network
+
+    @property
+    def prior(self) -> PriorBox:
+        """Psi's box."""
+        return self.learned.prior
+
+    def _log_ratio(self, psi: Array) -> Array:
+        """(n,) log of the density that psi (n, d) of all windows were drawn with, over the prior's."""
+        counts = np.array([self.first, *(n for _, n in self.proposals)], float)
+        gains = [np.zeros(len(psi))]
+        gains += [told(g, psi) for g, _ in self.proposals]
+        weighted = np.stack(gains) + np.log(counts / counts.sum())[:, None]
+        return np.logaddexp.reduce(weighted, 0)
+
+    def log_prob(self, x: Fidelity, **how: Any) -> Array:
+        """(n,) log density in nats; see `NeuralPosterior.log_prob`."""
+        value = self.learned.log_prob(x, **how)
+        assert x.psi is not None  # or the line before had refused x
+        return value - self._log_ratio(np.atleast_2d(x.psi)) - self._log_norm
+
+    def sample(self, n: int, rng: np.random.Generator, **how: Any) -> Fidelity:
+        """`n` draws, chosen among `oversampling` times as many of the network's by importance."""
+        found = self.learned.sample(n * self.config.oversampling, rng, **how)
+        assert found.psi is not None  # a posterior always speaks of psi
+        return found[chosen(-self._log_ratio(found.psi), n, rng)]
+
+
+Believed = NeuralPosterior | Corrected
+
+
+def told(posterior: Believed, psi: Array) -> Array:
+    """(n,) nats that a window told about psi (n, d): log posterior / prior."""
+    return posterior.log_prob(Fidelity(psi)) + posterior.prior.log_volume
+
+
+def drawn(posterior: Believed, n: int, rng: np.random.Generator) -> Array:
+    """(n, d) psi of a posterior, physical units."""
+    psi = posterior.sample(n, rng).psi
+    assert psi is not None  # a posterior always speaks of psi
+    return psi
+
+
+def chosen(log_weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """(n,) indices drawn by weight without replacement: two simulations of one psi would tell less than two of two."""
+    return np.argsort(-(log_weight + rng.gumbel(size=len(log_weight))))[:n]
+
+
+class Proposed:
+    """Draws of a posterior as proposals; `kept` is e to the entropy relative to the prior, a share of its volume."""
+
+    def __init__(self, posterior: Believed, config: SequentialConfig, rng: np.random.Generator) -> None:
+        self.posterior = posterior
+        self.kept = float(np.exp(-told(posterior, self.sample(config.samples, rng)).mean()))
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """(n, d) psi, physical units."""
+        return drawn(self.posterior, n, rng)
