@@ -7,7 +7,7 @@ adds is lost in that. A robot that earns less than it did at home is not as it w
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from nfc_gym.core.errors import InputError
 
@@ -36,4 +36,4 @@ def chance(home: np.ndarray, returns: Sequence[float]) -> float:
     """
     last = np.asarray(returns, float)[-LAST:]
     poorer = (1 + (home[None] <= last[:, None]).sum(1)) / (1 + len(home))
-    return float(chi2.sf(-2 * np.log(poorer).sum(), 2 * len(last)))
+    return float(chdtrc(2 * len(last), -2 * np.log(poorer).sum()))

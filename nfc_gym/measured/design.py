@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import cma
 import numpy as np
 from numpy.typing import NDArray
 
@@ -127,6 +126,8 @@ class Design:
         start = best
         series = Series(start.series, start.pattern, self.stage.time)
         options = {"verbose": -9, "seed": int(rng.integers(1, 2**31)), "popsize": 2 * _BATCH}
+        import cma  # where it is used: see `fit.polish`
+
         walk = cma.CMAEvolutionStrategy(np.zeros(series.size), _STEP, options)
         while done < tries and time.monotonic() - began < budget and not walk.stop():
             z = walk.ask()

@@ -3,11 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cma
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from nfc_gym.measured.box import Box, box
 from nfc_gym.measured.metric import TURN, Metric, loss, loss_weight
@@ -210,6 +209,8 @@ def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed:
         values = objective(problem, metric, limits, draws, found.x)
         best, value = draws[values.argmin()], float(values.min())
     else:
+        import cma  # where it is used: it imports matplotlib, a second that few commands need
+
         bounds = [limits.floor.tolist(), limits.roof.tolist()]
         options = {"bounds": bounds, "maxfevals": evaluations, "verbose": -9, "seed": seed + 1}  # 0: the time of day
         search = cma.CMAEvolutionStrategy(z, _SPREAD, options)
@@ -258,7 +259,7 @@ def differs(result: Fit, blocks: NDArray[np.intp], effect: Effect, level: float 
             sizes[at : at + len(e.params)] = [not p.shape for p in e.params]
         at += len(e.params)
     away = (limits.at(result.x) - limits.at(result.plant.null))[sizes[limits.free]]
-    most = float(chi2.ppf(level, len(away)))
+    most = float(chdtri(len(away), 1 - level))
     own = np.ix_(sizes[limits.free], sizes[limits.free])
     plain, robust = _covariances(result, limits, blocks)
     # Few clusters leave directions in which nothing scatters, and a distance along those would count for nothing.

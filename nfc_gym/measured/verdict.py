@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured.contest import bootstrap, clusters
@@ -171,7 +171,7 @@ def null_bound(v: Verified) -> float:
     count = len(v.null)
     spread = max(float(v.null.std(ddof=1)), 0.01) if count > 1 else 0.05
     # Of one more draw from a normal population of which few have been seen.
-    factor = float(student.ppf(0.95, count - 1)) * np.sqrt(1 + 1 / count) if count > 1 else 1.645
+    factor = float(stdtrit(count - 1, 0.95)) * np.sqrt(1 + 1 / count) if count > 1 else 1.645
     return float(v.null.mean()) + factor * spread
 
 
