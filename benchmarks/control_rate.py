@@ -153,17 +153,18 @@ def main() -> None:
     timing.use_clock(args.clock)
     torch.set_num_threads(1)
     robots, repeats = (["Jackal"], 1) if args.quick else (args.robots, args.repeats)
+    threads = 1 if args.quick else args.threads
     table = Table()
     for robot in robots:
         with tempfile.TemporaryDirectory() as folder:
-            measure(table, robot, Path(folder), args, repeats)
+            measure(table, robot, Path(folder), threads, args.draws, repeats)
     if args.json:
         args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
 
 
-def measure(table: Table, robot: str, folder: Path, args: argparse.Namespace, repeats: int) -> None:
+def measure(table: Table, robot: str, folder: Path, threads: int, draws: int, repeats: int) -> None:
     """Rows of one robot."""
-    named, horizon, policy = contestants(f"nfc_gym/{robot}Flat-v0", folder, args.threads, args.draws)
+    named, horizon, policy = contestants(f"nfc_gym/{robot}Flat-v0", folder, threads, draws)
     motion = recorded(f"nfc_gym/{robot}Flat-v0", policy, horizon + EVERY)
     taken: dict[str, list[list[float]]] = {name: [] for name in named}
     for _ in range(repeats + 1):

@@ -124,7 +124,7 @@ def main() -> None:
     prepare(args.data, args.work)
     rows = []
     if args.quick:
-        args.sets = ["emps"]
+        args.sets, args.jobs = ["emps"], 1
         with open(args.work / "emps" / "mapping.yaml", "a", encoding="utf-8") as mapping:
             mapping.write(f"effects: {{only: [{', '.join(QUICK)}]}}\n")
     for name in args.sets:

@@ -121,11 +121,12 @@ def toy(args: argparse.Namespace, out: Path) -> None:
     from nfc_gym.adaptation.pretraining import pretrain
 
     args.places, args.grounds, args.seeds = ["JackalFlat"], ["Flat"], [0]
-    args.methods = [m for m in args.methods if m in ("random", "unadapted", "nfc", "no_nfc", "oracle", "falco")]
-    args.episodes, args.envs, args.steps, args.budget, args.executed, args.scenarios = 4, 16, 4_000, 2.0, 1, ["axle"]
+    args.methods = [m for m in args.methods if m in ("random", "unadapted", "nfc", "oracle", "falco")]
+    args.episodes, args.envs, args.steps, args.budget, args.executed, args.scenarios = 2, 16, 2_000, 1.0, 1, ["axle"]
+    args.threads = 1
     args.policies = args.posteriors = out / "toys"
     args.policies.mkdir(exist_ok=True)
-    pretrain("JackalFlat", args.policies / "JackalFlat.safetensors", steps=4_000, envs=16, threads=1)
+    pretrain("JackalFlat", args.policies / "JackalFlat.safetensors", steps=2_000, envs=16, threads=1)
     space = nominal_space(ROBOTS["jackal"])
     psi = np.random.default_rng(0).uniform(space.low, space.high, (64, len(space)))  # it knows no more than the prior
     np.savez(args.posteriors / "JackalFlat.npz", psi=psi)
@@ -167,7 +168,7 @@ def asked(args: argparse.Namespace) -> Iterator[tuple[str, World, str | None, in
 def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tables.Cells:
     """All cells that there are or are asked for."""
     cells = tables.Cells()
-    points, judged = (2, 4) if args.quick else (10, 32)
+    points, judged = (2, 2) if args.quick else (10, 32)
     budget = Budget(args.envs, args.steps, args.budget, args.executed, judged, points, args.threads, args.device,
                     args.ratio)  # fmt: skip
     for table, world, task, seed in asked(args):

@@ -7,7 +7,7 @@ Every process is `nfc-gym pretrain`; run again, each goes on from where it stopp
 each begins with the weights of its policy in that folder; one of rough ground, where there is none, with those of its
 flat twin (`package` stands for the policies that come with the package). Prints how each
 policy does in the nominal world over 64 whole episodes, beside a policy of uniformly random actions; DIR holds the
-policies, their curves and logs. `--quick` is a few seconds of JackalFlat.
+policies, their curves and logs. `--quick` is a few seconds of JackalFlat on one core.
 """
 
 import argparse
@@ -115,7 +115,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     args = parser.parse_args()
     if args.quick:
-        args.seconds, args.only, args.envs = 8, ["JackalFlat"], 256
+        args.seconds, args.only, args.envs, args.net, args.cores = 2, ["JackalFlat"], 32, "small", 1
     elif args.out is None:
         parser.error("name a folder: --out DIR")
     with tempfile.TemporaryDirectory() as folder:

@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         left = [t for t in tasks if kept.get(t) is None][args.most :]
         tasks = [t for t in tasks if t not in left]
     print(f"seed {seed} (drawn at run time unless given); {len(tasks)} trials, {args.jobs} at a time", flush=True)
-    threads = args.threads if args.threads is not None else (0 if args.jobs == 1 else 1)
+    threads = args.threads if args.threads is not None else (0 if args.jobs == 1 and not args.quick else 1)
     began = time.monotonic()
     rows: list[Row] = []
     try:
@@ -75,7 +75,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--baselines", type=float, default=0.2, metavar="SHARE", help="of single effects with the slow baselines")
     add("--seed", type=int, help="repeats a run; default drawn, or the one that --out was begun with")
     add("--jobs", type=int, default=1, help="trials at a time, each a process")
-    add("--threads", type=int, help="of a trial; default 1, all cores with --jobs 1")
+    add("--threads", type=int, help="of a trial; default 1, all cores with --jobs 1 and without --quick")
     add("--out", type=Path, metavar="DIR", help="keeps finished trials: a killed run goes on, a longer one adds")
     add("--begin", type=Path, metavar="FILE", help="take over seed and trials that an earlier run's --json wrote")
     add("--most", type=int, metavar="N", help="of trials that are not finished only the first N of the plan")
