@@ -82,9 +82,10 @@ def model_text(env: Any, model: mujoco.MjModel, given: str | None) -> str:
     """
     base = env.unwrapped
     holders = (base, *vars(base).values())
+    own = getattr(base, "mjcf", None) if given is None else None  # asked once: it is written when asked for
     file = given or next((f for f in (getattr(h, "fullpath", None) for h in holders) if f and Path(f).is_file()), None)
-    if given is None and isinstance(getattr(base, "mjcf", None), str):
-        spec = mujoco.MjSpec.from_string(base.mjcf)
+    if isinstance(own, str):
+        spec = mujoco.MjSpec.from_string(own)
     elif file is not None:
         spec = mujoco.MjSpec.from_file(str(file))
     else:

@@ -27,7 +27,7 @@ DRIVES = "front_left+front_right+rear_left+rear_right"
 def few() -> Iterator[None]:
     """Fewer segments and rounds than a mission's, in half the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 20)
+        patch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 14)
         patch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4, 0.2, 0.05))
         yield
 
@@ -121,7 +121,7 @@ def test_worlds_of_a_belief_have_its_effects_each_in_a_size_of_its_own(
 
 
 def test_sensors_noise_is_found_and_worlds_have_it() -> None:
-    q = Assimilation(ID)
+    q = Assimilation(ID, effects=False)
     sd = np.where(q.machine.noise > 0, 3 * q.machine.noise, 0.0)
     noisy = PerturbSignals(gym.make(ID, context=["psi"]), {"proprio": {"sd": sd.tolist()}})
     belief = q.infer(driven_in(noisy, {}, 200))

@@ -85,7 +85,7 @@ def test_rounds_close_in_and_end_where_they_no_longer_narrow() -> None:
 
 def test_windows_of_the_prior_that_were_learned_before_are_the_first_round() -> None:
     begun = linear_windows(400)
-    net = network(begun, linear=True)
+    net = network(begun, linear=True, density="mixture", components=3)
     training = TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95)
     train(net, *begun.split(0.1), training)
     weights = {k: t.clone() for k, t in net.state_dict().items()}
@@ -111,7 +111,7 @@ def test_windows_of_the_prior_that_were_learned_before_are_the_first_round() -> 
 
 def test_a_later_round_may_train_new_weights() -> None:
     begun = linear_windows(400)
-    learned = network(begun, linear=True)
+    learned = network(begun, linear=True, density="mixture", components=3)
     train(learned, *begun.split(0.1), TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95))
     of = {"rounds": 2, "simulations": 300, "samples": 150, "oversampling": 4, "narrows": -np.inf}
     untrained = TrainConfig(epochs=1, batch=64, rate=1e-12, warmup=10, average=0.95)
