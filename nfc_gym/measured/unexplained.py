@@ -64,13 +64,14 @@ def unexplained(
         text = f"looks like {_inner(told)}, of no law of the library{near}"
         coordinate = f"body:{root}:pos" if root else "ground"  # a base without a name has no channel
         return {"coordinate": coordinate, "where": "ground"} | out | {"description": text}
-    if scanned is not None and (joint := surest(scanned.evidence)) is not None:
-        text = f"a force of some course on {joint} explains it best, of which no law is sure; {reason}{near}"
-        return _joint(plant.model, joint) | out | {"description": text}
-    if scanned is not None and scanned.nearest is not None:
-        law = scanned.nearest.law
-        law.bind(plant.model)
-        return _place(plant.model, law) | out | {"description": f"{_guess(scanned.nearest)}; {reason}{near}"}
+    if scanned is not None:
+        joint, guess = surest(scanned.evidence), scanned.nearest
+        if joint is not None and (guess is None or _joint_of(guess.law) != joint):
+            text = f"a force of some course on {joint} explains it best, of which no law is sure; {reason}{near}"
+            return _joint(plant.model, joint) | out | {"description": text}
+        if guess is not None:
+            guess.law.bind(plant.model)
+            return _place(plant.model, guess.law) | out | {"description": f"{_guess(guess)}; {reason}{near}"}
     place, group, times = _worst(v)
     coordinate = place if place.startswith("sensor") else f"{place} ({group})"
     text = f"furthest beyond the noise, with {times:.3g} times its mean square; {reason}{near}"
@@ -89,7 +90,7 @@ def _guess(near: Proposal) -> str:
 def _place(model: mujoco.MjModel, law: Effect) -> dict[str, str]:
     """`coordinate` (a channel that shows the degree of freedom) and `where` of a law."""
     name = law.where[0].removesuffix("@body")
-    joint, _, rest = name.partition("[")
+    joint, rest = _joint_of(law), name.partition("[")[2]
     if not rest:
         kind = "vel" if law.family in _SPEEDS else "pos"
         return {"coordinate": f"joint:{joint}:{kind}", "where": f"joint:{joint}"}
@@ -98,6 +99,11 @@ def _place(model: mujoco.MjModel, law: Effect) -> dict[str, str]:
     body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.dof_bodyid[dof]))
     kind = ("linvel" if i < 3 else "angvel") if law.family in _SPEEDS else ("pos" if i < 3 else "quat")
     return {"coordinate": f"body:{body}:{kind}[{i % 3}]", "where": f"joint:{name}"}
+
+
+def _joint_of(law: Effect) -> str:
+    """The joint that a law pushes."""
+    return law.where[0].partition("[")[0]
 
 
 def _joint(model: mujoco.MjModel, joint: str) -> dict[str, str]:

@@ -7,10 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from nfc_gym.measured.laws import Scanned
+from nfc_gym.measured.laws import Proposal, Scanned
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.remainder import Remainder
 from nfc_gym.measured.unexplained import unexplained
+from nfc_gym.physics.effects.law_place import LawHeight
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -26,12 +27,13 @@ def said(
     alike: tuple[str, ...] = (),
     ranked: dict[str, Any] | None = None,
     evidence: dict[str, float] | None = None,
+    nearest: Proposal | None = None,
     **more: str,
 ) -> dict[str, Any]:
     model = mujoco.MjModel.from_xml_string(MODEL)
     plant = Plant(model, ParameterSpace(model, []), nthread=1)
     rows = [RANKED] if ranked is None else [RANKED, ranked]
-    rest = Remainder(fitted=None, scanned=Scanned([], None, {}, evidence or {}))  # type: ignore[arg-type]
+    rest = Remainder(fitted=None, scanned=Scanned([], nearest, {}, evidence or {}))  # type: ignore[arg-type]
     found: Any = SimpleNamespace(generic=generic, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
     columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
@@ -75,5 +77,12 @@ def test_a_force_without_a_law_is_placed_where_its_evidence_leads() -> None:
     assert found["description"].startswith("a force of some course on root explains it best, of which no law is sure")
     found = said(None, evidence={"knee": 300.0, "root": 160.0})
     assert (found["coordinate"], found["where"]) == ("joint:knee:pos", "joint:knee")
+    # a law on the same joint says more than that it is the joint, one on another joint is not asked
+    lift = LawHeight(("root[2]",))
+    near = Proposal(lift, lift.null, 0.2)
+    found = said(None, evidence={"root": 300.0, "knee": 160.0}, nearest=near)
+    assert found["coordinate"].startswith("body:car:")
+    assert found["coordinate"].endswith("[2]")
+    assert said(None, evidence={"knee": 300.0, "root": 160.0}, nearest=near)["coordinate"] == "joint:knee:pos"
     # a lead that is no lead: where the misfit is most times the noise
     assert said(None, evidence={"root": 300.0, "knee": 295.0})["coordinate"] == "joint:knee (joint speed)"
