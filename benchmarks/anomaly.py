@@ -248,7 +248,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write the rows here")
     args = parser.parse_args()
     if args.quick:
-        args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 20, 20, 4
+        args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 10, 10, 2
         args.training, args.epochs, args.effects, args.draws, args.levels = 64, 1, 1, 4, 50
         args.lessons = 50
     return args

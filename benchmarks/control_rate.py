@@ -152,7 +152,7 @@ def main() -> None:
     args = parser.parse_args()
     timing.use_clock(args.clock)
     torch.set_num_threads(1)
-    robots, repeats = (["Jackal"], 1) if args.quick else (args.robots, args.repeats)
+    robots, repeats = (["Jackal"], 0) if args.quick else (args.robots, args.repeats)
     threads = 1 if args.quick else args.threads
     table = Table()
     for robot in robots:
@@ -173,8 +173,9 @@ def measure(table: Table, robot: str, folder: Path, threads: int, draws: int, re
             taken[name].append(seconds(step, motion)[horizon:])
     plain = 0.0
     for name, runs in taken.items():
-        rate = 1 / statistics.median(statistics.fmean(r) for r in runs[1:])  # the first turn warms up
-        slow = max(max(r) for r in runs[1:])
+        runs = runs[1:] or runs  # the first turn warms up; a quick run has no other
+        rate = 1 / statistics.median(statistics.fmean(r) for r in runs)
+        slow = max(max(r) for r in runs)
         plain = plain or rate
         goal = PLAIN if name == "policy" else LOOP if "posterior" in name else None
         table.add(f"{robot}: {name}", rate, "Hz", baseline=plain, at_least=goal)

@@ -241,7 +241,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the rows there")
     args = parser.parse_args()
     seed = secrets.randbits(32) if args.seed is None else args.seed
-    cases = args.cases or (300 if args.quick else 10_000)
+    cases = args.cases or (200 if args.quick else 10_000)
     print(f"seed {seed}, {cases} cases", flush=True)
     began, folder = time.monotonic(), Path(tempfile.mkdtemp(prefix="malformed"))
     bench = Bench(seed, folder / "case", show=40)
