@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior
 from nfc_gym.inference.space import PriorBox
 
@@ -137,7 +138,7 @@ class Corrected:
         self._log_norm = float(np.log(np.exp(-self._log_ratio(drawn(learned, config.samples, rng))).mean()))
 
     @property
-    def network(self) -> Any:
+    def network(self) -> Network:
         """The network that learned."""
         return self.learned.network
 

@@ -67,7 +67,7 @@ def unexplained(
     if scanned is not None:
         joint, guess = surest(scanned.evidence), scanned.nearest
         if joint is not None and (guess is None or _joint_of(guess.law) != joint):
-            text = f"a force of some course on {joint} explains it best, of which no law is sure; {reason}{near}"
+            text = f"a force of unknown course on {joint} explains it best, and no law of it is sure; {reason}{near}"
             return _joint(plant.model, joint) | out | {"description": text}
         if guess is not None:
             guess.law.bind(plant.model)
@@ -112,7 +112,8 @@ def _joint(model: mujoco.MjModel, joint: str) -> dict[str, str]:
     if index < 0 or model.jnt_type[index] != mujoco.mjtJoint.mjJNT_FREE:
         return {"coordinate": f"joint:{joint}:pos", "where": f"joint:{joint}"}
     body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.jnt_bodyid[index]))
-    return {"coordinate": f"body:{body}:pos", "where": f"joint:{joint}"}
+    # a body without a name has no channel
+    return {"coordinate": f"body:{body}:pos" if body else f"joint:{joint}", "where": f"joint:{joint}"}
 
 
 def _nearest(found: Found) -> tuple[str | None, float]:

@@ -164,9 +164,8 @@ class Tilted(Normal):
         return Fidelity(self.prior.from_z(np.interp(rng.uniform(size=(n, 1)), self.share, self.grid)))
 
 
-@pytest.mark.parametrize(
-    "proposed", [Normal(0.5, 0.3), Normal(-0.3, 0.2)]
-)  # as good as the posterior, and far beside it
+# near the posterior, and far beside it
+@pytest.mark.parametrize("proposed", [Normal(0.5, 0.3), Normal(-0.3, 0.2)])
 def test_what_was_learned_from_a_posteriors_draws_is_corrected(proposed: Normal) -> None:
     truth = Normal(0.6, 0.3)
     config = SequentialConfig(samples=20000, oversampling=16)

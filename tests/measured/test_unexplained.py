@@ -28,9 +28,10 @@ def said(
     ranked: dict[str, Any] | None = None,
     evidence: dict[str, float] | None = None,
     nearest: Proposal | None = None,
+    text: str = MODEL,
     **more: str,
 ) -> dict[str, Any]:
-    model = mujoco.MjModel.from_xml_string(MODEL)
+    model = mujoco.MjModel.from_xml_string(text)
     plant = Plant(model, ParameterSpace(model, []), nthread=1)
     rows = [RANKED] if ranked is None else [RANKED, ranked]
     rest = Remainder(fitted=None, scanned=Scanned([], nearest, {}, evidence or {}))  # type: ignore[arg-type]
@@ -74,9 +75,13 @@ def test_what_mends_a_claim_of_another_form_is_said() -> None:
 def test_a_force_without_a_law_is_placed_where_its_evidence_leads() -> None:
     found = said(None, evidence={"root": 300.0, "knee": 160.0})
     assert (found["coordinate"], found["where"]) == ("body:car:pos", "joint:root")
-    assert found["description"].startswith("a force of some course on root explains it best, of which no law is sure")
+    assert found["description"].startswith(
+        "a force of unknown course on root explains it best, and no law of it is sure"
+    )
     found = said(None, evidence={"knee": 300.0, "root": 160.0})
     assert (found["coordinate"], found["where"]) == ("joint:knee:pos", "joint:knee")
+    unnamed = said(None, evidence={"root": 300.0}, text=MODEL.replace('<body name="car"', "<body"))
+    assert (unnamed["coordinate"], unnamed["where"]) == ("joint:root", "joint:root")
     # a law on the same joint says more than that it is the joint, one on another joint is not asked
     lift = LawHeight(("root[2]",))
     near = Proposal(lift, lift.null, 0.2)
