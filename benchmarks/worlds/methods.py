@@ -103,26 +103,48 @@ def no_nfc(job: Job) -> "Learned":
 
 
 def oracle(job: Job) -> "Learned":
-    """PPO in as many simulations of the true world as there is time for: what could be reached at all."""
+    """PPO in as many simulations of the true world as there is time for, at its best there: what could be reached."""
+    from nfc_gym.adaptation.agent import ppo_agent
+    from nfc_gym.adaptation.choice import Choice
+
     from .learning import improve, levelled, opened, true_world
 
     budget, policy = job.budget, opened(job.nominal, job.budget.device)
     envs = true_world(job.world, budget.envs, budget, job.seed, **job.settings)
-    found = improve(policy, envs, job.mean_return, budget, job.seed, budget.steps)
+    choice = Choice(ppo_agent(policy), lambda: job.mean_return(policy))
+    found = improve(policy, envs, lambda _: choice.judge(), budget, job.seed, budget.steps)
+    choice.take()
     found.notes["levelled"] = levelled(found.curve)
     return found
 
 
 def randomised(job: Job) -> "Learned":
-    """PPO for as many steps in the package's simulator, psi uniform over the whole prior: no posterior is asked."""
+    """PPO for as many steps in the package's simulator, psi uniform over the whole prior: no posterior is asked.
+
+    As with NFC, the weights on the way that did best in such worlds are kept.
+    """
+    from nfc_gym.adaptation.agent import ppo_agent
+    from nfc_gym.adaptation.algorithm import AdaptConfig
+    from nfc_gym.adaptation.choice import Choice
+    from nfc_gym.adaptation.evaluate import evaluate
     from nfc_gym.adaptation.worlds import training_env
 
     from .learning import EPISODE, improve, opened
 
-    budget, policy = job.budget, opened(job.nominal, job.budget.device)
-    envs = training_env(f"nfc_gym/{job.world.place}-v0", budget.envs, threads=budget.threads, seed=job.seed, spread=1.0,
-                        episode=EPISODE, settings=job.settings)  # fmt: skip
-    return improve(policy, envs, job.mean_return, budget, job.seed, budget.steps)
+    budget, policy, seed = job.budget, opened(job.nominal, job.budget.device), job.seed
+    shared = {"threads": budget.threads, "spread": 1.0, "episode": EPISODE, "settings": job.settings}
+    environment = f"nfc_gym/{job.world.place}-v0"
+    envs = training_env(environment, budget.envs, seed=seed, **shared)
+    tests = training_env(environment, AdaptConfig.judged, seed=seed, staggered=False, **shared)
+    choice = Choice(ppo_agent(policy), lambda: float(evaluate(policy, tests, seed).returns.mean()))
+
+    def judge(learning: Any) -> float:
+        choice.judge()
+        return job.mean_return(learning)
+
+    found = improve(policy, envs, judge, budget, seed, budget.steps)
+    choice.take()
+    return found
 
 
 def inference(job: Job) -> Any:

@@ -21,7 +21,7 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from nfc_gym.adaptation.network import Scale, perceptron
 from nfc_gym.adaptation.policy import Policy
-from nfc_gym.adaptation.ppo import Actor, Diverged, OnPolicy, Power, PPOConfig, clipped, summed
+from nfc_gym.adaptation.ppo import ONWARD, Actor, Diverged, OnPolicy, Power, PPOConfig, clipped, summed
 from nfc_gym.adaptation.sight import Sight
 from nfc_gym.core.errors import InputError
 
@@ -171,7 +171,7 @@ def ppo_agent(policy: Policy, config: PPOConfig | None = None) -> Agent:
 
     Its weights are the policy's: what is adapted is the policy that was given.
     """
-    config = config or PPOConfig(rate=1e-4)
+    config = config or ONWARD
     critic = policy.network.critic
     return Agent(
         policy.actor, lambda actor, size: clipped(actor, critic, config), policy.sight, on_policy=config,

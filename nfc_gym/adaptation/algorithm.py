@@ -4,7 +4,9 @@
 policy is touched only after an anomaly. A world that never shows one leaves it as it was, to the bit, and says so.
 """
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +20,9 @@ from torch import nn
 from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.agent import Agent
 from nfc_gym.adaptation.beliefs import Inference, inference_of, width
+from nfc_gym.adaptation.choice import Choice, weights_of
 from nfc_gym.adaptation.earned import RATE, chance, require_home
+from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portable, spread
 from nfc_gym.adaptation.hallucination import hallucination
 from nfc_gym.adaptation.imagined import imagined
@@ -34,6 +38,7 @@ from nfc_gym.inference.random import mixed
 from nfc_gym.wrappers.anomaly import opened
 
 STATE = "state.safetensors"
+_POINTS = 3  # how often weights are judged on the way of one mission's learning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +54,8 @@ class AdaptConfig:
       hallucinate: train pi_h too, which leans the draws in the policy's favour.
       parts: of the belief, those that are used where it speaks of them; ("psi",) is the paper's "w/o delta fidelity".
       beta: how far, in standard deviations of the belief, pi_h = 1 leads.
+      judged: episodes by which weights are chosen: those from before the first mission, those that each mission left
+        and those on the way now compete in worlds of the present belief, and the best are kept. 0 keeps the last.
       seed: of everything.
     """
 
@@ -59,6 +66,7 @@ class AdaptConfig:
     hallucinate: bool = True
     parts: Sequence[str] = ("psi", "delta_s", "delta_e", "effects", "noise")
     beta: float = 1.0
+    judged: int = 16
     seed: int = 0
 
 
@@ -117,7 +125,7 @@ def adapt(
         if tau.anomalous:
             belief = run.infer(tau)  # psi, phi ~ q(psi, phi | tau)
             worlds = run.hallucinate(belief)  # N of p(psi, phi | tau, pi_h)
-            run.optimise(worlds)  # pi', pi_h' = Policy-Opt(pi, pi_h, psi, phi)
+            run.optimise(worlds, belief)  # pi', pi_h' = Policy-Opt(pi, pi_h, psi, phi)
             run.update(tau, belief)  # q <- q({psi}, {phi} | {tau}): sequential NFC
         run.store(tau)  # T = T + tau
     return run.finish()  # fine-tune NFC with T
@@ -140,6 +148,7 @@ class _Run:
         self.folder = None if folder is None else Path(folder)
         self.record = Record(None if self.folder is None else self.folder / "log", console)
         self.pi_h: Gaussian | None = None
+        self.past = [copy.deepcopy(weights_of(agent))]
         self.t = self.steps = 0
         self.belief: Sampler | None = None
         self.history: list[dict[str, Any]] = []
@@ -175,27 +184,23 @@ class _Run:
     def hallucinate(self, belief: Sampler) -> VectorSight | RayWorlds:
         """N simulations of the belief; with pi_h each episode's psi and phi are mean + beta L pi_h."""
         config = self.config
-        sent = belief if self.cluster is None else portable(belief)
-        make = partial(
-            imagined, self.environment, sent, hallucinate=config.hallucinate, parts=config.parts, beta=config.beta,
-            episode=config.episode or self.world.spec.max_episode_steps or 1000, sight=self.agent.sight,
-            settings=self.settings,
-        )  # fmt: skip
+        make = self._imagined(belief if self.cluster is None else portable(belief), hallucinate=config.hallucinate)
         worlds = spread(make, config.worlds, self.threads, mixed(config.seed, self.t) % 2**31, self.cluster)
         fresh = pi_h_for(self.agent, worlds, mixed(config.seed, self.t, 1))
         if fresh is None or self.pi_h is None or self.pi_h.log_std.shape != fresh.log_std.shape:
             self.pi_h = fresh
         return worlds
 
-    def optimise(self, worlds: VectorSight | RayWorlds) -> None:
+    def optimise(self, worlds: VectorSight | RayWorlds, belief: Sampler) -> None:
         """Policy-Opt: pi and pi_h for the return in these worlds. A loss that comes apart changes nothing."""
-        try:
+        with closing(worlds), self._choice(belief) as choice:
+            if choice is not None:
+                self.now["best_so_far"] = choice.best
             self.now |= optimise(
                 self.agent, worlds, self.config.steps, pi_h=self.pi_h, seed=mixed(self.config.seed, self.t, 2),
-                record=self.record, before=self.steps,
+                record=self.record, before=self.steps, choice=choice, points=_POINTS,
             )  # fmt: skip
-        finally:
-            worlds.close()
+        self.past.append(copy.deepcopy(weights_of(self.agent)))
         self.steps += self.config.steps
         if "diverged" in self.now:
             self.record.say(f"mission {self.t}: {self.now['diverged']}; the policy is as before")
@@ -228,8 +233,32 @@ class _Run:
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 
+    def _imagined(self, belief: Sampler, **how: Any) -> Callable[..., VectorSight]:
+        """Makes simulations of the belief."""
+        return partial(
+            imagined, self.environment, belief, parts=self.config.parts, beta=self.config.beta,
+            episode=self.config.episode or self.world.spec.max_episode_steps or 1000, sight=self.agent.sight,
+            settings=self.settings, **how,
+        )  # fmt: skip
+
+    @contextmanager
+    def _choice(self, belief: Sampler) -> Iterator[Choice | None]:
+        """Between all weights so far and those to come; the agent has the best so far. None where nothing chooses."""
+        if not self.config.judged:
+            yield None
+            return
+        seed = mixed(self.config.seed, self.t, 3) % 2**31
+        make = self._imagined(belief, hallucinate=False, staggered=False)
+        with closing(make(self.config.judged, threads=self.threads, seed=seed)) as envs:
+
+            def judge() -> float:
+                return float(evaluate(self.agent, envs, seed).returns.mean())
+
+            yield Choice(self.agent, judge, [module.state_dict() for module in self.past[:-1]])
+
     def _modules(self) -> dict[str, nn.Module]:
-        modules: dict[str, nn.Module] = {"agent": self.agent.weights or self.agent.actor}
+        modules: dict[str, nn.Module] = {"agent": weights_of(self.agent)}
+        modules |= {f"past_{k}": module for k, module in enumerate(self.past)}
         return modules if self.pi_h is None else {**modules, "pi_h": self.pi_h}
 
     def _described(self) -> dict[str, Any]:
@@ -242,7 +271,7 @@ class _Run:
         if self.folder is None:
             return
         size = 0 if self.pi_h is None else len(self.pi_h.log_std)
-        plain = {"t": self.t, "steps": self.steps, "pi_h": size, "history": self.history}
+        plain = {"t": self.t, "steps": self.steps, "pi_h": size, "past": len(self.past), "history": self.history}
         resume.save(self.folder / STATE, self._modules(), None, plain, self._described())
 
     def _go_on(self) -> None:
@@ -251,7 +280,9 @@ class _Run:
         if path is None or not path.is_file():
             self.dataset = Dataset(self.folder)
             return
-        size = int(resume.plain(path)["pi_h"])
+        kept = resume.plain(path)
+        self.past += [copy.deepcopy(self.past[0]) for _ in range(kept["past"] - 1)]
+        size = int(kept["pi_h"])
         if size:
             self.pi_h = hallucination(self.agent.sight.size, size).to(self.agent.device)
         plain = resume.load(path, self._modules(), None, self._described())

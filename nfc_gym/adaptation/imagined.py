@@ -63,6 +63,7 @@ def spoken(posterior: Sampler, wanted: Sequence[str]) -> tuple[str, ...]:
 def imagined(
     environment: str, belief: Sampler, n: int, *, hallucinate: bool, parts: Sequence[str], beta: float, episode: int,
     threads: int, seed: int, sight: Sight | None = None, settings: dict[str, Any] | None = None,
+    staggered: bool = True,
 ) -> VectorSight:  # fmt: skip
     """n simulations whose episodes are drawn from a belief, or from it as pi_h leans it.
 
@@ -78,6 +79,7 @@ def imagined(
       seed: of the first episodes' ends.
       sight: what is seen of them.
       settings: of the environment.
+      staggered: first episodes end at different times, as learning wants it; to judge a policy takes whole ones.
     """
     found = spoken(belief, parts)
     belief = getattr(belief, "near", lambda: belief)()
@@ -100,4 +102,4 @@ def imagined(
             envs = VectorRandomizePsi(envs, Parts(belief, ("psi",)))
         if "delta_s" in moving:
             envs = VectorResidualDynamics(envs, Parts(belief, ("delta_s",)))
-    return VectorSight(VectorStaggered(envs, episode, seed), sight)
+    return VectorSight(VectorStaggered(envs, episode, seed) if staggered else envs, sight)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from nfc_gym.adaptation.agent import Agent
+from nfc_gym.adaptation.choice import Choice
 from nfc_gym.adaptation.gathering import RayWorlds, gathered
 from nfc_gym.adaptation.hallucination import hallucination, widened
 from nfc_gym.adaptation.network import Gaussian
@@ -32,7 +33,7 @@ def pi_h_for(agent: Agent, worlds: VectorSight | RayWorlds, seed: int) -> Gaussi
 
 def optimise(
     agent: Agent, worlds: VectorSight | RayWorlds, steps: int, *, pi_h: Gaussian | None = None, seed: int = 0,
-    record: Record | None = None, before: int = 0,
+    record: Record | None = None, before: int = 0, choice: Choice | None = None, points: int = 1,
 ) -> dict[str, Any]:  # fmt: skip
     """Train an agent for the return in some worlds; it learns in place.
 
@@ -47,16 +48,18 @@ def optimise(
       seed: of actions and of the worlds' draws.
       record: what is written down.
       before: steps that were taken in earlier calls, by which curves are drawn.
+      choice: of the agent's weights on the way, which keeps the best; None keeps the last.
+      points: how often they are judged, at equal distances, the last time at the end.
 
     Returns:
-      `imagined_before` and `imagined_after`, mean returns of the first and the last episodes that ended; where the loss
-      came apart `diverged`, why.
+      `imagined_before` and `imagined_after`, mean returns of the first and the last episodes that ended; of a choice
+      `chosen`, the mean return of what is kept; where the loss came apart `diverged`, why.
     """
     size = int(worlds.single_action_space.shape[0])  # type: ignore[index]
     actor = agent.actor if pi_h is None else widened(agent.actor, pi_h)
     learner = agent.learner(actor, size)
     kept = [(m, copy.deepcopy(m.state_dict())) for m in (learner.loss, actor)]
-    record, episodes, first, done = record or Record(None, None), Episodes(), {}, 0
+    record, episodes, first, done, judged = record or Record(None, None), Episodes(), {}, 0, 0
     torch.manual_seed(mixed(seed, 0))
     if isinstance(worlds, RayWorlds):
         worlds.restarted = episodes.forget
@@ -74,8 +77,15 @@ def optimise(
                 record.scalars(before + done, {f"worlds/{k}": v for k, v in (values | found).items()})
                 said = f"{done:,}/{steps:,} steps in {worlds.num_envs} worlds  {in_words(found)}"
                 record.line(said, done >= steps)
+                if choice is not None and done * points >= (judged + 1) * steps:
+                    record.scalars(before + done, {"worlds/judged": choice.judge()})
+                    judged = done * points // steps
     except Diverged as e:
         for module, state in kept:
             module.load_state_dict(state)
         return {"diverged": str(e)}
-    return {"imagined_before": first.get("return"), "imagined_after": episodes.means().get("return")}
+    told = {"imagined_before": first.get("return"), "imagined_after": episodes.means().get("return")}
+    if choice is None:
+        return told
+    choice.take()
+    return told | {"chosen": choice.best}

@@ -26,7 +26,7 @@ from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.gathering import Batches, Cluster, RayWorlds, cluster_of, gathered, spread
 from nfc_gym.adaptation.network import ActorCritic, Sizes, hidden_of
 from nfc_gym.adaptation.policy import Policy, check_suffix, load_policy, taught
-from nfc_gym.adaptation.ppo import Diverged, OnPolicy, PPOConfig, clipped
+from nfc_gym.adaptation.ppo import ONWARD, Diverged, OnPolicy, PPOConfig, clipped
 from nfc_gym.adaptation.record import Episodes, Record, in_words
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.threads import limit_threads
@@ -59,10 +59,6 @@ class Recipe:
     ppo: PPOConfig = field(default_factory=PPOConfig)
 
 
-# Of what begins with another policy's weights: small first steps, until the critic knows what the new cells mean, and
-# little reward for exploring, since the way is known. (With a gamma of 0.995, in iterations of 4096 steps, Quadcopter
-# Rough unlearned its goals; with this it does so later.)
-ONWARD = PPOConfig(entropy=0.001, rate=1e-4)
 RECIPES: Mapping[str, Recipe] = {
     "ant": Recipe(),
     # What it does at random makes it fall: it is to explore no more than it must, and may change its mind faster.

@@ -85,8 +85,9 @@ def robot_of(environment: str) -> str:
 
 
 def training_env(
-    name: str, n: int, *, threads: int, seed: int, spread: float, episode: int, settings: Mapping[str, Any]
-) -> VectorSight:
+    name: str, n: int, *, threads: int, seed: int, spread: float, episode: int, settings: Mapping[str, Any],
+    staggered: bool = True,
+) -> VectorSight:  # fmt: skip
     """Simulations to train in: psi drawn anew each episode, terrain from the pool, first ends staggered.
 
     Args:
@@ -94,11 +95,12 @@ def training_env(
       seed: of ends.
       spread: psi is uniform over this share of the prior around nominal; 0 is nominal always.
       settings: of the environment.
+      staggered: first episodes end at different times; to judge a policy takes whole ones.
     """
     envs: VectorEnv = vector_env(name, n, threads=threads, episode=episode, **settings)
     if spread:
         envs = VectorRandomizePsi(envs, spread)
-    return VectorSight(VectorStaggered(envs, episode, seed))
+    return VectorSight(VectorStaggered(envs, episode, seed) if staggered else envs)
 
 
 def torchrl_env(envs: VectorEnv) -> GymWrapper:

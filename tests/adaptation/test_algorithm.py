@@ -1,7 +1,9 @@
 """Algorithm 1: nothing is touched without an anomaly, all is kept, a run that stopped ends as one that did not."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -17,12 +19,14 @@ from torchrl.objectives import ClipPPOLoss
 from nfc_gym import InputError
 from nfc_gym.adaptation import AdaptConfig, Agent, adapt, load_policy, ppo_agent, sac_agent
 from nfc_gym.adaptation.agent import OffPolicyConfig
-from nfc_gym.adaptation.sight import Sight
+from nfc_gym.adaptation.choice import Choice
+from nfc_gym.adaptation.evaluate import evaluate
+from nfc_gym.adaptation.sight import Sight, VectorSight
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.wrappers import RandomizePsi
 
-CONFIG = AdaptConfig(missions=2, worlds=8, steps=512, episode=40)
+CONFIG = AdaptConfig(missions=2, worlds=8, steps=512, episode=40, judged=0)
 
 
 class Alarm:
@@ -84,7 +88,7 @@ def test_a_world_without_anomalies_changes_nothing(jackal: Path, tmp_path: Path)
 def test_an_anomaly_adapts_the_policy_and_is_kept_like_the_rest(jackal: Path, hallucinate: bool) -> None:
     policy = load_policy(jackal)
     before = state(policy.network)
-    config = AdaptConfig(missions=1, worlds=8, steps=512, episode=40, hallucinate=hallucinate)
+    config = replace(CONFIG, missions=1, hallucinate=hallucinate)
     done = adapt(ppo_agent(policy), world(), belief(), Alarm(20), config=config, threads=1)
     after = state(policy.network)
     assert done.anomalies == 1
@@ -96,16 +100,58 @@ def test_an_anomaly_adapts_the_policy_and_is_kept_like_the_rest(jackal: Path, ha
 
 def test_a_run_that_stopped_ends_as_one_that_did_not(jackal: Path, tmp_path: Path) -> None:
     whole, halves = load_policy(jackal), load_policy(jackal)
-    one = adapt(ppo_agent(whole), world(), belief(), Alarm(9), config=CONFIG, folder=tmp_path / "a", threads=1)
-    first = AdaptConfig(**{**CONFIG.__dict__, "missions": 1})
+    config = replace(CONFIG, missions=3, judged=2)
+    one = adapt(ppo_agent(whole), world(), belief(), Alarm(9), config=config, folder=tmp_path / "a", threads=1)
+    first = replace(config, missions=2)
     adapt(ppo_agent(halves), world(), belief(), Alarm(9), config=first, folder=tmp_path / "b", threads=1)
     fresh = load_policy(jackal)  # another process knows only the file that it was given
-    two = adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=CONFIG, folder=tmp_path / "b", threads=1)
+    two = adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=config, folder=tmp_path / "b", threads=1)
     assert same(state(whole.network), state(fresh.network))
     assert one.history == two.history
-    other = AdaptConfig(**{**CONFIG.__dict__, "seed": 1})
+    other = replace(config, seed=1)
     with pytest.raises(InputError, match="another run"):
         adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=other, folder=tmp_path / "b", threads=1)
+
+
+@pytest.mark.parametrize(
+    ("judged", "changes"),
+    [
+        ([3, 1, 1, 2], False),
+        ([3, 1, 4, 2], True),
+        ([1, 2, 2, 3, 1, 5, 2, 2, 2], False),
+        ([1, 2, 2, 3, 4, 1, 2, 2, 2], True),
+    ],
+    ids=["learning made it worse", "better on the way", "the given ones again", "better each time"],
+)
+def test_the_best_weights_of_all_missions_are_kept(
+    jackal: Path, monkeypatch: pytest.MonkeyPatch, judged: list[int], changes: bool
+) -> None:
+    """By what is foretold of the policy as it is, of those that earlier missions left, and at three points."""
+    values = iter(judged)
+    judge = lambda *_: SimpleNamespace(returns=np.array(next(values)))  # noqa: E731
+    monkeypatch.setattr("nfc_gym.adaptation.algorithm.evaluate", judge)
+    policy = load_policy(jackal)
+    before = state(policy.network)
+    config = replace(CONFIG, judged=2, steps=3 * 1024, missions=1 + (len(judged) > 4))
+    done = adapt(ppo_agent(policy), world(), belief(), Alarm(20), config=config, threads=1)
+    assert same(state(policy.network), before) != changes
+    assert done.history[-1]["chosen"] == max(judged[4:] or judged)
+
+
+def test_what_an_earlier_mission_left_may_be_taken_up_again() -> None:
+    agent = ppo_agent(load_policy("JackalFlat"))
+    good, bad = (copy.deepcopy(agent.weights.state_dict()) for _ in range(2))
+    bad = {k: v + 1.0 if "gaussian" in k else v for k, v in bad.items()}
+    agent.weights.load_state_dict(bad)
+    envs = VectorSight(gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=4, context=["psi"], autoreset_mode="Disabled",
+                                    max_episode_steps=100), agent.sight)  # fmt: skip
+    choice = Choice(agent, lambda: float(evaluate(agent, envs, seed=0).returns.mean()), [good])
+    assert same(state(agent.weights), good)
+    best = choice.best
+    agent.weights.load_state_dict(bad)
+    assert choice.judge() < best == choice.best
+    choice.take()
+    assert same(state(agent.weights), good)
 
 
 def test_sac_adapts_too(jackal: Path) -> None:
