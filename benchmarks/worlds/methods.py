@@ -56,9 +56,13 @@ class Job:
         """Of the environment."""
         return {"task": self.task} if self.task else {}
 
+    def returns(self, policy: Any) -> np.ndarray:
+        """(judged,) of a few episodes in the true world, always the same."""
+        return np.array(self.played(policy, self.budget.judged, self.seed + 10_000).returns)
+
     def mean_return(self, policy: Any) -> float:
-        """Over a few episodes in the true world, for curves."""
-        return float(np.mean(self.played(policy, self.budget.judged, self.seed + 10_000).returns))
+        """Over these, for curves."""
+        return float(self.returns(policy).mean())
 
     def played(self, policy: Any, episodes: int, seed: int) -> Episodes:
         """Episodes in the true world."""
@@ -111,7 +115,7 @@ def oracle(job: Job) -> "Learned":
 
     budget, policy = job.budget, opened(job.nominal, job.budget.device)
     envs = true_world(job.world, budget.envs, budget, job.seed, **job.settings)
-    choice = Choice(ppo_agent(policy), lambda: job.mean_return(policy))
+    choice = Choice(ppo_agent(policy), lambda: job.returns(policy))
     found = improve(policy, envs, lambda _: choice.judge(), budget, job.seed, budget.steps)
     choice.take()
     found.notes["levelled"] = levelled(found.curve)
@@ -136,7 +140,7 @@ def randomised(job: Job) -> "Learned":
     environment = f"nfc_gym/{job.world.place}-v0"
     envs = training_env(environment, budget.envs, seed=seed, **shared)
     tests = training_env(environment, AdaptConfig.judged, seed=seed, staggered=False, **shared)
-    choice = Choice(ppo_agent(policy), lambda: float(evaluate(policy, tests, seed).returns.mean()))
+    choice = Choice(ppo_agent(policy), lambda: evaluate(policy, tests, seed).returns)
 
     def judge(learning: Any) -> float:
         choice.judge()

@@ -55,7 +55,8 @@ class AdaptConfig:
       parts: of the belief, those that are used where it speaks of them; ("psi",) is the paper's "w/o delta fidelity".
       beta: how far, in standard deviations of the belief, pi_h = 1 leads.
       judged: episodes by which weights are chosen: those from before the first mission, those that each mission left
-        and those on the way now compete in worlds of the present belief, and the best are kept. 0 keeps the last.
+        and those on the way now compete in worlds of the present belief, and the best are deployed, while learning goes
+        on from where it was (see `choice`). 0 deploys the last.
       seed: of everything.
     """
 
@@ -68,6 +69,10 @@ class AdaptConfig:
     beta: float = 1.0
     judged: int = 16
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.judged == 1 or self.judged < 0:
+            raise InputError(f"adapt: judged is {self.judged}; want 0, or 2 episodes or more")
 
 
 @dataclass
@@ -148,7 +153,8 @@ class _Run:
         self.folder = None if folder is None else Path(folder)
         self.record = Record(None if self.folder is None else self.folder / "log", console)
         self.pi_h: Gaussian | None = None
-        self.past = [copy.deepcopy(weights_of(agent))]
+        self.past = [copy.deepcopy(weights_of(agent))]  # what was deployed
+        self.learned = copy.deepcopy(weights_of(agent))  # where learning has come to
         self.t = self.steps = 0
         self.belief: Sampler | None = None
         self.history: list[dict[str, Any]] = []
@@ -193,6 +199,8 @@ class _Run:
 
     def optimise(self, worlds: VectorSight | RayWorlds, belief: Sampler) -> None:
         """Policy-Opt: pi and pi_h for the return in these worlds. A loss that comes apart changes nothing."""
+        own = weights_of(self.agent)
+        own.load_state_dict(self.learned.state_dict())
         with closing(worlds), self._choice(belief) as choice:
             if choice is not None:
                 self.now["best_so_far"] = choice.best
@@ -200,10 +208,14 @@ class _Run:
                 self.agent, worlds, self.config.steps, pi_h=self.pi_h, seed=mixed(self.config.seed, self.t, 2),
                 record=self.record, before=self.steps, choice=choice, points=_POINTS,
             )  # fmt: skip
-        self.past.append(copy.deepcopy(weights_of(self.agent)))
-        self.steps += self.config.steps
         if "diverged" in self.now:
+            own.load_state_dict(self.past[-1].state_dict())
             self.record.say(f"mission {self.t}: {self.now['diverged']}; the policy is as before")
+        self.learned.load_state_dict(own.state_dict())
+        if choice is not None and "diverged" not in self.now:
+            choice.take()
+        self.past.append(copy.deepcopy(own))
+        self.steps += self.config.steps
 
     def update(self, tau: Trajectory, belief: Sampler) -> None:
         """Sequential NFC."""
@@ -243,21 +255,19 @@ class _Run:
 
     @contextmanager
     def _choice(self, belief: Sampler) -> Iterator[Choice | None]:
-        """Between all weights so far and those to come; the agent has the best so far. None where nothing chooses."""
+        """Between all weights so far and those to come. None where nothing chooses."""
         if not self.config.judged:
             yield None
             return
         seed = mixed(self.config.seed, self.t, 3) % 2**31
         make = self._imagined(belief, hallucinate=False, staggered=False)
         with closing(make(self.config.judged, threads=self.threads, seed=seed)) as envs:
-
-            def judge() -> float:
-                return float(evaluate(self.agent, envs, seed).returns.mean())
-
-            yield Choice(self.agent, judge, [module.state_dict() for module in self.past[:-1]])
+            yield Choice(
+                self.agent, lambda: evaluate(self.agent, envs, seed).returns, [m.state_dict() for m in self.past]
+            )
 
     def _modules(self) -> dict[str, nn.Module]:
-        modules: dict[str, nn.Module] = {"agent": weights_of(self.agent)}
+        modules: dict[str, nn.Module] = {"agent": weights_of(self.agent), "learned": self.learned}
         modules |= {f"past_{k}": module for k, module in enumerate(self.past)}
         return modules if self.pi_h is None else {**modules, "pi_h": self.pi_h}
 

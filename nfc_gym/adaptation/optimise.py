@@ -48,12 +48,12 @@ def optimise(
       seed: of actions and of the worlds' draws.
       record: what is written down.
       before: steps that were taken in earlier calls, by which curves are drawn.
-      choice: of the agent's weights on the way, which keeps the best; None keeps the last.
+      choice: judges the agent's weights on the way; the agent has the last ones until it takes the best.
       points: how often they are judged, at equal distances, the last time at the end.
 
     Returns:
       `imagined_before` and `imagined_after`, mean returns of the first and the last episodes that ended; of a choice
-      `chosen`, the mean return of what is kept; where the loss came apart `diverged`, why.
+      `chosen`, the mean return of the best; where the loss came apart `diverged`, why.
     """
     size = int(worlds.single_action_space.shape[0])  # type: ignore[index]
     actor = agent.actor if pi_h is None else widened(agent.actor, pi_h)
@@ -85,7 +85,4 @@ def optimise(
             module.load_state_dict(state)
         return {"diverged": str(e)}
     told = {"imagined_before": first.get("return"), "imagined_after": episodes.means().get("return")}
-    if choice is None:
-        return told
-    choice.take()
-    return told | {"chosen": choice.best}
+    return told if choice is None else told | {"chosen": choice.best}
