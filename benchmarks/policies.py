@@ -8,9 +8,10 @@ Table II: return in a hidden world of each environment, between a random policy 
 (1), the paper's min-max normalisation beside. Table III: the Jackal's broken axle on a figure of eight, in the paper's
 scenarios. With `--counting` Table II takes the worlds that `hidden_worlds.py --find K --json FILE` has found to count.
 Every cell (table, world, method, seed) is kept in --out, so the same command goes on where it was stopped; `--stop
-SECONDS` begins no new cell after that time. `--beside DIR` takes the random policy, the unadapted policy and the oracle
-of an earlier run in the same worlds, of all its seeds, and runs none. What is hidden is drawn from `--seed`, itself
-drawn once and kept.
+SECONDS` begins no new cell after that time, and `--kept` begins none: tables of what there is. `--beside DIR` takes the
+random policy, the unadapted policy and the oracle of an earlier run in the same worlds, of all its seeds, and runs
+none.
+What is hidden is drawn from `--seed`, itself drawn once and kept.
 Pretrained policies are those that `pretrain.py --out DIR` made, else the package's; posteriors (also .npz) and
 detectors are `<place>.safetensors` in their folders; so are TD-MPC2's world models, which `tdmpc2_pretrain.py` makes.
 The control rate is that of one robot's decisions on this machine.
@@ -102,6 +103,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--seed", type=int, help="of what is hidden; default drawn once, and kept in --out")
     add("--beside", type=Path, metavar="DIR", help="--out of an earlier run, perhaps with another budget")
     add("--stop", type=float, metavar="SECONDS")
+    add("--kept", action="store_true", help="make the tables of the cells in --out")
     add("--out", type=Path, metavar="DIR")
     add("--json", type=Path, metavar="FILE")
     add("--quick", action="store_true")
@@ -178,6 +180,8 @@ def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tab
                 print("time is up: the same command goes on")
                 return cells
             name = f"{table}_{world.name}_{method}_{seed}"
+            if args.kept and not (kept.cells / f"{name}.json").is_file():
+                continue
             *given, model = files(args, world.place)
             job = Job(world, seed, *given, budget, task, out / "states" / name, model)
             start = time.monotonic()
