@@ -139,7 +139,7 @@ def randomised(job: Job) -> "Learned":
     shared = {"threads": budget.threads, "spread": 1.0, "episode": EPISODE, "settings": job.settings}
     environment = f"nfc_gym/{job.world.place}-v0"
     envs = training_env(environment, budget.envs, seed=seed, **shared)
-    tests = training_env(environment, AdaptConfig.judged, seed=seed, staggered=False, **shared)
+    tests = training_env(environment, min(budget.judged, AdaptConfig.judged), seed=seed, staggered=False, **shared)
     choice = Choice(ppo_agent(policy), lambda: evaluate(policy, tests, seed).returns)
 
     def judge(learning: Any) -> float:
@@ -180,7 +180,8 @@ def nfc(**config: Any) -> Make:
         home = earned_at_home(policy, job.world, job.seed, EPISODE, nthread=job.budget.threads, **job.settings)
         context = ["psi", "elevation"] if job.world.ground == "Rough" else ["psi"]
         given = AdaptConfig(missions=budget.executed, worlds=budget.envs, steps=budget.steps // budget.executed,
-                            episode=EPISODE, seed=job.seed, **config)  # fmt: skip
+                            episode=EPISODE, judged=min(budget.judged, AdaptConfig.judged), seed=job.seed,
+                            **config)  # fmt: skip
         found = adapt(
             ppo_agent(policy), job.world.single(context=context, **job.settings), posterior, detector,
             config=given, environment=f"nfc_gym/{job.world.place}-v0", folder=job.folder, threads=budget.threads,

@@ -226,7 +226,7 @@ class _Run:
         self.dataset.add(tau)
         self.history.append(self.now)
         self.record.scalars(self.t, {k: float(v) for k, v in self.now.items() if isinstance(v, int | float)})
-        shown = {k: v for k, v in self.now.items() if k in ("return", "length", "score", "chance", "width")}
+        shown = {k: v for k, v in self.now.items() if k in ("return", "length", "score", "chance", "width", "chosen")}
         what = "anomalous: adapted" if tau.anomalous else "no anomaly: the policy is not touched"
         reached = "" if not self.world.unwrapped.robot.place_size else f"  reached {tau.reached}"
         self.record.say(f"mission {self.t}: {in_words(shown)}{reached}  {what}")
@@ -291,7 +291,7 @@ class _Run:
             self.dataset = Dataset(self.folder)
             return
         kept = resume.plain(path)
-        self.past += [copy.deepcopy(self.past[0]) for _ in range(kept["past"] - 1)]
+        self.past += [copy.deepcopy(self.past[0]) for _ in range(kept.get("past", 1) - 1)]
         size = int(kept["pi_h"])
         if size:
             self.pi_h = hallucination(self.agent.sight.size, size).to(self.agent.device)
