@@ -10,8 +10,7 @@ scenarios. With `--counting` Table II takes the worlds that `hidden_worlds.py --
 Every cell (table, world, method, seed) is kept in --out, so the same command goes on where it was stopped; `--stop
 SECONDS` begins no new cell after that time, and `--kept` begins none: tables of what there is. `--beside DIR` takes the
 random policy, the unadapted policy and the oracle of an earlier run in the same worlds, of all its seeds, and runs
-none.
-What is hidden is drawn from `--seed`, itself drawn once and kept.
+none. What is hidden is drawn from `--seed`, itself drawn once and kept.
 Pretrained policies are those that `pretrain.py --out DIR` made, else the package's; posteriors (also .npz) and
 detectors are `<place>.safetensors` in their folders; so are TD-MPC2's world models, which `tdmpc2_pretrain.py` makes.
 The control rate is that of one robot's decisions on this machine.
