@@ -32,7 +32,7 @@ def job(tmp_path: Path, **change: Any) -> Any:
     from worlds.methods import Job
     from worlds.world import World
 
-    budget = Budget(envs=4, steps=800, seconds=5.0, executed=1, judged=1, points=1, threads=1)
+    budget = Budget(envs=4, steps=800, seconds=5.0, executed=1, judged=2, points=1, threads=1)
     given = {"world": World("JackalFlat", "axle", 0), "seed": 0, "nominal": untrained(tmp_path), "posterior": None,
              "detector": None, "budget": budget, "task": None, "folder": tmp_path / "states"}  # fmt: skip
     return Job(**{**given, **change})
