@@ -106,7 +106,10 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--out", type=Path, metavar="DIR")
     add("--json", type=Path, metavar="FILE")
     add("--quick", action="store_true")
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if args.kept and not (args.out and args.out.is_dir()):
+        parser.error(f"--kept makes tables of the cells in --out, and {args.out or 'no --out'} is no folder")
+    return args
 
 
 def master_seed(given: int | None, out: Path) -> int:

@@ -75,6 +75,7 @@ def true_world(world: World, n: int, budget: Budget, seed: int, **settings: Any)
 
 def improve(
     policy: Policy, envs: VectorEnv, judge: Callable[[Policy], float], budget: Budget, seed: int, steps: int,
+    first: float | None = None,
 ) -> Learned:  # fmt: skip
     """PPO in an environment, from where a policy is.
 
@@ -85,6 +86,7 @@ def improve(
       budget: see `Budget`.
       seed: of actions and of the environments' episodes.
       steps: control steps of all simulations together.
+      first: what `judge` says of the policy as it is, if that is known.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # the size of each buffer is no news
     agent = ppo_agent(policy)
@@ -93,7 +95,7 @@ def improve(
     torch.manual_seed(seed)
     env = torchrl_env(envs)
     env.set_seed(seed)
-    curve, done, began, notes = [(0, judge(policy))], 0, time.monotonic(), {}
+    curve, done, began, notes = [(0, judge(policy) if first is None else first)], 0, time.monotonic(), {}
     marks = [steps * (k + 1) // budget.points for k in range(budget.points)]
     for batch in batches(env, agent.actor, horizon, agent.device):
         kept = copy.deepcopy(policy.network.state_dict())

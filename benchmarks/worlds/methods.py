@@ -116,7 +116,7 @@ def oracle(job: Job) -> "Learned":
     budget, policy = job.budget, opened(job.nominal, job.budget.device)
     envs = true_world(job.world, budget.envs, budget, job.seed, **job.settings)
     choice = Choice(ppo_agent(policy), lambda: job.returns(policy))
-    found = improve(policy, envs, lambda _: choice.judge(), budget, job.seed, budget.steps)
+    found = improve(policy, envs, lambda _: choice.judge(), budget, job.seed, budget.steps, choice.best)
     choice.take()
     found.notes["levelled"] = levelled(found.curve)
     return found

@@ -211,10 +211,11 @@ class _Run:
         if "diverged" in self.now:
             own.load_state_dict(self.past[-1].state_dict())
             self.record.say(f"mission {self.t}: {self.now['diverged']}; the policy is as before")
-        self.learned.load_state_dict(own.state_dict())
-        if choice is not None and "diverged" not in self.now:
-            choice.take()
-        self.past.append(copy.deepcopy(own))
+        else:
+            self.learned.load_state_dict(own.state_dict())
+            if choice is not None:
+                choice.take()
+            self.past.append(copy.deepcopy(own))
         self.steps += self.config.steps
 
     def update(self, tau: Trajectory, belief: Sampler) -> None:

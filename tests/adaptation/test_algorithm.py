@@ -182,7 +182,8 @@ def test_an_agent_of_a_script_that_knows_nothing_of_us() -> None:
     assert any((before[k] != v).any() for k, v in net.state_dict().items())
 
 
-def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path) -> None:
+@pytest.mark.parametrize("judged", [0, 2])
+def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path, judged: int) -> None:
     policy = load_policy(jackal)
     agent, before = ppo_agent(policy), state(policy.network)
 
@@ -193,12 +194,15 @@ def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path) -> No
             return out if self.seen < 10 else out.apply(lambda x: x * float("nan"))
 
     agent.loss = lambda actor, size: Broken(actor, policy.network.critic, functional=False)
-    done = adapt(agent, world(), belief(), Alarm(20), config=CONFIG, threads=1)
+    config = replace(CONFIG, judged=judged)
+    done = adapt(agent, world(), belief(), Alarm(20), config=config, threads=1)
     assert "not finite" in done.history[0]["diverged"]
     assert same(state(policy.network), before)
 
 
 def test_what_does_not_fit_is_named(jackal: Path) -> None:
+    with pytest.raises(InputError, match="judged is 1; want 0, or 2 episodes"):
+        AdaptConfig(judged=1)
     agent = ppo_agent(load_policy(jackal))
     with pytest.raises(InputError, match="another robot than nfc_gym/AntFlat-v0"):
         adapt(agent, world("AntFlat"), belief(), Alarm(None))
