@@ -108,7 +108,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--quick", action="store_true")
     args = parser.parse_args(argv)
     if args.kept and not (args.out and args.out.is_dir()):
-        parser.error(f"--kept makes tables of the cells in --out, and {args.out or 'no --out'} is no folder")
+        parser.error(f"--kept makes tables of the cells in --out: want a folder that is there, got {args.out}")
     return args
 
 

@@ -145,3 +145,26 @@ def test_a_table_takes_its_references_from_an_earlier_run(tmp_path: Path) -> Non
     policies.references(args, cells)
     found = {method: {"curve": [[0, 1.0]]} for method in ("random", "oracle")}
     assert cells.found == {("II", "JackalFlat", "axle", 5, 0): found}
+
+
+def test_what_is_found_to_count_must_do_so_with_other_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    import hidden_worlds
+    from worlds.counting import Drop
+    from worlds.figures import Interval
+    from worlds.judge import Episodes
+
+    drops = iter([0.5, 0.1, 0.2, 0.6, 0.4])
+    seeds = []
+
+    def measure(policy: str, world: Any, episodes: int, seed: int, **_: Any) -> Drop:
+        seeds.append(seed)
+        some = Interval(1.0, 0.0, 2.0)
+        played = Episodes([1.0], [1.0], [0.0], [1.0], [0.0], [0.0], [1])
+        return Drop(world, some, some, some, next(drops), played)
+
+    monkeypatch.setattr(hidden_worlds, "measure", measure)
+    args = hidden_worlds.parse(["--find", "1", "--seed", "3", "--draws", "5"])
+    rows = list(hidden_worlds.worlds(args, None, "AntFlat", "psi+effect"))
+    assert [row["counts"] for row in rows] == [False, False, True]
+    assert [row.get("again") for row in rows] == [0.1, None, 0.4]
+    assert seeds == [3, 1_000_003, 3, 3, 1_000_003]
