@@ -155,19 +155,41 @@ class Search:
                 break
             state = State(better.plant, better.x, tuple(rounds), frozenset(self.lookout.hopeless))
             keep(state)
-        whole = self._merged(
-            arena, rounds
-        )  # before any part of it is doubted: what two do together neither may do alone
+        mended = self._mended(arena, rounds)
+        if mended is not arena:
+            arena, screen = mended, Screen(self.fit_data.problem, mended.under, mended.current)
+        return self._concluded(arena, screen, screened, outcome, rounds, calibrated)
+
+    def _mended(self, arena: Arena, rounds: list[Round]) -> Arena:
+        """The arena in which two laws are one where one does, and which the effects that were doubted have left.
+
+        Laws are merged before any is doubted: what two do together neither may do alone.
+        """
+        whole = self._merged(arena, rounds)
         confirmed = self._plainer(self._confirmed(whole, rounds), rounds)
-        if confirmed is not whole:
-            confirmed = self._merged(confirmed, rounds)
-        if confirmed is not arena:
-            arena, screen = confirmed, Screen(self.fit_data.problem, confirmed.under, confirmed.current)
+        return confirmed if confirmed is whole else self._merged(confirmed, rounds)
+
+    def _concluded(
+        self,
+        arena: Arena,
+        screen: Screen,
+        screened: list[Screened],
+        last: Round,
+        rounds: list[Round],
+        calibrated: Fit,
+    ) -> Found:
+        """What is found, after the generic alternatives' turn, and what is to be doubted of it.
+
+        Args:
+          arena, screen: of the model that stands at the end.
+          screened: candidates of the last contest.
+          last: that contest, which says what generic alternatives gained.
+          rounds: of the search; what was merged or dropped since that contest comes after it.
+          calibrated: psi alone, fitted.
+        """
         dropped: list[str] = []
         odd = misshapen(arena, self.generics, self.options.worth)
-        mended = max(odd.values(), key=lambda j: j.total, default=None)
-        generic = self._generic(arena, screen, outcome)
-        generic = mended if generic is None else generic
+        generic = self._generic(arena, screen, last) or max(odd.values(), key=lambda j: j.total, default=None)
         label = None if generic is None else arena.label(generic)
         if generic is not None and arena.current.plant.effects and self._outdone(arena, generic, calibrated):
             self.say("a generic law explains clearly more than all named effects: none is claimed")

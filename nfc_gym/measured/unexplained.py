@@ -98,7 +98,8 @@ def _place(model: mujoco.MjModel, law: Effect) -> dict[str, str]:
     dof, _ = degrees(model)[name]
     body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.dof_bodyid[dof]))
     kind = ("linvel" if i < 3 else "angvel") if law.family in _SPEEDS else ("pos" if i < 3 else "quat")
-    return {"coordinate": f"body:{body}:{kind}[{i % 3}]", "where": f"joint:{name}"}
+    # a body without a name has no channel
+    return {"coordinate": f"body:{body}:{kind}[{i % 3}]" if body else f"joint:{name}", "where": f"joint:{name}"}
 
 
 def _joint_of(law: Effect) -> str:

@@ -88,6 +88,8 @@ def test_a_force_without_a_law_is_placed_where_its_evidence_leads() -> None:
     found = said(None, evidence={"root": 300.0, "knee": 160.0}, nearest=near)
     assert found["coordinate"].startswith("body:car:")
     assert found["coordinate"].endswith("[2]")
+    unnamed = said(None, evidence={"root": 300.0}, nearest=near, text=MODEL.replace('<body name="car"', "<body"))
+    assert (unnamed["coordinate"], unnamed["where"]) == ("joint:root[2]", "joint:root[2]")
     assert said(None, evidence={"knee": 300.0, "root": 160.0}, nearest=near)["coordinate"] == "joint:knee:pos"
     # a lead that is no lead: where the misfit is most times the noise
     assert said(None, evidence={"root": 300.0, "knee": 295.0})["coordinate"] == "joint:knee (joint speed)"
