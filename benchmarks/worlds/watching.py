@@ -8,7 +8,7 @@ from gymnasium.vector import VectorEnv
 
 from nfc_gym.adaptation.trajectory import Array
 from nfc_gym.inference.detector import WindowDetector
-from nfc_gym.inference.rates import threshold_at
+from nfc_gym.inference.rates import threshold_at, wanted
 
 from .judge import Policy
 from .players import play, seen_by
@@ -19,6 +19,7 @@ RATE = 0.05  # false alarms an episode
 EVERY = 25  # control steps from one window to the next that is looked at
 LASTING = 36  # windows whose surprises add up: a stumble is over sooner, what a machine lacks stays
 ROBOTS = 128  # at home; half of them fit the detector, the others set its threshold
+ROUNDS = 4  # of so many robots, at most, where some fall or crash before there is a window of them
 
 
 class Unforeseen:
@@ -135,7 +136,12 @@ def windows(
 def watcher(policy: Policy, world: World, seed: int, **settings: Any) -> Lasting:
     """A detector for a world's robot and policy; the sensors' noise is known at home, what is hidden is not."""
     at_home = World(world.place, "nominal", world.seed, engine=world.engine)
-    robots = windows(policy, seen_by(policy, at_home, ROBOTS, **settings), world.kind.proprio_size, seed)
+    robots: list[tuple[Array, Array]] = []
+    for k in range(ROUNDS):
+        env = seen_by(policy, at_home, ROBOTS, **settings)
+        robots += windows(policy, env, world.kind.proprio_size, seed + k * ROBOTS)
+        if len(robots) >= 2 * wanted(RATE):
+            break
     half = min(len(robots) // 2, ROBOTS // 2)
     scorer = Unforeseen(*(np.concatenate(part) for part in zip(*robots[:half], strict=True)))
     scores = [scorer.score(*each) for each in robots[half:]]

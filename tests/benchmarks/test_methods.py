@@ -107,6 +107,28 @@ def test_a_watcher_of_the_motion_at_home_sees_another_motion(tmp_path: Path, mon
     assert EVERY * 2 == HORIZON
 
 
+def test_robots_that_crash_at_once_leave_a_watcher_enough_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from worlds import watching
+    from worlds.learning import opened
+    from worlds.world import World
+
+    seeds: list[int] = []
+
+    def crashing(policy: Any, env: Any, size: int, seed: int) -> list[Any]:
+        env.close()
+        seeds.append(seed)
+        rng = np.random.default_rng(seed)
+        length = watching.HORIZON
+        return [(rng.normal(size=(2, length + 1, size)), rng.normal(size=(2, length, 2))) for _ in range(100)]
+
+    monkeypatch.setattr(watching, "windows", crashing)
+    policy, home = opened(untrained(tmp_path), "cpu"), World("JackalFlat", "nominal", 0)
+    assert watching.watcher(policy, home, 7).threshold is not None
+    assert seeds == [7, 7 + watching.ROBOTS]
+
+
 def test_algorithm_one_runs_in_a_hidden_world(tmp_path: Path) -> None:
     from worlds.machines import ROBOTS, nominal_space
     from worlds.methods import run
