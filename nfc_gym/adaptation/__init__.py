@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from nfc_gym.adaptation.handover import hand_over
     from nfc_gym.adaptation.policy import Policy, load_policy
     from nfc_gym.adaptation.pretraining import pretrain
+    from nfc_gym.adaptation.sight import Sight
 
 _HOME = {
     "AdaptConfig": "algorithm",
@@ -25,6 +26,7 @@ _HOME = {
     "LearnConfig": "afterwards",
     "Learned": "afterwards",
     "Policy": "policy",
+    "Sight": "sight",
     "adapt": "algorithm",
     "hand_over": "handover",
     "learn_from_mission": "afterwards",
@@ -34,8 +36,8 @@ _HOME = {
     "sac_agent": "agent",
 }
 __all__ = [
-    "AdaptConfig", "Adapted", "Agent", "FineTuneConfig", "LearnConfig", "Learned", "Policy", "adapt", "hand_over",
-    "learn_from_mission", "load_policy", "ppo_agent", "pretrain", "sac_agent",
+    "AdaptConfig", "Adapted", "Agent", "FineTuneConfig", "LearnConfig", "Learned", "Policy", "Sight", "adapt",
+    "hand_over", "learn_from_mission", "load_policy", "ppo_agent", "pretrain", "sac_agent",
 ]  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,17 @@ class AdaptConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        least = {"missions": 1, "worlds": 1, "steps": 1, "seed": 0} | ({} if self.episode is None else {"episode": 1})
+        for name, low in least.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
+                raise InputError(f"adapt: {name} is {value!r}; want a whole number, {low} or more")
         if self.judged == 1 or self.judged < 0:
             raise InputError(f"adapt: judged is {self.judged}; want 0, or 2 episodes or more")
+        if not 0 <= self.beta < float("inf"):
+            raise InputError(f"adapt: beta is {self.beta!r}; want a number of standard deviations, 0 or more")
+        if isinstance(self.parts, str) or not self.parts:
+            raise InputError(f"adapt: parts is {self.parts!r}; want parts of the belief, such as ('psi',)")
 
 
 @dataclass
@@ -151,6 +161,8 @@ class _Run:
         self.detector, self.threshold = opened(detector, threshold)
         self.inference = inference_of(posterior)
         self.folder = None if folder is None else Path(folder)
+        if self.folder is not None and self.folder.exists() and not self.folder.is_dir():
+            raise InputError(f"adapt: {self.folder} is a file; `folder` is where trajectories and state are kept")
         self.record = Record(None if self.folder is None else self.folder / "log", console)
         self.pi_h: Gaussian | None = None
         self.past = [copy.deepcopy(weights_of(agent))]  # what was deployed
@@ -310,8 +322,13 @@ def check_fit(agent: Agent, world: Any) -> None:
     """Refuse an agent that cannot act in a world.
 
     Raises:
-      InputError: the world is a vector environment or none of this package's, of another robot, or has another action.
+      InputError: it is no agent, the world is a vector environment or none of this package's, of another robot, or has
+        another action; the agent's actor does not take what the world shows.
     """
+    if not isinstance(agent, Agent):
+        raise InputError(
+            f"adapt: want an Agent(actor, loss, sight), got {type(agent).__name__}; ppo_agent(policy) makes one"
+        )
     if isinstance(world, VectorEnv) or not hasattr(world.unwrapped, "psi_space"):
         raise InputError("adapt: the world is one environment of this package, single, with wrappers around it")
     theirs, mine = Sight.of(world), agent.sight
@@ -319,7 +336,10 @@ def check_fit(agent: Agent, world: Any) -> None:
         raise InputError(f"adapt: the agent is of another robot than {theirs.environment}: {mine.says()}")
     if mine.cells is not None and theirs.cells is None:
         raise InputError(f"adapt: the agent looks at elevation, and {theirs.environment} is flat ground")
-    size = agent.action_size()
+    try:
+        size = agent.action_size()
+    except RuntimeError as e:
+        raise InputError(f"adapt: the agent's actor does not take an observation of ({mine.size},): {e}") from e
     if world.action_space.shape != (size,):
         raise InputError(
             f"adapt: the agent's actions have {size} entries, those of {theirs.environment} {world.action_space.shape}"

@@ -12,13 +12,16 @@ import torch
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torch.distributions import Distribution, constraints
-from torchrl.modules import IndependentNormal
+from torchrl.data import Composite, Unbounded
+from torchrl.modules import IndependentNormal, SafeProbabilisticModule, SafeProbabilisticTensorDictSequential
+from torchrl.modules.distributions import has_analytic_entropy
 
 from nfc_gym.adaptation.network import Gaussian, Scale
 from nfc_gym.core.errors import InputError
 
 _LAYERS = (64,)
 _KEYS = ("h_loc", "h_scale")
+_DRAWS = 4  # that an entropy without a closed form is estimated from
 
 
 class Joined(Distribution):
@@ -87,8 +90,15 @@ class Joined(Distribution):
         return self.own.log_prob(value[..., : self.size]) + self.h.log_prob(value[..., self.size :])
 
     def entropy(self) -> Tensor:
-        """(...) of both together; raises `NotImplementedError` where the agent's own has none in closed form."""
-        return self.own.entropy() + self.h.entropy()
+        """(...) of both together; the agent's own is estimated from draws where it has no closed form.
+
+        TorchRL asks the class whether it has one, and of this class alone the agent's own decides.
+        """
+        if has_analytic_entropy(self.own):
+            return self.own.entropy() + self.h.entropy()
+        shape = torch.Size([_DRAWS])
+        drawn = self.own.rsample(shape) if self.own.has_rsample else self.own.sample(shape)
+        return self.h.entropy() - self.own.log_prob(drawn).mean(0)
 
 
 def hallucination(observation: int, size: int) -> Gaussian:
@@ -113,9 +123,10 @@ def widened(actor: ProbabilisticTensorDictSequential, pi_h: Gaussian) -> Probabi
     if next(iter(last.out_keys)) != "action":
         raise InputError(f"hallucination needs an actor whose distribution is over 'action', not {last.out_keys[0]!r}")
     keys: Any = {**dict(zip(last.dist_keys, last.in_keys, strict=True)), **{key: key for key in _KEYS}}
-    joined = ProbabilisticTensorDictModule(
+    joined = SafeProbabilisticModule(
         in_keys=keys,
         out_keys=["action"],
+        spec=_spec(actor, pi_h),
         distribution_class=Joined,
         distribution_kwargs={"own_class": last.distribution_class, "own_kwargs": dict(last.distribution_kwargs)},
         return_log_prob=True,
@@ -123,4 +134,11 @@ def widened(actor: ProbabilisticTensorDictSequential, pi_h: Gaussian) -> Probabi
     )
     beside = TensorDictModule(pi_h, in_keys=["observation"], out_keys=list(_KEYS))
     modules: list[Any] = [*parts[:-1], beside, joined]
-    return ProbabilisticTensorDictSequential(*modules)
+    return SafeProbabilisticTensorDictSequential(*modules)
+
+
+def _spec(actor: ProbabilisticTensorDictSequential, pi_h: Gaussian) -> Composite | None:
+    """Of the longer action, for losses that read its size there; None where the agent's own actor has no spec."""
+    own = getattr(actor, "spec", None)
+    action = own.get("action", None) if isinstance(own, Composite) else own
+    return None if action is None else Composite(action=Unbounded(torch.Size([action.shape[-1] + len(pi_h.log_std)])))

@@ -5,6 +5,7 @@ from contextlib import closing
 from typing import Any
 
 import torch
+from gymnasium.vector import VectorEnv
 
 from nfc_gym.adaptation.agent import Agent
 from nfc_gym.adaptation.choice import Choice
@@ -32,7 +33,7 @@ def pi_h_for(agent: Agent, worlds: VectorSight | RayWorlds, seed: int) -> Gaussi
 
 
 def optimise(
-    agent: Agent, worlds: VectorSight | RayWorlds, steps: int, *, pi_h: Gaussian | None = None, seed: int = 0,
+    agent: Agent, worlds: VectorEnv | RayWorlds, steps: int, *, pi_h: Gaussian | None = None, seed: int = 0,
     record: Record | None = None, before: int = 0, choice: Choice | None = None, points: int = 1,
 ) -> dict[str, Any]:  # fmt: skip
     """Train an agent for the return in some worlds; it learns in place.
@@ -41,8 +42,8 @@ def optimise(
 
     Args:
       agent: which.
-      worlds: vector environment; made by `imagined`, or any other: the true world itself for an oracle; or on a
-        cluster (`RayWorlds`).
+      worlds: vector environment of this package, with `context=["psi"]` and `autoreset_mode="Disabled"`; made by
+        `imagined`, or any other: the true world itself for an oracle; or on a cluster (`RayWorlds`).
       steps: control steps of all simulations together.
       pi_h: see `pi_h_for`.
       seed: of actions and of the worlds' draws.
@@ -55,6 +56,8 @@ def optimise(
       `imagined_before` and `imagined_after`, mean returns of the first and the last episodes that ended; of a choice
       `chosen`, the mean return of the best; where the loss came apart `diverged`, why.
     """
+    if not isinstance(worlds, VectorSight | RayWorlds):
+        worlds = VectorSight(worlds, agent.sight)
     size = int(worlds.single_action_space.shape[0])  # type: ignore[index]
     actor = agent.actor if pi_h is None else widened(agent.actor, pi_h)
     learner = agent.learner(actor, size)

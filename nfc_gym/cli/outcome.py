@@ -35,7 +35,7 @@ def outcome(ctx: typer.Context, resumes: bool = False) -> Iterator[None]:
     except typer.Exit:
         raise
     except KeyboardInterrupt:
-        again = "goes on from the last finished stage" if resumes else "starts over"
+        again = "goes on from what it had finished" if resumes else "starts over"
         _fail(ctx, INTERRUPTED, f"interrupted; the same command {again}")
     except NfcError as e:
         _fail(ctx, BAD_INPUT, str(e))

@@ -207,7 +207,7 @@ def _outcome(candidate: Row, label: str, equivalents: Sequence[Any]) -> str:
     if gain is not None and gain <= 0:
         return "no gain on unseen logs"
     if low is not None and low <= 0:
-        return "gain on unseen logs not sure: lower bound not above zero"
+        return "gain on what it was not fitted to is not sure: lower bound not above zero"
     if label:
         return "gains, but significantly less than the best"
     return "a gain too small to name, or no larger than chance gives"

@@ -231,7 +231,7 @@ class Screen:
 def answer(current: Fit, white: Array) -> Array:
     """(p, j) steps of a fitted model's scaled free parameters that answer best what is left of (p, S, m) residuals."""
     weight = loss_weight(current.white)
-    tangent = (weight[..., None] * current.jacobian).reshape(-1, current.jacobian.shape[-1])
+    tangent = (weight[..., None] * current.jacobian).reshape(current.white.size, current.jacobian.shape[-1])
     return _step(tangent, (weight * white).reshape(len(white), -1).T).T
 
 

@@ -200,10 +200,41 @@ def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path, judge
     assert same(state(policy.network), before)
 
 
-def test_what_does_not_fit_is_named(jackal: Path) -> None:
-    with pytest.raises(InputError, match="judged is 1; want 0, or 2 episodes"):
-        AdaptConfig(judged=1)
-    agent = ppo_agent(load_policy(jackal))
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"judged": 1}, "judged is 1; want 0, or 2 episodes"),
+        ({"missions": 0}, "missions is 0; want a whole number, 1 or more"),
+        ({"worlds": -1}, "worlds is -1; want a whole number, 1 or more"),
+        ({"steps": 1.5}, "steps is 1.5; want a whole number"),
+        ({"episode": 0}, "episode is 0; want a whole number"),
+        ({"seed": -1}, "seed is -1; want a whole number, 0 or more"),
+        ({"beta": -1.0}, "beta is -1.0; want a number of standard deviations"),
+        ({"parts": ()}, "parts is \\(\\); want parts of the belief"),
+        ({"parts": "psi"}, "parts is 'psi'; want parts of the belief"),
+    ],
+)
+def test_settings_that_cannot_be_are_named(wrong: dict[str, Any], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        AdaptConfig(**wrong)
+
+
+def test_what_does_not_fit_is_named(jackal: Path, tmp_path: Path) -> None:
+    policy = load_policy(jackal)
+    agent = ppo_agent(policy)
+    with pytest.raises(InputError, match=r"want an Agent.*got Policy; ppo_agent"):
+        adapt(policy, world(), belief(), Alarm(None))  # type: ignore[arg-type]
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file is a file"):
+        adapt(agent, world(), belief(), Alarm(None), folder=tmp_path / "file")
+    net = nn.Sequential(nn.Linear(agent.sight.size - 4, 4), NormalParamExtractor())
+    unlike = ProbabilisticActor(
+        TensorDictModule(net, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+    )
+    with pytest.raises(InputError, match="does not take an observation of"):
+        adapt(Agent(unlike, agent.loss, agent.sight), world(), belief(), Alarm(None))
     with pytest.raises(InputError, match="another robot than nfc_gym/AntFlat-v0"):
         adapt(agent, world("AntFlat"), belief(), Alarm(None))
     with pytest.raises(InputError, match="single"):
@@ -219,3 +250,13 @@ def test_what_does_not_fit_is_named(jackal: Path) -> None:
     narrow.action_space = gym.spaces.Box(-1, 1, (3,))
     with pytest.raises(InputError, match="2 entries"):
         adapt(wide, narrow, belief(), Alarm(None))
+
+
+def test_policy_opt_takes_any_vector_environment(jackal: Path) -> None:
+    from nfc_gym.adaptation.optimise import optimise
+
+    agent = ppo_agent(load_policy(jackal))
+    before = copy.deepcopy(agent.actor.state_dict())
+    envs = gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=4, context=["psi"], autoreset_mode="Disabled", nthread=1)
+    optimise(agent, envs, 256)
+    assert not same(before, agent.actor.state_dict())

@@ -101,7 +101,7 @@ def test_options_reach_the_loop(loop: Any) -> None:
         (OSError("Error writing file: No space left on device"), 2, "the disk is full"),
         (PermissionError(errno.EACCES, "denied", "/o"), 2, "/o: permission denied: choose a place"),
         (OSError(errno.EROFS, "ro", "/o"), 2, "read-only: choose another --out"),
-        (KeyboardInterrupt(), 3, "interrupted; the same command goes on from the last finished stage"),
+        (KeyboardInterrupt(), 3, "interrupted; the same command goes on from what it had finished"),
         (
             ZeroDivisionError("division by zero"),
             1,

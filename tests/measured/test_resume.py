@@ -134,7 +134,7 @@ def test_an_interrupted_run_says_how_to_go_on(
     _, errors = run.communicate(timeout=30)
     assert run.returncode == 3
     assert errors.split("\n") == [
-        "nfc-gym close-loop: interrupted; the same command goes on from the last finished stage", ""
+        "nfc-gym close-loop: interrupted; the same command goes on from what it had finished", ""
     ]  # fmt: skip
     assert not (tmp_path / "out" / "run_0" / "report.json").exists()
 

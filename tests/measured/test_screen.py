@@ -8,10 +8,10 @@ import pytest
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.fisher import Lens, repeated
-from nfc_gym.measured.fit import stand
+from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.metric import loss, metric
-from nfc_gym.measured.screen import Screen, ladder
+from nfc_gym.measured.screen import Screen, answer, ladder
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
@@ -181,3 +181,10 @@ def test_springs_with_values_of_their_own_are_screened() -> None:
     assert found.gain > 0
     # Drives of one make on one battery follow it alike.
     assert split(FAMILIES["supply_sag"](("a", "b")), screen.current.plant) is None
+
+
+def test_a_model_without_free_parameters_answers_nothing() -> None:
+    """An anchored mass is all that a mapping may declare."""
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    bare = Fit(Plant(model, ParameterSpace(model, [])), np.zeros(0), np.ones((5, 3)), np.zeros((5, 3, 0)))
+    assert answer(bare, np.ones((2, 5, 3))).shape == (2, 0)
