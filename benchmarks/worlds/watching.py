@@ -146,7 +146,7 @@ def watcher(policy: Policy, world: World, seed: int, **settings: Any) -> Lasting
     scorer = Unforeseen(*(np.concatenate(part) for part in zip(*robots[:half], strict=True)))
     scores = [scorer.score(*each) for each in robots[half:]]
     lasting = Lasting(scorer, np.concatenate(scores))
-    lasting.threshold = threshold_at([lasting.lasting(each).max() for each in scores], RATE).value
+    lasting.threshold = threshold_at([lasting.lasting(each).max() for each in scores], RATE, "episodes").value
     return lasting
 
 

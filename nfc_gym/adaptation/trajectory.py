@@ -138,7 +138,7 @@ def threshold_of(nominal: Iterable[Trajectory], rate: float) -> Threshold:
     Raises:
       InputError: too few trajectories for the rate.
     """
-    return threshold_at([float(t.scores.max()) for t in nominal], rate)
+    return threshold_at([float(t.scores.max()) for t in nominal], rate, "trajectories")
 
 
 def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: float, seed: int) -> Trajectory:

@@ -47,7 +47,7 @@ class Log:
       exogenous: `exo:<name>` -> (T,) measured signals that drive effects (volts, temperature).
       known: `<field>:<object>` -> (T,) model fields that the log itself gives.
       servo: `ctrl:<actuator>` -> {"gain" | "supply" | "damping": (T,)} of a firmware servo's law.
-      group: logs of one group are never split between fitting and verifying.
+      group: logs of one group are never split between fitting and verifying where the split is `by: group` or `rotate`.
       condition: label of what the day was like (a wind, a floor); logs of one label share it.
     """
 

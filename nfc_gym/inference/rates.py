@@ -49,7 +49,7 @@ def wanted(rate: float) -> int:
     return math.ceil(ALARMS / rate - 1e-9)
 
 
-def threshold_at(scores: ArrayLike, rate: float) -> Threshold:
+def threshold_at(scores: ArrayLike, rate: float, what: str = "windows") -> Threshold:
     """The score that nominal windows reach at a wanted rate.
 
     It is the k-th largest of n scores, k the whole part of rate (n + 1): if the windows are exchangeable with those to
@@ -59,6 +59,7 @@ def threshold_at(scores: ArrayLike, rate: float) -> Threshold:
     Args:
       scores: (n,) of nominal windows that nothing was fitted to.
       rate: wanted false-positive rate.
+      what: is scored, in words.
 
     Raises:
       InputError: too few windows for that rate, or a score that is not finite.
@@ -66,10 +67,10 @@ def threshold_at(scores: ArrayLike, rate: float) -> Threshold:
     least, found = wanted(rate), _scores("held-out nominal", scores)
     n = len(found)
     if n < least:
+        enough = f"; from these a rate of {ALARMS / n:.2g} or more can be set" if n > ALARMS else ""
         raise InputError(
-            f"threshold: {n} held-out windows cannot show a false-positive rate of {rate:g}, which takes {least} or "
-            f"more ({ALARMS} false alarms among them); "
-            f"from these a rate of {min(1.0, ALARMS / n):.2g} or more can be set"
+            f"threshold: {n} held-out {what} cannot show a false-positive rate of {rate:g}, which takes {least} or "
+            f"more ({ALARMS} false alarms among them){enough}"
         )
     k = math.floor(rate * (n + 1))
     low, high = betaincinv(k, n + 1 - k, [0.05, 0.95])

@@ -1,6 +1,7 @@
 """A training run's state as one safetensors file: tensors by name, the rest as JSON in its metadata."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -40,10 +41,10 @@ def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: format {metadata.get('format')!r}, want {FORMAT!r}: remove it to train anew")
     plain = json.loads(metadata["state"])
-    differ = [k for k, v in json.loads(json.dumps(description)).items() if plain["of"].get(k) != v]
+    differ = list(_differences(plain["of"], json.loads(json.dumps(description))))
     if differ:
         raise InputError(
-            f"{path} is of another run (another {', '.join(differ)}): remove it to train anew, or use another folder"
+            f"{path} is of another run ({'; '.join(differ)}): remove it to train anew, or train to another place"
         )
     for name in ("network", "average", "best"):
         own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
@@ -56,6 +57,17 @@ def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
     run.optimiser.load_state_dict(state)
     run.step, run.loss_sum = plain["step"], plain["loss_sum"]
     run.outcome = type(run.outcome)(**plain["outcome"])
+
+
+def _differences(kept: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
+    """What two descriptions disagree in, with both values where these are plain."""
+    for key, value in now.items():
+        before = kept.get(key)
+        if isinstance(value, dict) and isinstance(before, dict):
+            yield from _differences(before, value)
+        elif before != value:
+            plain = not isinstance(value, list | dict)
+            yield f"{key} {before!r}, now {value!r}" if plain else f"another {key}"
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

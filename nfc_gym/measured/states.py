@@ -35,12 +35,20 @@ class States:
 
 
 def channel_noise(log: Log, name: str) -> float:
-    """Noise of a channel: as declared, else estimated from the log's high frequencies."""
+    """Noise of a channel: as declared, else estimated from the log's high frequencies; of attitudes in rad."""
     channel = log.channels[name]
     if channel.noise is not None:
         return channel.noise
     index = fresh_samples(log.time, channel.values, channel.rate)
-    return estimate_noise(channel.values[index])
+    return estimate_noise(_turned(channel.values[index]) if ":quat" in name else channel.values[index])
+
+
+def _turned(quat: Array) -> Array:
+    """(n, 3) body-frame increments of rotation (n, 4), added up: the noise of a vector has the size of its angle's."""
+    unit = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    steps = quat_to_vector(quat_multiply(quat_conjugate(unit[:-1]), unit[1:]))
+    # They add up to a curve whose slope is the body-frame rate to second order in the step.
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
 
 
 def _smooth(log: Log, channel: Channel, values: Array, points: int, raw: bool) -> Local:
@@ -123,12 +131,10 @@ class _Builder:
         """Smooth a quaternion as a rotation vector about the nearest sample."""
         key, channel = attitude
         quat = channel.values / np.linalg.norm(channel.values, axis=1, keepdims=True)
-        noise = channel_noise(self.log, key) * (2.0 if channel.noise is None else 1.0)
+        noise = channel_noise(self.log, key)
         index = fresh_samples(self.log.time, channel.values, channel.rate)
         vectors = np.zeros((len(quat), 3))
-        steps = quat_to_vector(quat_multiply(quat_conjugate(quat[index[:-1]]), quat[index[1:]]))
-        # Body-frame increments add up to a curve whose slope is the body-frame rate to second order in the step.
-        vectors[index[1:]] = np.cumsum(steps, 0)
+        vectors[index] = _turned(quat[index])
         fit = _smooth(self.log, channel, vectors, self.points, self.raw)
         hold = index[np.searchsorted(index, np.arange(len(quat)), side="right") - 1]
         self.qpos[:, q + 3 : q + 7] = quat_multiply(quat[hold], vector_to_quat(fit.value - vectors[hold]))

@@ -23,6 +23,8 @@ def test_a_rate_beyond_what_the_windows_show_is_refused() -> None:
     with pytest.raises(InputError, match=r"2999 held-out windows.*3000 or more.*0\.001"):
         threshold_at(np.zeros(2999), 0.001)
     assert threshold_at(np.arange(3000), 0.001).value == 2997
+    with pytest.raises(InputError, match=r"3 held-out trajectories cannot show .* false alarms among them\)$"):
+        threshold_at(np.zeros(3), 0.05, "trajectories")  # of which no rate can be told
     with pytest.raises(InputError, match="between 0 and 1"):
         wanted(0)
     with pytest.raises(InputError, match="NaN"):

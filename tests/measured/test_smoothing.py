@@ -5,7 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nfc_gym.core import Channel, Log
 from nfc_gym.measured.smoothing import estimate_noise, fresh_samples, local_polynomial, moving_average
+from nfc_gym.measured.states import channel_noise
+from nfc_gym.physics.state import quat_multiply, vector_to_quat
 
 uneven = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.015, 80))
 
@@ -106,3 +109,11 @@ def test_moving_average(samples: int) -> None:
     for k in (half, 30, 59 - half):
         np.testing.assert_allclose(out[k], values[k - half : k + half + 1].mean(0))
     np.testing.assert_allclose(moving_average(values[:, 0], samples), out[:, 0])
+
+
+def test_the_noise_of_an_attitude_is_estimated_as_an_angle() -> None:
+    rng, t = np.random.default_rng(0), 0.01 * np.arange(2000)
+    turned = vector_to_quat(np.stack([0.3 * np.sin(t), 0.2 * np.cos(2 * t), 0.5 * t], 1))
+    seen = quat_multiply(turned, vector_to_quat(0.01 * rng.standard_normal((len(t), 3))))
+    log = Log("flight", t, {}, {"body:base:quat": Channel(seen)})
+    assert channel_noise(log, "body:base:quat") == pytest.approx(0.01, rel=0.05)

@@ -7,6 +7,7 @@ from machines import make, plant_of, run
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects.each import each
 from nfc_gym.physics.segments import Segments
 
 DT, MASS = 0.002, 2.0
@@ -195,3 +196,14 @@ def test_thermal_fades_a_step_as_it_heats_up() -> None:
     made = _made("thermal", {"fade": 0.3, "time_constant": 0.1, "reference": 2.0}, ctrl)
     time = np.arange(1, 101) * DT
     np.testing.assert_allclose(made[5:], 2 * (1 - 0.3 * (1 - np.exp(-time / 0.1))), atol=1e-12)
+
+
+def test_of_delays_that_differ_the_model_carries_all_or_none() -> None:
+    """MJCF has no delay shorter than a step: were the longer one in the model, it would act there and beside it."""
+    two = RAIL.replace("</actuator>", '<motor name="pull" joint="rail"/></actuator>')
+    spec = mujoco.MjSpec.from_string(two)
+    both = each([build("delay", name, {"delay": 0.0})[0] for name in ("push", "pull")])
+    assert not both.spec(spec, np.array([DT / 2, 0.03]))
+    assert [a.delay for a in spec.actuators] == [0, 0]
+    assert both.spec(spec, np.array([0.02, 0.03]))
+    assert [a.delay for a in spec.actuators] == [0.02, 0.03]

@@ -57,8 +57,10 @@ class Each(Effect):
         return [theta[..., p] for p in self._parts]
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        """See `Effect`."""
-        return all([m.spec(spec, t) for m, t in zip(self.members, self._theta(theta), strict=True)])
+        """See `Effect`: all members or none, lest one act in the model and beside it as well."""
+        parts = list(zip(self.members, self._theta(theta), strict=True))
+        tried = spec.copy()
+        return all(m.spec(tried, t) for m, t in parts) and all([m.spec(spec, t) for m, t in parts])
 
     def model(self, fields: ModelFields, theta: Array) -> None:
         """See `Effect`."""
