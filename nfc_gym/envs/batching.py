@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs.contract import checked_options
+from nfc_gym.physics.parameters import numbers
 
 Ids = NDArray[np.intp]
 
@@ -41,17 +42,21 @@ def seeds_of(seed: int | Sequence[int | None] | None, n: int) -> list[int | None
     return seeds
 
 
-def rows_of(value: Any, ids: Ids, n: int) -> Any:
-    """Reset options of n environments, for some of them: (n, ...) arrays are cut, anything else holds for each."""
+def rows_of(value: Any, ids: Ids, n: int, name: str) -> Any:
+    """A reset option of n environments, for some of them: an (n, ...) array is cut, anything else holds for each."""
     if isinstance(value, Mapping):
-        return {k: np.asarray(v)[ids] if np.shape(v) == (n,) else v for k, v in value.items()}
-    return np.asarray(value)[ids] if np.shape(value)[:1] == (n,) and np.ndim(value) != 1 else np.asarray(value)
+        each = {k: numbers(v, f"{name}[{k!r}]") for k, v in value.items()}
+        return {k: v[ids] if v.shape == (n,) else v for k, v in each.items()}
+    numbers(value, name)  # refuses what is none
+    array = np.asarray(value)
+    return array[ids] if array.shape[:1] == (n,) and array.ndim != 1 else array
 
 
 def terrain_ids(chosen: Any, k: int, maps: int) -> Ids:
     """(k,) map of each environment."""
     chosen = np.asarray(chosen)
-    if chosen.shape not in ((), (k,)) or (chosen != chosen.astype(np.intp)).any():
+    numeric = chosen.dtype.kind in "iuf" and np.isfinite(chosen).all()
+    if chosen.shape not in ((), (k,)) or not numeric or (chosen % 1 != 0).any():
         raise InputError(
             f"terrain_id has shape {chosen.shape} and type {chosen.dtype}; want whole numbers () or ({k},)"
         )

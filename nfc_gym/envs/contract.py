@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs.robot import FASTEST, Array, Robot
 from nfc_gym.envs.view import View
-from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.physics.parameters import ParameterSpace, numbers
 from nfc_gym.terrain import SHAPE, Heightfield
 from nfc_gym.terrain.egocentric import SIZE
 
@@ -141,7 +141,9 @@ def nothing_yet(robot: Robot, view: View) -> dict[str, NDArray]:
 
 
 def checked_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Reset options; an unknown one, or a terrain for a flat environment, raises `InputError`."""
+    """Reset options; what is no mapping, an unknown one, or a terrain for a flat environment raises `InputError`."""
+    if options is not None and not isinstance(options, Mapping):
+        raise InputError(f"options is {options!r}, want None or a mapping with: {', '.join((*OPTIONS, *more))}")
     given = {k: v for k, v in (options or {}).items() if v is not None}
     for key in given:
         if key not in (*OPTIONS, *more):
@@ -157,7 +159,7 @@ def psi_of(space: ParameterSpace, values: Any, shape: tuple[int, ...], name: str
     """(*shape, d) psi from a vector, one a simulation, or a dict of names (the rest nominal); None is nominal.
 
     Raises:
-      InputError: an unknown name, another shape, a value that is not finite.
+      InputError: an unknown name, another shape, a value that is no finite number.
     """
     if values is None:
         psi: ArrayLike = space.nominal
@@ -166,11 +168,12 @@ def psi_of(space: ParameterSpace, values: Any, shape: tuple[int, ...], name: str
         for key, value in values.items():
             if key not in space.names:
                 raise InputError(f"{name} has no parameter {key!r}; there are: {', '.join(space.names)}")
-            if np.shape(value) not in ((), shape):
-                raise InputError(f"{name}[{key!r}] has shape {np.shape(value)}, want () or {shape}")
-            psi[..., space.names.index(key)] = value
+            own = numbers(value, f"{name}[{key!r}]")
+            if own.shape not in ((), shape):
+                raise InputError(f"{name}[{key!r}] has shape {own.shape}, want () or {shape}")
+            psi[..., space.names.index(key)] = own
     else:
-        psi = np.asarray(values, float)
+        psi = numbers(values, name)
         if psi.shape not in ((len(space),), (*shape, len(space))):
             raise InputError(f"{name} has shape {psi.shape}, want {(*shape, len(space))}: {', '.join(space.names)}")
     psi = np.broadcast_to(psi, (*shape, len(space))).astype(float)

@@ -2,12 +2,21 @@
 
 from typing import Any
 
+import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs.render import Camera, Pictures, Window
+
+
+def warn_without_mode() -> None:
+    """What Gymnasium's own environments say to `render` without a `render_mode`."""
+    gymnasium.logger.warn(
+        "render() shows nothing without a render_mode: give it when the environment is made, for instance "
+        'gymnasium.make(..., render_mode="rgb_array")'
+    )
 
 
 class Screen:
@@ -31,7 +40,7 @@ class Screen:
         self._window: Window | None = None
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8] | None:
-        """A picture (height, width, 3), or None where a window was brought up to date, or nothing is shown."""
+        """A picture (height, width, 3), or None where a window was brought up to date, or there is no mode."""
         if self._mode == "rgb_array":
             if self._pictures is None:
                 self._pictures = Pictures(model, *self._size)
@@ -40,6 +49,8 @@ class Screen:
             if self._window is None:
                 self._window = Window(model, data, self.camera)
             self._window.render(model)
+        if self._mode is None:
+            warn_without_mode()
         return None
 
     def close(self) -> None:

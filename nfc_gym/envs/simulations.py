@@ -96,6 +96,7 @@ class Simulations:
     def _write_psi(self, ids: Ids, given: Mapping[str, Any]) -> None:
         shape = (len(ids),)
         psi = psi_of(self.space, given.get("psi"), shape)
+        self.space.require_possible(psi)
         belief = psi_of(self.space, given["psi_belief"], shape, "psi_belief") if "psi_belief" in given else psi
         fields = self.fields if len(ids) == self.n else self.fields.rows(ids)
         fields.restore()

@@ -168,6 +168,7 @@ class RobotEnv(gymnasium.Env):
 
         Raises:
           InputError: another shape, or an entry that is not finite, which the message names.
+          ResetNeeded: no episode was begun yet.
         """
         action = np.array(action, np.float64)
         values = action.tolist()  # a handful of numbers: looked at faster one by one than by numpy
@@ -176,6 +177,8 @@ class RobotEnv(gymnasium.Env):
         if max(values) > 1 or min(values) < -1:
             action = np.clip(action, -1, 1)
         view = self._view
+        if view.now is None:
+            raise gymnasium.error.ResetNeeded("the environment must be reset before its first step")
         view.ctrl[...] = self.robot.actuate(action, view)
         self._advance()
         unstable = broken(view)
@@ -188,7 +191,10 @@ class RobotEnv(gymnasium.Env):
         return self._observation(), float(reward), bool(terminated), False, _leaves(info)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(height, width, 3) picture for `rgb_array`; brings the window up to date for `human`."""
+        """(height, width, 3) picture for `rgb_array`; brings the window up to date for `human`.
+
+        Without a `render_mode` Gymnasium's logger warns, and there is no picture.
+        """
         return self.screen.render(self.model, self.data)
 
     def close(self) -> None:
@@ -207,6 +213,7 @@ class RobotEnv(gymnasium.Env):
     def _set_psi(self, given: Mapping[str, Any]) -> None:
         space = self.psi_space
         psi = psi_of(space, given.get("psi"), ())
+        space.require_possible(psi)
         belief = psi_of(space, given["psi_belief"], (), "psi_belief") if "psi_belief" in given else psi
         self.fields.restore()
         space.write(self.fields, psi)

@@ -42,9 +42,11 @@ class Pool:
 
     def map(self, index: Any) -> terrain.Heightfield:
         """One map; an index outside the pool raises `InputError`."""
-        if index != int(index) or not 0 <= index < self.size:
+        value = index.item() if isinstance(index, np.generic | np.ndarray) and np.ndim(index) == 0 else index
+        whole = isinstance(value, int | float) and not isinstance(value, bool)
+        if not whole or value not in range(self.size):
             raise InputError(f"terrain_id is {index!r}, want a whole number from 0 to {self.size - 1}")
-        return _map(self.kind, float(self.difficulty), self.seed, int(index), self.scale)
+        return _map(self.kind, float(self.difficulty), self.seed, int(value), self.scale)
 
 
 @lru_cache(maxsize=_KEPT)

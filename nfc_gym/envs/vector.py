@@ -5,7 +5,7 @@ has its own psi (`Batch.expand`) and its own terrain, one heightfield of a pool 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import mujoco
@@ -30,7 +30,7 @@ from nfc_gym.envs.contract import (
 )
 from nfc_gym.envs.look import HeldMaps
 from nfc_gym.envs.robot import Robot
-from nfc_gym.envs.screen import Screen
+from nfc_gym.envs.screen import Screen, warn_without_mode
 from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.simulations import Simulations
 from nfc_gym.physics.fields import ModelFields
@@ -56,6 +56,11 @@ class RobotVectorEnv(VectorEnv):
       after_hooks: called with this environment after the last physics step, before anything is observed.
       reset_hooks: called with the ids (k,) about to be reset, autoresets included; a returned dict of reset options,
         leading shape (k,), holds for those unless `reset` itself was given that option.
+
+    It cannot be pickled or copied: `gymnasium.make_vec` makes another one.
+
+    Raises:
+      InputError: a value is none of these; the message says what would be valid.
     """
 
     def __init__(
@@ -70,10 +75,10 @@ class RobotVectorEnv(VectorEnv):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        self._kind, self._nthread = robot_class(robot), nthread
+        self._kind, self._nthread = robot_class(robot), _whole("nthread", nthread, 0)
         self._given = Settings.of(self._kind, settings)
         self.screen = Screen(render_mode, (None, "rgb_array"), self._given)
-        self.num_envs, self.rough, self.render_mode = int(num_envs), bool(rough), render_mode
+        self.num_envs, self.rough, self.render_mode = _whole("num_envs", num_envs, 1), bool(rough), render_mode
         self.frame_skip, self.autoreset_mode = self._kind.frame_skip, AutoresetMode(autoreset_mode)
         self.control_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
@@ -215,7 +220,7 @@ class RobotVectorEnv(VectorEnv):
         for i, own in enumerate(seeds_of(seed, n)):
             if own is not None and i in ids:
                 self._sims.generators[i] = seeding.np_random(own)[0]
-        self._begin(ids, {key: rows_of(value, ids, n) for key, value in given.items()})
+        self._begin(ids, {key: rows_of(value, ids, n, key) for key, value in given.items()})
         info = nothing_yet(self.robot, self._view)
         return self._observation(), masked(info, np.isin(np.arange(n), ids))
 
@@ -258,8 +263,9 @@ class RobotVectorEnv(VectorEnv):
         return obs, rewards, ended, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A picture (height, width, 3) of every environment."""
+        """A picture (height, width, 3) of every environment; without a `render_mode` Gymnasium's logger warns."""
         if self.render_mode is None:
+            warn_without_mode()
             return None
         frames = []
         for i in range(self.num_envs):
@@ -271,6 +277,12 @@ class RobotVectorEnv(VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Free what rendering holds."""
         self.screen.close()
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            f"{type(self).__name__} cannot be pickled or copied, since its simulations are MuJoCo's own: make it anew "
+            "with gymnasium.make_vec, and reset it with the same seed"
+        )
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 
@@ -331,6 +343,13 @@ class RobotVectorEnv(VectorEnv):
             perceived = self._sims.perceived or None
             obs["elevation"] = self._elevation.around(self._view.qpos, perceived, self._sims.chosen, self._steps, rows)
         return obs
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    """An argument that is a whole number, `least` or more."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name} is {value!r}, want a whole number, {least} or more")
+    return int(value)
 
 
 def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotVectorEnv:

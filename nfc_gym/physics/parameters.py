@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,6 +20,16 @@ from nfc_gym.physics.contact import restitution_solref
 from nfc_gym.physics.fields import ModelFields, rows_of
 
 Array = NDArray[np.float64]
+
+
+def numbers(value: Any, name: str) -> Array:
+    """A number, or numbers, as an array; anything else raises `InputError` with the value's name."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        text = repr(value)
+        shown = text if len(text) <= 80 else f"{text[:77]}..."
+        raise InputError(f"{name} is {shown}, want a number or an array of numbers") from None
 
 
 @dataclass(frozen=True)
@@ -80,6 +91,20 @@ COMPOUND = {
     "geom_restitution": ("geom_solref", _write_restitution),
 }
 _READ = {"servo_kv": ("actuator_gainprm", 0), "servo_kp": ("actuator_gainprm", 0)}
+_WIDE = 100  # characters of a `repr` on one line
+_ANY, _AT_LEAST_0 = (-np.inf, np.inf), (0.0, np.inf)
+# Field -> (least, most) that nature allows; a mass must be more than 0.
+_POSSIBLE = {
+    "geom_restitution": (0.0, 1.0),
+    **dict.fromkeys(
+        (
+            "body_mass", "geom_friction", "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
+            "tendon_stiffness", "tendon_damping", "tendon_frictionloss", "servo_kp", "servo_kv", "opt.density",
+            "opt.viscosity",
+        ),
+        _AT_LEAST_0,
+    ),
+}  # fmt: skip
 _FIELD = re.compile(r"^([\w.]+?)(?:\[(\d+)\])?$")
 
 
@@ -113,6 +138,8 @@ def resolve(model: mujoco.MjModel, field: str, of: Sequence[str]) -> _Bound:
     if not isinstance(array, np.ndarray):
         raise InputError(f"field {field!r} is not an array field of MjModel (or one of {', '.join(COMPOUND)})")
     if name.startswith("opt."):
+        if component is None or component >= len(array):
+            raise InputError(f"field {field!r}: name one of its {len(array)} components, for instance {name}[0]")
         return _Bound(name, component, None)
     if not of:
         raise InputError(f"field {field!r}: `of` must name at least one object")
@@ -147,6 +174,18 @@ def _require_mass(model: mujoco.MjModel, p: Parameter, bound: _Bound) -> None:
                 f"parameter {p.name!r}: body {model.body(body).name!r} has no mass in the model, and so no "
                 "inertia that could grow with it; name a body with a mass"
             )
+
+
+def _require_possible(p: Parameter, bound: _Bound, value: Array) -> None:
+    """Refuse values (...,) of a parameter that nature does not allow."""
+    if bound.name == "body_mass" and (value <= 0).any():
+        raise InputError(f"parameter {p.name!r}: a mass must be positive, got {float(value.min()):g} {p.unit}")
+    least, most = _POSSIBLE.get(bound.name, _ANY)
+    wrong = value[(value < least) | (value > most)]
+    if wrong.size:
+        unit = "" if p.unit == "1" else f" {p.unit}"
+        want = "0 or more" if most == np.inf else f"a number from {least:g} to {most:g}"
+        raise InputError(f"parameter {p.name!r} is {float(wrong[0]):g}{unit}, want {want}")
 
 
 class ParameterSpace:
@@ -191,6 +230,11 @@ class ParameterSpace:
     def __len__(self) -> int:
         return len(self.parameters)
 
+    def __repr__(self) -> str:
+        rows = [f"{p.name} {p.low:g}..{p.high:g}{'' if p.unit == '1' else f' {p.unit}'}" for p in self.parameters]
+        line = f"{type(self).__name__}({', '.join(rows)})"
+        return line if len(line) <= _WIDE else "\n".join([f"{type(self).__name__}(", *(f"  {r}," for r in rows), ")"])
+
     @property
     def free(self) -> NDArray[np.bool_]:
         """(d,) which parameters are not anchored."""
@@ -218,9 +262,21 @@ class ParameterSpace:
             value = psi[..., i]
             if not np.isfinite(value).all():
                 raise InputError(f"parameter {p.name!r} is not finite")
-            if bound.name == "body_mass" and (value <= 0).any():
-                raise InputError(f"parameter {p.name!r}: a mass must be positive, got {float(value.min()):g} {p.unit}")
+            if bound.name == "body_mass":
+                _require_possible(p, bound, value)
             write_field(fields, bound, value)
+
+    def require_possible(self, psi: ArrayLike) -> None:
+        """Refuse psi (..., d) that nature does not allow, such as negative friction; it may leave the prior's box.
+
+        `write` asks it of masses alone: bounds that a fit was given may reach further.
+
+        Raises:
+          InputError: naming the parameter and what it can be.
+        """
+        psi = np.asarray(psi, float)
+        for i, (p, bound) in enumerate(zip(self.parameters, self._bound, strict=True)):
+            _require_possible(p, bound, psi[..., i])
 
     def normalise(self, psi: ArrayLike) -> Array:
         """Physical values (..., d) to [-1, 1] by the prior's bounds, not clipped."""
@@ -236,13 +292,21 @@ class ParameterSpace:
         return np.where(self.free, draws, self.nominal)
 
     def vector(self, values: "dict[str, float] | ArrayLike") -> Array:
-        """(d,) from a dict of names (the rest nominal) or a vector; an unknown name raises `InputError`."""
+        """(d,) from a dict of names (the rest nominal) or a vector.
+
+        Raises:
+          InputError: an unknown name, or a value that is no number.
+        """
         if not isinstance(values, dict):
-            return np.asarray(values, float)
+            return numbers(values, "psi")
         unknown = sorted(set(values) - set(self.names))
         if unknown:
             raise InputError(f"no parameter named {unknown[0]!r}; there are: {', '.join(self.names)}")
-        return np.array([values.get(n, v) for n, v in zip(self.names, self.nominal, strict=True)], float)
+        given = {n: numbers(v, f"psi[{n!r}]") for n, v in values.items()}
+        for name, value in given.items():
+            if value.ndim:
+                raise InputError(f"psi[{name!r}] has shape {value.shape}, want one number")
+        return np.array([given.get(n, v) for n, v in zip(self.names, self.nominal, strict=True)], float)
 
 
 def parameters_from_toml(path: Path) -> list[Parameter]:

@@ -44,6 +44,19 @@ def opened(detector: Detector | str | os.PathLike[str], threshold: float | None)
     return found, float(limit)
 
 
+def scored(env: Any, detector: Detector, obs: Any, action: Any, next_obs: Any) -> Any:
+    """The detector's score of a transition, a number or (n,); its `InputError` says so where goals are in the way."""
+    try:
+        return detector.update(obs, action, next_obs)
+    except InputError as e:
+        if isinstance(next_obs, dict) or not getattr(getattr(env.unwrapped, "robot", None), "goal_size", 0):
+            raise
+        raise InputError(
+            f"{e}; with context=[] an observation is `proprio` and the goal in one: make the environment with "
+            'context=["psi"]'
+        ) from None
+
+
 class MonitorAnomaly(EnvWrapper):
     """Adds `anomaly` (bool) and `anomaly_score` (float) to every `info`; at a reset False and 0.
 
@@ -70,7 +83,7 @@ class MonitorAnomaly(EnvWrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and score the transition."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        score = np.float64(self.detector.update(self._last, action, observation))
+        score = np.float64(scored(self.env, self.detector, self._last, action, observation))
         self._last = observation
         info = {**info, "anomaly": np.bool_(score >= self.threshold), "anomaly_score": score}
         return observation, reward, terminated, truncated, info
@@ -101,7 +114,7 @@ class VectorMonitorAnomaly(VectorEnvWrapper):
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step, and score the transitions."""
         observation, reward, terminated, truncated, info = self.env.step(actions)
-        score = np.array(self.detector.update(self._last, actions, observation), float)
+        score = np.array(scored(self.env, self.detector, self._last, actions, observation), float)
         if score.shape != (self.num_envs,):
             raise InputError(f"MonitorAnomaly: the detector's scores have shape {score.shape}, want ({self.num_envs},)")
         first = self.rows.step(terminated, truncated)

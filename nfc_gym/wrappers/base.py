@@ -38,7 +38,8 @@ def finite(action: Any) -> Any:
 class _Common(RecordConstructorArgs):
     """The wrapper's own stream of random numbers, and pickling through the constructor.
 
-    What a wrapper drew for the running episode is not pickled: `step` before the next `reset` raises `ResetNeeded`.
+    A pickle or a deep copy begins before its first reset, also where the bare environment's would go on: what wrappers
+    drew and remember of the running episode is not in it, and `step` before `reset` raises `ResetNeeded`.
 
     The stream follows from the seed of `reset` and never draws from the environment's own generator, so that a wrapper
     which changes nothing leaves the environment's draws as they are.
@@ -59,6 +60,7 @@ class _Common(RecordConstructorArgs):
         self._depth = sum(kind(w) == kind(self) for w in beneath(env))
 
     def __reduce__(self) -> tuple[Any, ...]:
+        """The wrapper made anew around its environment, before the first reset: a running episode is not kept."""
         return _rebuild, (type(self), self.env, self.arguments)
 
     def recorded(self, name: str, value: Any) -> Any:
@@ -83,7 +85,7 @@ class _Common(RecordConstructorArgs):
 
 
 class EnvWrapper(_Common, gym.Wrapper):
-    """Base of the wrappers around one environment."""
+    """Base of the wrappers around one environment. A pickle or a deep copy must be reset before it steps."""
 
     def __init__(self, env: gym.Env, **arguments: Any) -> None:
         self.require(env)
@@ -100,7 +102,10 @@ class EnvWrapper(_Common, gym.Wrapper):
 
 
 class VectorEnvWrapper(_Common, VectorWrapper):
-    """Base of their twins around a vector environment; all rows draw from one stream."""
+    """Base of their twins around a vector environment; all rows draw from one stream.
+
+    This package's own vector environments cannot be pickled or copied, and so neither can their wrappers.
+    """
 
     def __init__(self, env: VectorEnv, **arguments: Any) -> None:
         self.require(env)

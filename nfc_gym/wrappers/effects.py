@@ -36,14 +36,44 @@ def recorded(effects: Given) -> list[dict[str, Any]] | str:
     """Effects as a spec keeps them: rows of plain data, or a path."""
     if isinstance(effects, str | os.PathLike):
         return os.fspath(effects)
-    return [to_row(*e) if isinstance(e, tuple) else dict(e) for e in effects]
+    return [_recorded(e) for e in effects]
+
+
+def _recorded(given: Any) -> Any:
+    """One of them; what is neither a pair nor a row is left to `bound` to refuse."""
+    if _is_pair(given):
+        return to_row(given[0], _values(*given))
+    return dict(given) if isinstance(given, Mapping) else given
+
+
+def _is_pair(given: Any) -> bool:
+    return isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Effect)
+
+
+def _own_pair(given: Any) -> tuple[Effect, Array]:
+    """An effect that nobody else holds, and its values."""
+    return copy.deepcopy(given) if _is_pair(given) else from_row(given)
+
+
+def _values(effect: Effect, theta: ArrayLike) -> Array:
+    """Values (k,) of an effect; another number of them, or what cannot be, raises `InputError`."""
+    try:
+        values = np.asarray(theta, float)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.shape != (len(effect.params),) or not np.isfinite(values).all():
+        names = ", ".join(p.name for p in effect.params)
+        raise InputError(f"ApplyEffects: {effect.id} takes finite values of {names}, got {theta}")
+    effect.require_possible(values)
+    return values
 
 
 def bound(effects: Given, model: mujoco.MjModel, condition: str | None = None) -> tuple[list[Effect], list[Array]]:
     """Effects of their own, bound to a model, and their values in a condition.
 
     Raises:
-      InputError: a row, a family, a place or a parameter that does not exist, or values of another number.
+      InputError: a row, a family, a place or a parameter that does not exist, values of another number, or values that
+        cannot be (`Param.nature`).
     """
     if isinstance(effects, str | os.PathLike):
         try:
@@ -51,24 +81,21 @@ def bound(effects: Given, model: mujoco.MjModel, condition: str | None = None) -
         except InputError as e:
             file = os.fspath(effects)
             raise InputError(str(e) if str(e).startswith(file) else f"{file}: {e}") from None
-    pairs = [copy.deepcopy(e) if isinstance(e, tuple) else from_row(e) for e in effects]
-    pairs = [_in_condition(*pair, condition) for pair in pairs]
-    for effect, theta in pairs:
-        if np.shape(theta) != (len(effect.params),) or not np.isfinite(theta).all():
-            names = ", ".join(p.name for p in effect.params)
-            raise InputError(f"ApplyEffects: {effect.id} takes finite values of {names}, got {theta}")
+    pairs = [_own_pair(e) for e in effects]
+    pairs = [_in_condition(effect, _values(effect, theta), condition) for effect, theta in pairs]
+    for effect, _ in pairs:
         effect.bind(model)
-    return [e for e, _ in pairs], [np.asarray(t, float) for _, t in pairs]
+    return [e for e, _ in pairs], [t for _, t in pairs]
 
 
 def _in_condition(effect: Effect, theta: Array, condition: str | None) -> tuple[Effect, Array]:
     """The effect with its values of one condition, where they differ."""
-    if not isinstance(effect, Conditioned) or np.shape(theta) != (len(effect.params),):
+    if not isinstance(effect, Conditioned):
         return effect, theta
     if condition is None:
         known = ", ".join(effect.conditions)
         raise InputError(f"ApplyEffects: {effect.id} differs between conditions: say condition=, one of {known}")
-    return effect.inner, effect.inside(np.asarray(theta, float), condition)
+    return effect.inner, effect.inside(theta, condition)
 
 
 def check_signals(effects: Sequence[Effect], exogenous: Mapping[str, Signal]) -> None:

@@ -33,8 +33,8 @@ class Prior:
         posterior, a path.
 
     Raises:
-      InputError: a fraction outside (0, 1], a name that the space lacks, bounds that are not ordered, a source of
-        another width.
+      InputError: a fraction outside (0, 1], a name that the space lacks, bounds that are not ordered or reach what
+        nature does not allow (a mass of 0, negative friction), a source of another width.
     """
 
     def __init__(self, space: ParameterSpace, distribution: Distribution) -> None:
@@ -52,6 +52,8 @@ class Prior:
         else:
             self.draws = Draws(distribution, "psi", "RandomizePsi")
             self.draws.expect((len(space),), meaning=f"the parameters {', '.join(space.names)}")
+        for bound in (self.low, self.high):
+            space.require_possible(bound)
 
     def _named(self, bounds: Mapping[str, Sequence[float]]) -> None:
         for name, pair in bounds.items():
@@ -61,9 +63,11 @@ class Prior:
         self.high = self.space.vector({n: float(b[1]) for n, b in bounds.items()})
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """(n, d) psi in physical units."""
+        """(n, d) psi in physical units; samples that nature does not allow raise `InputError`."""
         if self.draws is not None:
-            return self.draws.draw(n, rng)
+            psi = self.draws.draw(n, rng)
+            self.space.require_possible(psi)
+            return psi
         return rng.uniform(self.low, self.high, (n, len(self.space)))
 
 
@@ -126,6 +130,8 @@ class Psi:
             self.value = self.space.vector(options["psi"])
             return options
         self.value = self.space.vector(options.pop("psi", value))
+        if self.value.shape == self.space.nominal.shape:  # another one is refused where it is written
+            self.space.require_possible(self.value)
         self.sim.edit()
         return options or None
 

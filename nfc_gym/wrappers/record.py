@@ -5,6 +5,7 @@ A folder with `model.xml`, `mapping.yaml` and one Parquet file an episode, its c
 """
 
 import os
+import pathlib
 from typing import Any
 
 import gymnasium as gym
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
+from nfc_gym.wrappers.order import beneath, kind
 from nfc_gym.wrappers.record_folder import LogFolder
 from nfc_gym.wrappers.record_tape import Tape
 from nfc_gym.wrappers.simulation import Simulation, simulation_of
@@ -37,6 +39,10 @@ class _Recording:
 
     def _wire(self, path: Path, model_file: Path | None) -> None:
         sim = self.sim
+        for inner in beneath(self.env):
+            if isinstance(inner, _Recording) and inner.log.folder.resolve() == pathlib.Path(path).resolve():
+                name = kind(self)
+                raise InputError(f"{name} around {name}: both record into {os.fspath(path)}; give each its own folder")
         self.log = LogFolder(self.env, sim, path, None if model_file is None else os.fspath(model_file))
         self.sensing = int(sim.nominal.nsensordata) > 0
         sim.attach("RecordLog", after=self.sensing, substeps=self.sensing)
@@ -84,6 +90,15 @@ class RecordLog(_Recording, EnvWrapper):
     One sample a control step: time, commands as the environment sends them (before effects act on them), positions and
     velocities of joints and free bodies, sensors (with the sensor effects of `ApplyEffects`). A file is there once its
     episode is over (its end, the next reset, or `close`), and whole; episodes of less than two steps leave none.
+
+    A folder holds one `model.xml`, and the ground is part of it. An environment on rough ground draws a map of its pool
+    at each reset, so that the second episode would need another model: make it with `terrain_pool=1`, or reset it with
+    the same `options={"terrain_id": ...}` each time.
+
+    Raises:
+      InputError: no MuJoCo environment, its MJCF is not at hand, another recorder beneath writes to the folder; at a
+        reset, the folder holds logs of another model or other ground.
+      MissingExtra: Parquet or YAML cannot be written.
     """
 
     def __init__(self, env: gym.Env, path: Path, model_file: Path | None = None) -> None:

@@ -73,7 +73,9 @@ class LogFolder:
                 series = sense(column.name, series, self.sim.duration())
             wide = pa.FixedSizeListArray.from_arrays(np.ascontiguousarray(series).reshape(-1), column.size)
             table[column.name] = series[:, 0] if column.size == 1 else wide
-        with replacing(self.folder / f"episode_{self.count:04d}.parquet") as part:
+        while (file := self.folder / f"episode_{self.count:04d}.parquet").exists():  # of another recorder
+            self.count += 1
+        with replacing(file) as part:
             pq.write_table(pa.table(table), part)
         self.count += 1
         self._map()

@@ -68,10 +68,22 @@ def test_psi_may_leave_the_prior_but_not_physics() -> None:
         ({"base_mass": 0.0}, "mass must be positive"),
         ({"base_mass": np.nan}, "base_mass is not finite"),
         ({"bas_mass": 1.0}, "no parameter 'bas_mass'; there are: base_mass"),
-        (np.zeros(3), r"shape \(3,\), want \(17,\)"),
+        (np.zeros(3), r"shape \(3,\), want \((2, )?17,?\)"),
+        ({"base_mass": "heavy"}, "base_mass'\\] is 'heavy', want a number"),
+        ("heavy", "psi is 'heavy', want a number"),
+        ({"front_left_wheel_friction": -0.1}, "front_left_wheel_friction' is -0.1, want 0 or more"),
+        ({"front_left_wheel_damping": -5}, "front_left_wheel_damping' is -5 N m s/rad, want 0 or more"),
+        ({"front_left_wheel_restitution": 3}, "front_left_wheel_restitution' is 3, want a number from 0 to 1"),
     ):
-        with pytest.raises(InputError, match=message):
-            env.reset(options={"psi": bad})
+        for one_or_two in (env, gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=2)):
+            with pytest.raises(InputError, match=message):
+                one_or_two.reset(options={"psi": bad})
+    with pytest.raises(InputError, match="rear_right_ankle_stiffness' is -1 N m/rad"):
+        made("nfc_gym/AntFlat-v0").reset(options={"psi": {"rear_right_ankle_stiffness": -1}})
+    with pytest.raises(InputError, match="'front_left_wheel_friction' is -1"):
+        gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=2).reset(
+            options={"psi": {"front_left_wheel_friction": [1.0, -1.0]}}
+        )
 
 
 @pytest.mark.parametrize(
@@ -109,6 +121,10 @@ def test_reset_options_are_checked() -> None:
     for options, message in (
         ({"terrain_id": 3}, "from 0 to 2"),
         ({"terrain_id": 0.5}, "whole number"),
+        ({"terrain_id": "x"}, "'x', want a whole number from 0 to 2"),
+        ({"terrain_id": np.array([1])}, r"array\(\[1\]\), want a whole number"),
+        ({"terrain_id": True}, "True, want a whole number"),
+        ({"terrain_id": np.nan}, "nan, want a whole number"),
         ({"heightfield": np.zeros((5, 5))}, r"shape \(5, 5\), want \(256, 256\)"),
         ({"heightfield": np.full((256, 256), np.nan)}, "not finite"),
         ({"heightfield": np.full((256, 256), 99.0)}, "-5 to 11 m"),
@@ -116,6 +132,25 @@ def test_reset_options_are_checked() -> None:
     ):
         with pytest.raises(InputError, match=message):
             rough.reset(options=options)
+    for index in (1, 1.0, np.int64(1), np.array(1)):
+        rough.reset(options={"terrain_id": index})
+    with pytest.raises(InputError, match=r"options is \[1\], want None or a mapping with: psi"):
+        flat.reset(options=[1])
+
+
+def test_a_step_before_the_first_reset_is_told() -> None:
+    for name in ("nfc_gym/JackalFlat-v0", "nfc_gym/AntFlat-v0"):
+        env = made(name).unwrapped
+        with pytest.raises(gymnasium.error.ResetNeeded, match="reset before"):
+            env.step(np.zeros(env.action_space.shape))
+
+
+def test_rendering_without_a_mode_warns() -> None:
+    env = made("nfc_gym/JackalFlat-v0").unwrapped
+    for one_or_two in (env, gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=2)):
+        one_or_two.reset()
+        with pytest.warns(UserWarning, match="render_mode"):
+            assert one_or_two.render() is None
 
 
 def test_input_errors_are_value_errors() -> None:

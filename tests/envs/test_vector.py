@@ -3,6 +3,8 @@
 import gc
 import multiprocessing
 import os
+import pickle
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -252,6 +254,32 @@ def test_bad_input() -> None:
     assert envs.step(np.full((N, 2), 1e308))[3].all(), "finite values of any size are clipped"
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"\[0, 1, 2\]"):
         envs.step(np.zeros((N, 2)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"n": 0}, "num_envs is 0, want a whole number, 1 or more"),
+        ({"n": 2.5}, "num_envs is 2.5"),
+        ({"nthread": -4}, "nthread is -4, want a whole number, 0 or more"),
+    ],
+)
+def test_bad_sizes_are_told(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        vector("nfc_gym/JackalFlat-v0", **arguments)
+
+
+@pytest.mark.parametrize("bad", ["x", True, [True] * N, np.nan, [1], [[1], [1, 2]]])
+def test_what_names_no_terrain_is_told(bad: Any) -> None:
+    with pytest.raises(InputError, match=r"^terrain_id"):
+        vector("nfc_gym/JackalRough-v0").reset(options={"terrain_id": bad})
+
+
+def test_it_is_made_anew_in_place_of_a_copy() -> None:
+    envs = vector("nfc_gym/JackalFlat-v0")
+    for copied in (pickle.dumps, deepcopy):
+        with pytest.raises(TypeError, match=r"make it anew with gymnasium\.make_vec"):
+            copied(envs)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")

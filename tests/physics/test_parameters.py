@@ -171,6 +171,43 @@ def test_impossible_values_are_refused(index: int, value: float, words: str) -> 
         SPACE.write(ModelFields(mujoco.MjModel.from_xml_string(XML)), psi)
 
 
+@pytest.mark.parametrize(
+    ("index", "value", "words"),
+    [
+        (0, 0.0, "'mass': a mass must be positive"),
+        (1, -0.1, "'grip' is -0.1, want 0 or more"),
+        (2, -0.1, "'damping' is -0.1 N m s/rad, want 0 or more"),
+        (3, -5.0, "'kv' is -5 N m s/rad"),
+        (4, -5.0, "'kp' is -5 N m/rad"),
+        (6, 1.5, "'bounce' is 1.5, want a number from 0 to 1"),
+        (6, -0.1, "'bounce' is -0.1"),
+    ],
+)
+def test_what_nature_does_not_allow_is_told(index: int, value: float, words: str) -> None:
+    SPACE.require_possible(VALUES)
+    SPACE.require_possible(np.array([900.0, 30.0, 50.0, 90.0, 900.0, 5.0, 1.0]))  # beyond the prior
+    psi = np.tile(VALUES, (3, 1))
+    psi[1, index] = value
+    for some in (psi[1], psi):
+        with pytest.raises(InputError, match=words):
+            SPACE.require_possible(some)
+
+
+def test_values_that_are_no_numbers_are_told() -> None:
+    for values in ({"grip": "firm"}, ["firm"] * 7, [1, [2]]):
+        with pytest.raises(InputError, match=r"^psi.* is .*, want a number"):
+            SPACE.vector(values)
+    with pytest.raises(InputError, match=r"psi\['grip'\] has shape \(2,\), want one number"):
+        SPACE.vector({"grip": [1, 2]})
+
+
+def test_a_space_shows_names_units_and_bounds() -> None:
+    assert repr(ParameterSpace(MODEL, SPACE.parameters[:2])) == "ParameterSpace(mass 1..4 kg, grip 0.1..2)"
+    lines = repr(SPACE).splitlines()
+    assert (lines[0], lines[1], lines[-1]) == ("ParameterSpace(", "  mass 1..4 kg,", ")")
+    assert len(lines) == len(SPACE) + 2
+
+
 def test_values_beyond_the_prior_are_allowed() -> None:
     assert _written(np.array([9.0, *VALUES[1:]])).body_mass[1] == 9.0
 
@@ -181,6 +218,8 @@ def test_values_beyond_the_prior_are_allowed() -> None:
         ("body_mass", ("bass",), "leg_l"),
         ("geom_friction", ("foot_l",), "3 components"),
         ("geom_friction[7]", ("foot_l",), "component 7"),
+        ("opt.gravity", (), "name one of its 3 components, for instance opt.gravity\\[0\\]"),
+        ("opt.gravity[7]", (), "name one of its 3 components"),
         ("body_weight", ("base",), "not an array field"),
         ("body_mass", (), "at least one"),
     ],

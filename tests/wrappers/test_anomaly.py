@@ -84,3 +84,30 @@ def test_bad_input_is_refused_by_name() -> None:
     silent.threshold = None  # type: ignore[assignment]
     with pytest.raises(InputError, match="threshold"):
         MonitorAnomaly(NoModel(), silent)
+
+
+class Picky(Jump):
+    """Knows `proprio` of the Jackal."""
+
+    def update(self, obs, action, next_obs):
+        next_obs = next_obs["proprio"] if isinstance(next_obs, dict) else next_obs
+        if next_obs.shape[-1] != 15:
+            raise InputError(f"an observation must have 15 entries, got {next_obs.shape}")
+        return np.zeros(next_obs.shape[:-1])
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_an_observation_with_the_goal_in_it_is_told_of(vector: bool) -> None:
+    def env(context: list[str]):
+        if vector:
+            return VectorMonitorAnomaly(gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=2, context=context), Picky())
+        return MonitorAnomaly(gym.make("nfc_gym/JackalFlat-v0", context=context), Picky())
+
+    for context in (["psi"], []):
+        monitored = env(context)
+        monitored.reset(seed=0)
+        if context:
+            monitored.step(np.zeros(monitored.action_space.shape))
+            continue
+        with pytest.raises(InputError, match=r'15 entries.*make the environment with context=\["psi"\]'):
+            monitored.step(np.zeros(monitored.action_space.shape))

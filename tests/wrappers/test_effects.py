@@ -12,9 +12,9 @@ from fakes import CUBE, STATELESS, FakeEnv, NoModel, ZooEnv, roll, same
 from machines import candidates, make, plant_of, probe
 
 from nfc_gym.core import InputError
-from nfc_gym.physics.effects import FAMILIES, Effect
+from nfc_gym.physics.effects import FAMILIES, Effect, build
 from nfc_gym.physics.effects.each import each
-from nfc_gym.physics.effects.saved import to_row
+from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
@@ -215,6 +215,54 @@ def test_bad_input_is_refused_by_name() -> None:
         ApplyEffects(ZooEnv(), [_sag()])
     with pytest.raises(InputError, match="only once"):
         ApplyEffects(ApplyEffects(FakeEnv(), []), [])
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (("coulomb", {"level": -1}), "level is -1 N m; it must be 0 or more"),
+        (("loss", {"fraction": 3.0}), "fraction is 3; it must be 0 or more and at most 1"),
+        (("delay", {"delay": -0.1}), "delay is -0.1 s; it must be 0 or more"),
+        (("stribeck", {"level": 1, "rise": 1, "speed": 0}), "speed is 0 rad/s; it must be more than 0"),
+        (("delay", {"time": 0.1}), r"delay has the parameters delay \(0 to 0.5 s\), got: time"),
+    ],
+)
+def test_values_that_no_machine_can_have(row: tuple[str, dict], message: str) -> None:
+    family, parameters = row
+    where = "hinge" if family in ("coulomb", "stribeck") else "twist"
+    with pytest.raises(InputError, match=message):
+        ApplyEffects(FakeEnv(), [{"family": family, "where": where, "parameters": parameters}])
+    if "time" not in parameters:
+        with pytest.raises(InputError, match=message):
+            ApplyEffects(FakeEnv(), [build(family, where, parameters)])
+
+
+def test_what_is_no_row_is_refused_by_name() -> None:
+    row = {"family": "loss", "where": "twist", "parameters": {"fraction": 0.3}}
+    effect, theta = build(**row)
+    for given, message in (
+        ("loss", "an effect is a mapping with the keys family, where, parameters, and not 'loss'"),
+        (("loss",), "and not \\('loss',\\)"),
+        ({**row, "extra": 1}, "'extra' is none"),
+        ((effect, [0.1, 0.2]), "takes finite values of fraction"),
+        ((effect, ["much"]), "takes finite values of fraction"),
+    ):
+        with pytest.raises(InputError, match=message):
+            ApplyEffects(FakeEnv(), [given])
+    told = dict.fromkeys(
+        ("id", "sentence", "share_of_excess", "equivalents", "proposal", "nearest", "alike", "mended_by")
+    )
+    env = ApplyEffects(FakeEnv(), [{**row, **told, "own_values": False}])  # as the measured loop writes it
+    np.testing.assert_array_equal(env.thetas[0], theta)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_what_a_fit_may_end_at_is_loaded(family: str) -> None:
+    """At the bounds of all that is proposed, and beyond them by what arithmetic leaves behind."""
+    for effect in CANDIDATES[family]:
+        for theta in (effect.low, effect.high, effect.null, effect.low - 1e-12, effect.high + 1e-12):
+            np.testing.assert_array_equal(from_row(to_row(effect, theta))[1], theta)
+            effect.require_possible(theta)
 
 
 def _sag() -> tuple[Effect, np.ndarray]:

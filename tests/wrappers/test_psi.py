@@ -9,7 +9,7 @@ import pytest
 from fakes import FakeEnv, Gaussian, NoModel, roll, same
 
 from nfc_gym.core import Fidelity, InputError
-from nfc_gym.wrappers import RandomizePsi
+from nfc_gym.wrappers import RandomizePsi, VectorRandomizePsi
 
 
 def test_a_drawn_mass_is_in_the_model_and_inertia_follows() -> None:
@@ -111,6 +111,34 @@ def test_spec_and_pickle(tmp_path: Path) -> None:
 def test_bad_input_is_refused_by_name(distribution, space, message: str) -> None:
     with pytest.raises(InputError, match=message):
         RandomizePsi(FakeEnv(), distribution, space)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "message"),
+    [
+        ({"base_mass": (-5, 10)}, "'base_mass': a mass must be positive, got -5 kg"),
+        ({"front_left_wheel_friction": (-0.1, 1)}, "'front_left_wheel_friction' is -0.1, want 0 or more"),
+        ({"front_left_wheel_restitution": (0.5, 2)}, "'front_left_wheel_restitution' is 2, want a number from 0 to 1"),
+    ],
+)
+def test_ranges_that_reach_the_impossible_are_refused(distribution, message: str) -> None:
+    for wrapper, env in (
+        (RandomizePsi, gym.make("nfc_gym/JackalFlat-v0")),
+        (VectorRandomizePsi, gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=2)),
+    ):
+        with pytest.raises(InputError, match=message):
+            wrapper(env, distribution)
+        wrapper(env, {"base_mass": (5, 80)}).reset()  # beyond the prior
+
+
+def test_impossible_values_are_refused_of_environments_of_others() -> None:
+    space = [{"name": "grip", "field": "geom_friction[0]", "of": ["cube"], "low": 0.1, "high": 2}]
+    with pytest.raises(InputError, match="'grip' is -1, want 0 or more"):
+        RandomizePsi(FakeEnv(), space=space).reset(options={"psi": {"grip": -1}})
+    with pytest.raises(InputError, match="'grip' is -2, want 0 or more"):
+        RandomizePsi(FakeEnv(), np.array([-2.0]), space).reset()
+    with pytest.raises(InputError, match=r"psi\['grip'\] is 'firm'"):
+        RandomizePsi(FakeEnv(), space=space).reset(options={"psi": {"grip": "firm"}})
 
 
 def test_an_environment_without_mujoco_is_refused() -> None:

@@ -295,6 +295,21 @@ def test_bad_input_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
             RecordLog(FakeEnv(), tmp_path)
 
 
+def test_two_recorders_have_two_folders(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="RecordLog around RecordLog: both record into"):
+        RecordLog(RecordLog(FakeEnv(), tmp_path / "a"), tmp_path / "b" / ".." / "a")
+    envs = gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=2)
+    with pytest.raises(InputError, match="both record into"):
+        VectorRecordLog(VectorRecordLog(envs, tmp_path / "a"), tmp_path / "a")
+    _drive(RecordLog(RecordLog(FakeEnv(), tmp_path / "c"), tmp_path / "d"), 2, 5)
+    one, other = (RecordLog(FakeEnv(), tmp_path / "e") for _ in range(2))
+    for env, steps in ((one, 5), (other, 6)):  # side by side none overwrites the other's
+        _drive(env, 1, steps)
+        env.close()
+    lengths = [len(read_table(f)["time"]) for f in sorted((tmp_path / "e").glob("*.parquet"))]
+    assert lengths == [5, 6]
+
+
 def test_other_ground_needs_another_folder(tmp_path: Path) -> None:
     env = RecordLog(gym.make("nfc_gym/JackalRough-v0", terrain_pool=2), tmp_path)
     env.reset(options={"terrain_id": 0})

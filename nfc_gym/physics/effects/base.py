@@ -30,6 +30,7 @@ from nfc_gym.physics.names import names as names_in
 Array = NDArray[np.float64]
 Rows = slice | NDArray[np.intp]  # what picks rows of an array, see `index`
 TIME = "exo:time"  # seconds since the log, or the episode, began: a signal that every log has
+_HAIR = 1e-9  # by which a fit's arithmetic may pass a bound that it stopped at
 _NO_CHOICE = 0.01  # of a value: a range so narrow is no range
 
 
@@ -46,6 +47,7 @@ class Param:
       resolution: a size below which nobody would speak of the effect.
       natural: True where the bounds are nature's own (a share of one), and not merely beyond all that is plausible: a
         fit may then rightly end there.
+      floor: what any value lies above, fitted or given, where `low` does not say (see `nature`).
       ambient: True where the value belongs to the day and not to the machine (the wind, not the drag): it may differ
         from one condition of the logs to another.
     """
@@ -60,11 +62,40 @@ class Param:
     resolution: float = 0.0
     natural: bool = False
     ambient: bool = False
+    floor: float | None = None
 
     @property
     def given(self) -> bool:
         """Whether its bounds leave no choice: it sets a unit, and nothing is measured of it."""
         return self.high - self.low < _NO_CHOICE * abs(self.high)
+
+    @property
+    def nature(self) -> tuple[float, float]:
+        """(least, most) that a value can be at all, where the bounds of a fit only say what is plausible.
+
+        The least is `floor`; without one it is 0, or nothing where `low` is negative. A share of one (`natural`) is 1
+        at most. A least that the fit's bounds keep clear of is itself none.
+        """
+        least = self.floor if self.floor is not None else 0.0 if self.low >= 0 else -np.inf
+        return least, 1.0 if self.natural else np.inf
+
+    def possible(self, value: float) -> bool:
+        """Whether there can be such a value at all."""
+        least, most = self.nature
+        return (value > least or self.low == least <= value + _HAIR) and value <= most + _HAIR
+
+    @property
+    def wanted(self) -> str:
+        """What a value can be, for messages."""
+        least, most = self.nature
+        parts = [f"{least:g} or more" if self.low == least else f"more than {least:g}"] if least > -np.inf else []
+        parts += [f"at most {most:g}"] if most < np.inf else []
+        return " and ".join(parts)
+
+    @property
+    def bounds(self) -> str:
+        """Name, bounds of a fit and unit, for messages."""
+        return f"{self.name} ({self.low:g} to {self.high:g}{'' if self.unit == '1' else f' {self.unit}'})"
 
 
 @dataclass(frozen=True)
@@ -212,11 +243,31 @@ class Effect(ABC):
         """The family's parameters of those names, in its own order; others raise `InputError`."""
         known = [p.name for p in cls.PARAMS]
         if set(names) != set(known):
-            raise InputError(f"{cls.family} has the parameters {', '.join(known)}, got: {', '.join(names) or 'none'}")
+            told = ", ".join(p.bounds for p in cls.PARAMS)
+            raise InputError(
+                f"{cls.family} has the parameters {told}, got: {', '.join(names) or 'none'} (in brackets the bounds of "
+                "a fit)"
+            )
         return cls.PARAMS
 
     def bind(self, model: mujoco.MjModel) -> None:  # noqa: B027 (most effects need no more than names)
         """Resolve names to addresses once; a name that the model lacks raises `InputError`."""
+
+    def require_possible(self, theta: Array) -> None:
+        """Refuse parameters (k,) that are not finite, or that no machine can have.
+
+        Raises:
+          InputError: naming the parameter and what it can be.
+        """
+        for p, value in zip(self.params, theta, strict=True):
+            if not np.isfinite(value):
+                raise InputError(f"effect {self.id!r}: {p.name} is {value:g}; it must be a finite number")
+            if not p.possible(value):
+                unit = "" if p.unit == "1" else f" {p.unit}"
+                raise InputError(
+                    f"effect {self.id!r}: {p.name} is {value:g}{unit}; it must be {p.wanted} "
+                    f"(a fit goes from {p.low:g} to {p.high:g})"
+                )
 
     # ---- hooks ----------------------------------------------------------------------------------------------------
 

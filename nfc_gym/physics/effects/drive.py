@@ -87,7 +87,7 @@ class Gain(Effect):
 
     family = "gain"
     summary = "Actuator force scaled"
-    PARAMS = (Param("gain", "1", 0.2, 3.0, null=1.0, probes=(0.85, 1.15), resolution=0.005),)
+    PARAMS = (Param("gain", "1", 0.2, 3.0, null=1.0, probes=(0.85, 1.15), resolution=0.005, floor=-np.inf),)
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.rows = actuator_ids(model, self.where)

@@ -175,8 +175,8 @@ class Compliance(OnGround):
     family = "compliance"
     summary = "Soft ground"
     PARAMS = (
-        Param("softness", "1", -0.5, 30.0, probes=(1.0, 4.0), resolution=0.02),
-        Param("damping", "1", -0.9, 10.0, probes=(-0.5, 1.0), resolution=0.02),
+        Param("softness", "1", -0.5, 30.0, probes=(1.0, 4.0), resolution=0.02, floor=-1.0),
+        Param("damping", "1", -0.9, 10.0, probes=(-0.5, 1.0), resolution=0.02, floor=-1.0),
     )
 
     def bind(self, model: mujoco.MjModel) -> None:

@@ -31,7 +31,7 @@ class DampingPoly(_OnJoint):
     family = "damping_poly"
     summary = "Joint damping"
     PARAMS = (
-        Param("linear", "N m s/rad", 0.0, 1e3, probes=(0.01,)),
+        Param("linear", "N m s/rad", 0.0, 1e3, probes=(0.01,), floor=-np.inf),  # less damping than the model's
         Param("quadratic", "N m s^2/rad^2", -1e3, 1e3, probes=(0.01,)),
         Param("cubic", "N m s^3/rad^3", -1e3, 1e3, probes=(0.01,)),
     )

@@ -13,6 +13,9 @@ from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import Each, each
 
 Array = NDArray[np.float64]
+_READ = ("family", "where", "parameters", "each", "own_values", "conditions")
+# What the measured loop says of an effect besides, in `effects.yaml` and `report.json`.
+_TOLD = ("id", "sentence", "share_of_excess", "equivalents", "proposal", "nearest", "alike", "mended_by")
 
 
 def to_row(effect: Effect, theta: Array) -> dict[str, Any]:
@@ -32,18 +35,18 @@ def from_row(row: Mapping[str, Any]) -> tuple[Effect, Array]:
     `conditions` where it has some.
 
     Raises:
-      InputError: a key is missing, or the family, a parameter or a value is none.
+      InputError: a key is missing or unknown, or the family, a parameter or a value is none, or cannot be.
     """
     family, where, parameters = _keys(row)
     try:
         if row.get("conditions"):
             return _conditioned(family, where, parameters, row)
         if not (row.get("each") or row.get("own_values")):
-            return _finite(*build(family, where, parameters))
+            return _possible(*build(family, where, parameters))
         members, thetas = [], []
         for place in [where] if isinstance(where, str) else where:
             own = {k.rpartition("@")[0]: v for k, v in parameters.items() if k.rpartition("@")[2] == place}
-            member, theta = _finite(*build(family, [place], own))
+            member, theta = _possible(*build(family, [place], own))
             members.append(member)
             thetas.append(theta)
     except (TypeError, KeyError, ValueError, OverflowError) as e:
@@ -68,11 +71,11 @@ def _conditioned(family: str, where: str | list[str], given: Mapping[str, Any], 
     if missing:
         raise InputError(f"{effect.id}: the value of {missing[0]!r} is missing; there are: {', '.join(given)}")
     values = [given[p.name] for p in effect.params]
-    return _finite(effect, np.array([float(v["value"] if isinstance(v, Mapping) else v) for v in values]))
+    return _possible(effect, np.array([float(v["value"] if isinstance(v, Mapping) else v) for v in values]))
 
 
 def _keys(row: Any) -> tuple[str, str | list[str], Mapping[str, Any]]:
-    """Family, places and parameters of a row; what is missing, or of another kind than they are, raises."""
+    """Family, places and parameters of a row; what is missing, unknown, or of another kind than they are, raises."""
     if not isinstance(row, Mapping):
         raise InputError(f"an effect is a mapping with the keys family, where, parameters, and not {_short(row)}")
     for key in ("family", "where", "parameters"):
@@ -80,6 +83,9 @@ def _keys(row: Any) -> tuple[str, str | list[str], Mapping[str, Any]]:
             raise InputError(
                 f"an effect needs the keys family, where, parameters; {key!r} is missing in {_short(dict(row))}"
             )
+    unknown = [key for key in row if key not in (*_READ, *_TOLD)]
+    if unknown:
+        raise InputError(f"an effect has the keys {', '.join(_READ)}; {unknown[0]!r} is none, in {_short(dict(row))}")
     family, where, parameters = row["family"], row["where"], row["parameters"]
     if not isinstance(family, str):
         raise InputError(f"an effect's family is a name, and not {_short(family)}")
@@ -95,10 +101,8 @@ def _keys(row: Any) -> tuple[str, str | list[str], Mapping[str, Any]]:
     return family, where if isinstance(where, str) else list(names), parameters
 
 
-def _finite(effect: Effect, theta: Array) -> tuple[Effect, Array]:
-    for p, value in zip(effect.params, theta, strict=True):
-        if not np.isfinite(value):
-            raise InputError(f"effect {effect.id!r}: {p.name} is {value:g}; it must be a finite number")
+def _possible(effect: Effect, theta: Array) -> tuple[Effect, Array]:
+    effect.require_possible(theta)
     return effect, theta
 
 

@@ -134,7 +134,7 @@ class SensorGain(_OnChannel):
 
     family = "sensor_gain"
     summary = "Sensor gain"
-    PARAMS = (Param("gain", "1", 0.3, 3.0, null=1.0, probes=(1.05,), resolution=1e-3),)
+    PARAMS = (Param("gain", "1", 0.3, 3.0, null=1.0, probes=(1.05,), resolution=1e-3, floor=-np.inf),)
     # A joint whose speed is not measured has its speed from the position channel, and with it the gain.
     with_speed = True
 
