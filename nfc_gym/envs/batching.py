@@ -43,13 +43,17 @@ def seeds_of(seed: int | Sequence[int | None] | None, n: int) -> list[int | None
 
 
 def rows_of(value: Any, ids: Ids, n: int, name: str) -> Any:
-    """A reset option of n environments, for some of them: an (n, ...) array is cut, anything else holds for each."""
+    """A reset option of n environments, for some of them: an (n, ...) array is cut, anything else holds for each.
+
+    Of psi an array of one dimension is one for all, even if there are as many environments as parameters.
+    """
     if isinstance(value, Mapping):
         each = {k: numbers(v, f"{name}[{k!r}]") for k, v in value.items()}
         return {k: v[ids] if v.shape == (n,) else v for k, v in each.items()}
     numbers(value, name)  # refuses what is none
     array = np.asarray(value)
-    return array[ids] if array.shape[:1] == (n,) and array.ndim != 1 else array
+    one_for_all = array.ndim == 1 and name != "terrain_id"
+    return array[ids] if array.shape[:1] == (n,) and not one_for_all else array
 
 
 def terrain_ids(chosen: Any, k: int, maps: int) -> Ids:

@@ -299,3 +299,10 @@ def test_a_forked_worker_may_forget_the_environments_of_its_parent() -> None:
     worker.kill()
     assert code == 0
     same(held[0].step(np.zeros((N, 2)))[2], np.zeros(N, bool))
+
+
+def test_maps_of_all_may_be_named_where_some_are_reset() -> None:
+    envs = vector("nfc_gym/JackalRough-v0", context=["psi"])
+    envs.reset(seed=0, options={"terrain_id": 0})
+    envs.reset(options={"reset_mask": np.array([True, False, True]), "terrain_id": np.array([1, 1, 2])})
+    assert envs.unwrapped.terrain_id.tolist() == [1, 0, 2]
