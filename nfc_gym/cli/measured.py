@@ -118,7 +118,9 @@ def consulted(posterior: Path | None) -> "tuple[Path | None, tuple[Witness, Path
 def predict(
     ctx: typer.Context,
     mapping: MappingFile,
-    out: Annotated[Path, typer.Option(metavar="FILE.npz", help="One array a log.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE.npz", help="One array a log, by its name; a file that is there is replaced.")
+    ],
     fit: Annotated[
         Path | None, typer.Option(metavar="DIR", help="What close-loop wrote; not needed for --stage nominal.")
     ] = None,
@@ -129,7 +131,19 @@ def predict(
         typer.Option(metavar="S", min=0, help="rollout: start anew from the measured state every S seconds."),
     ] = None,
 ) -> None:
-    """Predict every log with the model as given, calibrated or extended."""
+    """Predict every log with the model as given, calibrated or extended.
+
+    FILE.npz holds an array (rows, columns) for each log, in SI units. Its rows are those of the log, at the same times;
+    where several clocks or a `shift` leave some out, those of `time` that all columns reach. Its columns follow the
+    channels in the order of the mapping: for rollout all joint:NAME:pos and vel, body: and sensor: channels, each with
+    its components, of orientations w, x, y, z; for inverse the force: channels; for forward the sensor: channels. A
+    single column makes a vector (rows,).
+
+    A rollout begins at the measured state of a log's first row (with `split: {by: time}`, of each part's), and with
+    --restart anew every S seconds. With `by: rotate` each log is predicted by the fit that did not see its group.
+
+    Example: nfc-gym predict mapping.yaml --fit result --out predictions.npz
+    """
     with outcome(ctx):
         if fit is None and stage is not Stage.nominal:
             raise InputError(

@@ -49,11 +49,12 @@ def calibrate(
       before any fitting (per number compared), and with `compare` `seconds_from_nominal`.
     """
     sigma = problem.covariance(plant, plant.null)
+    tell = say if plant.space.free.any() else lambda text: None  # where nothing is free, only the metric settles
 
     def fitted(x: Array, alone: bool) -> Array:
-        tick = lambda turn: say(f"calibrating psi, pass {turn} of at most {TURNS}")  # noqa: E731
+        tick = lambda turn: tell(f"calibrating psi, pass {turn} of at most {TURNS}")  # noqa: E731
         found, under, extra = settle(problem, sigma, plant, x, tick=tick)
-        again = lambda start: say(f"calibrating psi from elsewhere, start {start} of {STARTS}")  # noqa: E731
+        again = lambda start: tell(f"calibrating psi from elsewhere, start {start} of {STARTS}")  # noqa: E731
         return hollows(problem, under, extra, found, seed, tick=again).x if alone else found.x
 
     began = time.monotonic()

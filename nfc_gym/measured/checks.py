@@ -9,15 +9,18 @@ import mujoco
 from nfc_gym.core import InputError, Log
 from nfc_gym.measured.clock_checks import clock_offsets, shift_notes
 from nfc_gym.measured.dataset import Dataset, assemble, read_log
-from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order
+from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order, parted
 from nfc_gym.measured.mapping import SPLITS, Mapping, load_mapping
 from nfc_gym.measured.model import compile_model, read_spec
 from nfc_gym.measured.model_checks import model_findings
 from nfc_gym.measured.signal_checks import suspicions
+from nfc_gym.measured.speed_checks import clock_unit
 from nfc_gym.measured.splits import find_logs
 from nfc_gym.measured.stream_checks import stream_notes
 
 __all__ = ["Finding", "check", "examine", "require"]
+
+ONE_SAMPLE = 0.9  # sampling intervals, below which no horizon reaches a sample; less than 1, as intervals are rounded
 
 
 def check(dataset_path: Path | str) -> list[Finding]:
@@ -70,8 +73,7 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
         if alignment is not None:
             found += [(source.name, s) for s in stream_notes(alignment)]
         for defect in defects:
-            message, _, advice = defect.text.partition("; ")
-            found.append((source.name, Suspicion("error", defect.where, "defect", message, advice)))
+            found.append((source.name, Suspicion("error", defect.where, "defect", *parted(defect.text))))
         if log is not None:
             found += [(source.name, s) for s in suspicions(mapping, model, log)]
             logs.append(log)
@@ -102,27 +104,9 @@ def _weighed(found: list[tuple[str, Suspicion]], logs: int) -> list[tuple[str, S
 def _whole(dataset: Dataset) -> list[Finding]:
     """What can only be judged over all logs: lengths, splits, what will be estimated."""
     findings = []
-    segments, fold = dataset.mapping.segments, dataset.folds[0]
+    segments = dataset.mapping.segments
     if segments.mode == "rollout":
-        for split in SPLITS:
-            longest = max((log.duration for log in dataset.of(split, fold)), default=0.0)
-            if longest < segments.horizons[-1]:
-                message = f"no log that {split if split == 'fit' else split + 's'} is as long as the longest horizon, "
-                message += f"{segments.horizons[-1]:g} s; the longest lasts {longest:.3g} s"
-                advice = "shorten segments.length and segments.horizons, record longer logs, or change `split`"
-                findings.append(Finding("error", "segments", message, advice))
-        short = [log.name for log in dataset.logs if log.duration < segments.horizons[-1]]
-        if short and len(short) < len(dataset.logs):
-            message = f"{len(short)} of {len(dataset.logs)} logs are shorter than the longest horizon, first {short[0]}"
-            findings.append(
-                Finding("warning", "segments", message, "they are left out; shorten the horizons to use them")
-            )
-        slow = max(log.interval for log in dataset.logs)
-        if segments.horizons[0] < 0.5 * slow:
-            message = (
-                f"the shortest horizon, {segments.horizons[0]:g} s, is below half a sampling interval ({slow:.3g} s)"
-            )
-            findings.append(Finding("warning", "segments", message, "begin with a horizon of one interval or more"))
+        findings += _reached(dataset)
     if not dataset.independent_splits:
         message = "some logs are cut by time, so fitting and verification are not independent"
         findings.append(Finding("note", "split", message, "the report will say so; separate logs prove more"))
@@ -133,9 +117,45 @@ def _whole(dataset: Dataset) -> list[Finding]:
     return findings
 
 
+def _reached(dataset: Dataset) -> list[Finding]:
+    """Whether the logs of every split hold segments with samples to compare."""
+    findings: list[Finding] = []
+    segments, fold = dataset.mapping.segments, dataset.folds[0]
+    first, last = segments.horizons[0], segments.horizons[-1]
+    told = next((text for log in dataset.logs if (text := clock_unit(log, dataset.mapping.time))), "")
+    key = "unit" if dataset.mapping.time.interval is None else "interval"
+    cause = f"check `time.{key}`: {told}" if told else ""
+
+    def too_slow(log: Log) -> bool:
+        return last < ONE_SAMPLE * log.interval
+
+    for split in SPLITS:
+        longest = max((log.duration for log in dataset.of(split, fold)), default=0.0)
+        if longest < last:
+            message = f"no log that {split if split == 'fit' else split + 's'} is as long as the longest horizon, "
+            message += f"{last:g} s; the longest lasts {longest:.3g} s"
+            advice = "shorten segments.length and segments.horizons, record longer logs, or change `split`"
+            findings.append(Finding("error", "segments", message, cause or advice))
+    short = [log.name for log in dataset.logs if log.duration < last]
+    if short and len(short) < len(dataset.logs):
+        message = f"{len(short)} of {len(dataset.logs)} logs are shorter than the longest horizon, first {short[0]}"
+        findings.append(Finding("warning", "segments", message, "they are left out; shorten the horizons to use them"))
+    blind = next((own for s in SPLITS if (own := dataset.of(s, fold)) and all(map(too_slow, own))), None)
+    slow = max(log.interval for log in dataset.logs)
+    if blind is not None:
+        interval = min(log.interval for log in blind)
+        span = f"every horizon, {first:g} to {last:g} s," if first < last else f"the horizon, {last:g} s,"
+        message = f"{span} lies below one sampling interval, {interval:.3g} s: there is no sample to compare"
+        advice = "check `time.unit` (s, ms, us or ns), or lengthen segments.length and segments.horizons"
+        findings.append(Finding("error", "segments", message, cause or advice))
+    elif first < 0.5 * slow:
+        message = f"the shortest horizon, {first:g} s, is below half a sampling interval ({slow:.3g} s)"
+        findings.append(Finding("warning", "segments", message, "begin with a horizon of one interval or more"))
+    return findings
+
+
 def _finding(where: str, text: str) -> Finding:
-    message, _, advice = text.partition("; ")
-    return Finding("error", where, message, advice)
+    return Finding("error", where, *parted(text))
 
 
 def _split_line(line: str, path: str) -> Finding:

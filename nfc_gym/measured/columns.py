@@ -132,8 +132,9 @@ def finite(values: Array, what: str, needed: NDArray[np.bool_] | None = None) ->
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise InputError(
-            f"{what}: {int(bad.sum())} of {len(bad)} rows are NaN or infinite, the first row {row}; cut the log there, "
-            "or, for a measured channel, name a `mask` column that is false in those rows"
+            f"{what}: {int(bad.sum())} of {len(bad)} rows {'are' if bad.sum() > 1 else 'is'} NaN or infinite, "
+            f"the first row {row}; cut the log there, or, for a measured channel, name a `mask` column that is false "
+            "in those rows"
         )
     return plausible(values, what)
 
@@ -144,7 +145,7 @@ def plausible(values: Array, what: str) -> Array:
     if len(wild):
         row = wild[0]
         raise InputError(
-            f"{what}: {values[tuple(row)]:.3g} at row {row[0]} ({len(wild)} such values), which nothing measures; "
-            "correct the column or its unit, or leave out those rows"
+            f"{what}: {values[tuple(row)]:.3g} at row {row[0]} ({len(wild)} such value{'s' * (len(wild) > 1)}), "
+            "which nothing measures; correct the column or its unit, or leave out those rows"
         )
     return values

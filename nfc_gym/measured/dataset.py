@@ -154,6 +154,8 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
     names = [name for use in used for name in use.columns]
     time = defects.attempt("time", lambda: time_of(mapping.time, columns, names))
     if time is None:
+        if columns.rows or _counted(columns, names):
+            _parts(mapping, columns, alignment, defects)  # what is wrong with the other columns is told with it
         return Reading(None, defects, alignment)
     if alignment is None:
         moved = _shifted(mapping, table, time, used, defects)
@@ -167,6 +169,14 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
     name, group, condition = source.name, source.group, source.condition
     log = defects.attempt("log", lambda: Log(name=name, time=time, group=group, condition=condition, **parts))
     return Reading(log, defects, alignment)
+
+
+def _counted(columns: LogColumns, names: list[str]) -> bool:
+    """Whether columns agree on the rows of a log whose time cannot be read; they can then be looked at."""
+    try:
+        return columns.untimed(names) > 0
+    except InputError:
+        return False
 
 
 def _aligned(streams: Streams, mapping: Mapping, used: list[Use], defects: _Defects) -> Alignment | None:
@@ -284,8 +294,8 @@ def _quaternion(values: Array, scalar_last: bool) -> Array:
     off = np.flatnonzero(np.abs(norm - 1) > UNIT_NORM)
     if off.size:
         raise InputError(
-            f"norm {norm[off[0]]:.3g} at row {off[0]} ({off.size} such rows) where unit quaternions are wanted; "
-            "name their four columns"
+            f"norm {norm[off[0]]:.3g} at row {off[0]} ({off.size} such row{'s' * (off.size > 1)}) "
+            "where unit quaternions are wanted; name their four columns"
         )
     norm = np.where(np.abs(norm - 1) < ROUNDING, 1.0, norm)  # what is of unit length keeps its bits
     quat = (np.roll(values, 1, axis=1) if scalar_last else values) / norm[:, None]

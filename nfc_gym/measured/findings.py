@@ -1,11 +1,13 @@
 """`Finding`: one thing that is wrong or looks wrong, where, and what to do; the same in many logs is one finding."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 Severity = Literal["error", "warning", "note"]
 _RANK = {"error": 0, "warning": 1, "note": 2}
+_ASIDE = re.compile(r"\((?:[^()]|\([^()]*\))*\)")  # in round brackets
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,13 @@ class Suspicion:
     kind: str
     message: str
     advice: str
+
+
+def parted(text: str) -> tuple[str, str]:
+    """An error's `message; advice` as the two, or without advice; what is in round brackets stays whole."""
+    outside = _ASIDE.sub(lambda aside: "." * len(aside[0]), text)
+    at = outside.find("; ")
+    return (text, "") if at < 0 else (text[:at], text[at + 2 :])
 
 
 def gather(found: Iterable[tuple[str, Suspicion]], logs: int) -> list[Finding]:

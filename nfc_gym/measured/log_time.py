@@ -58,7 +58,8 @@ def _of_column(name: str, unit: str, columns: LogColumns) -> Array:
         k = int(back[0])
         how = "stands still" if step[k] == 0 else "goes back"
         raise InputError(
-            f"column {name!r} {how} at row {k + 1} ({time[k]:.6g} to {time[k + 1]:.6g} s; {back.size} such rows); "
+            f"column {name!r} {how} at row {k + 1} ({time[k]:.6g} to {time[k + 1]:.6g} s, "
+            f"{back.size} such row{'s' * (back.size > 1)}); "
             "remove repeated rows, or cut the file there into two logs"
         )
     longest = int(step.argmax())

@@ -103,6 +103,7 @@ def close_loop(
       InputError: the mapping, the model, the logs or `out` cannot be used; nothing is written then.
     """
     require_writable(out)
+    _require_room(out, overwrite, fold)
     with one_blas_thread(), untimed():
         # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
         mujoco.set_mju_user_warning(lambda message: None)
@@ -115,6 +116,18 @@ def close_loop(
         _require_stable(bench)
         key = _key(bench, seed, mapping, *([posterior] if posterior else []), *([witness[1]] if witness else []))
         return _close_loop(bench, dataset, out, seed, key, overwrite, resume, fold, console)
+
+
+def _require_room(out: Path, overwrite: bool, fold: str | None) -> None:
+    """Refuse, before the logs are read, what `require_free` would refuse after: a finished run, somebody's files."""
+    inside = list(out.iterdir()) if out.is_dir() else []
+    folders = [p for p in inside if p.is_dir()]
+    if fold:
+        folder = next((p for p in folders if p.name == fold), None)
+        if folder is not None:
+            require_free(folder, None, overwrite)
+    else:  # folders may be those of folds, which only the logs tell
+        require_free(out, None, overwrite, own=[p.name for p in folders])
 
 
 def _close_loop(

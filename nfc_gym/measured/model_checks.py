@@ -15,7 +15,7 @@ from nfc_gym.measured.stiffness import stiffness_findings
 from nfc_gym.measured.units import si_unit
 from nfc_gym.measured.yaml_marks import suggest
 from nfc_gym.physics.fields import ModelFields, names_of
-from nfc_gym.physics.parameters import ParameterSpace, resolve, split_field
+from nfc_gym.physics.parameters import COMPOUND, ParameterSpace, resolve, split_field
 
 _OBJ = mujoco.mjtObj
 MOST_STEPS = 100_000  # of a segment with its history; usual are a hundred
@@ -138,5 +138,5 @@ def _field_advice(field: str, model: mujoco.MjModel) -> str:
         return ""
     owner = model.opt if field.startswith("opt.") else model
     fields = [n for n in dir(owner) if not n.startswith("_")]
-    close = [] if name in fields else get_close_matches(name, fields, 1)
+    close = [] if name in fields or name in COMPOUND else get_close_matches(name, fields, 1)
     return f"did you mean {close[0]!r}?" if close else ""

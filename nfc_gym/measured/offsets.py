@@ -72,23 +72,29 @@ def _smoothed(position: Array, rate: Array, width: float) -> tuple[Array, Array]
     )
 
 
-def _peak(a: Array, b: Array, most: int) -> int | None:
-    """The lag in samples, up to `most`, at which b (T, k) follows a best."""
-    if len(a) < LEAST:
-        return None
-    a, b = _centred(a), _centred(b)
+def agreement(a: Array, b: Array, most: int) -> Array:
+    """(2 most + 1,) correlation of a (T, k) and b (T, k) without their means, b coming later by -most to most rows."""
+    a, b = (v.reshape(len(v), -1) for v in (a, b))
     size, n = next_fast_len(2 * len(a), real=True), len(a)
     lags = np.arange(-most, most + 1)
     product = np.fft.irfft((np.fft.rfft(b, size, axis=0) * np.conj(np.fft.rfft(a, size, axis=0))).sum(1), size)[lags]
     energy = [np.concatenate([[0.0], np.cumsum((v**2).sum(1))]) for v in (a, b)]
     later, sooner = np.maximum(lags, 0), np.maximum(-lags, 0)  # b begins at `later`, a at `sooner`
     shared = (energy[0][n - later] - energy[0][sooner]) * (energy[1][n - sooner] - energy[1][later])
-    agreement = product / np.sqrt(np.maximum(shared, 1e-300))
-    inner = agreement[1:-1]
-    peaks = 1 + np.flatnonzero((inner >= agreement[:-2]) & (inner >= agreement[2:]) & (inner > 0))
+    return product / np.sqrt(np.maximum(shared, 1e-300))
+
+
+def _peak(a: Array, b: Array, most: int) -> int | None:
+    """The lag in samples, up to `most`, at which b (T, k) follows a best."""
+    if len(a) < LEAST:
+        return None
+    lags = np.arange(-most, most + 1)
+    found = agreement(_centred(a), _centred(b), most)
+    inner = found[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= found[:-2]) & (inner >= found[2:]) & (inner > 0))
     if not peaks.size:
         return None
-    high = peaks[agreement[peaks] >= (1 - TIES) * agreement[peaks].max()]
+    high = peaks[found[peaks] >= (1 - TIES) * found[peaks].max()]
     return int(lags[high[np.abs(lags[high]).argmin()]])
 
 

@@ -27,16 +27,23 @@ Array = NDArray[np.float64]
 def predict(
     mapping: Path, fit: Path | None, mode: str, stage: str, out: Path, *, restart: float | None = None
 ) -> dict[str, Array]:
-    """Predict every log and write one array a log to an npz file.
+    """Predict every log and write one array a log, in SI units, to an npz file, whole or not at all.
+
+    Rows are those of the log, at `Log.time`; of a log cut by time, those of its parts, one after the other. Columns
+    follow the channels of the mapping in their order, all components of each; a single column makes a vector (T,).
 
     Args:
       mapping: the mapping file.
       fit: folder that `close_loop` wrote; with folds each log is predicted by the fit that did not see its group.
-      mode: rollout (T, channels' columns in the mapping's order) from each log's first sample; inverse (T, actuators);
-        forward (T, sensors' columns).
+      mode: rollout (T, components of `joint:*:pos|vel`, `body:` and `sensor:` channels, orientations scalar first) from
+        the first sample of each log or part; inverse (T, `force:` channels); forward (T, components of `sensor:`
+        channels).
       stage: nominal, calibrated or extended.
-      out: npz file to write.
+      out: npz file to write; what is there is replaced.
       restart: rollout only: start anew from the measured state every so many seconds.
+
+    Returns:
+      The arrays by log name, as written.
 
     Raises:
       InputError: the mapping, the model or the logs cannot be used, the fit does not belong to the mapping, or a model

@@ -55,7 +55,7 @@ class Cut:
 
 
 def cut(logs: Sequence[Log], layout: Layout) -> Cut:
-    """Place segments end to end in every log that is long enough.
+    """Place segments end to end in every log that is long enough; each holds a sample beside its start.
 
     Raises:
       InputError: no log holds even one segment.
@@ -65,13 +65,22 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
         last = log.time[-1] - max(layout.horizons) + 0.5 * log.interval
         for begin in np.arange(0.0, max(last, 0.0) + 1e-9, layout.stride) if last >= 0 else ():
             s = int(np.searchsorted(log.time, begin - 1e-9))
+            if s >= len(log) - 1:  # the half interval that a log may be too short by reaches past its samples
+                continue
             near = np.abs(log.time[:, None] - (log.time[s] + np.array(layout.horizons))).argmin(0)
+            if near.max() <= s:  # no sample lies as far after the start as any horizon
+                continue
             which.append(i)
             starts.append(s)
             samples.append(near)
             steps.append((log.time[near] - log.time[s]) / layout.dt)
     if not which:
         longest = max(log.duration for log in logs)
+        if longest >= max(layout.horizons):
+            raise InputError(
+                f"no segment of {max(layout.horizons):g} s holds a sample beside its start: they are "
+                f"{min(log.interval for log in logs):.3g} s apart; check time.unit, or lengthen segments.length"
+            )
         raise InputError(
             f"no log is long enough for one segment of {max(layout.horizons):g} s (the longest has {longest:.3g} s): "
             "shorten segments.length"

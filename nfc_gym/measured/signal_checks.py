@@ -12,18 +12,10 @@ from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
-from nfc_gym.measured.smoothing import moving_average
+from nfc_gym.measured.speed_checks import DEGREES, TURN, compare_rates, ratio, strangers
 
 Array = NDArray[np.float64]
 
-DEGREES = 180 / np.pi
-# derivative of the position over the measured speed -> what explains it
-_RATIOS = {
-    DEGREES: "the position is in degrees where radians are declared",
-    1 / DEGREES: "the speed is in degrees/s where rad/s is declared",
-    np.pi / 30: "the speed is in rpm where rad/s is declared",
-    -1.0: "position and speed have opposite signs",
-}
 MANY_TURNS = 4 * np.pi  # rad; a joint that goes further may be in degrees, unless it is a wheel
 
 
@@ -44,6 +36,7 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
         if model is not None and parsed.kind == "sensor":
             yield from _components(name, parsed.object, channel, model)
             yield from gravity(name, parsed.object, channel, model)
+    yield from strangers(log)
     yield from _twins(log)
 
 
@@ -153,22 +146,22 @@ def _angle(name: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Suspic
     where, joint = f"channels.{name}", parse_channel(name).object
     values = log.channels[name].values
     jump = np.abs(np.diff(values))
-    if ((jump > 5.0) & (jump < 7.5)).any() and jump.max() < 7.5:
+    if ((jump > TURN[0]) & (jump < TURN[1])).any() and jump.max() < TURN[1]:
         row = int(jump.argmax()) + 1
         message = f"jumps by {jump.max():.3g} rad at row {row}: wrapped at a full turn?"
         yield Suspicion("error", where, "wrapped", message, "unwrap the column (numpy.unwrap) before it is read")
         return
     speed = log.channels.get(f"joint:{joint}:vel")
     if speed is not None and speed.values.shape == values.shape:
-        found = list(_compare_rates(where, log, np.gradient(values, log.time), speed.values))
+        found = list(compare_rates(where, log, values, speed.values))
         yield from found
         if found:
             return
     for command in _position_commands(joint, log, model):
-        ratio = _ratio(command, values)
+        farther = ratio(command, values)
         for factor, what in ((DEGREES, "the angle is in degrees"), (1 / DEGREES, "the command is in degrees")):
-            if ratio is not None and ratio > 0 and abs(np.log(ratio / factor)) < 0.35:
-                message = f"moves {ratio:.3g} times as far as it is commanded: {what} where radians are declared"
+            if farther is not None and farther > 0 and abs(np.log(farther / factor)) < 0.35:
+                message = f"moves {farther:.3g} times as far as it is commanded: {what} where radians are declared"
                 yield Suspicion("error", where, "degrees", message, "say `unit: deg`")
                 return
     yield from _too_far(where, joint, values, model)
@@ -203,34 +196,6 @@ def _position_commands(joint: str, log: Log, model: mujoco.MjModel | None) -> It
             continue
         if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, int(model.actuator_trnid[a, 0])) == joint:
             yield values
-
-
-def _ratio(x: Array, y: Array) -> float | None:
-    """Slope of y over x, of either sign, where the two follow each other (correlation above 0.8); else None."""
-    if not len(x):
-        return None
-    x, y = x - x.mean(), y - y.mean()
-    spread = float(np.linalg.norm(x) * np.linalg.norm(y))
-    if spread == 0 or abs(float(x @ y)) < 0.8 * spread:
-        return None
-    return float(np.linalg.norm(y) / np.linalg.norm(x)) * float(np.sign(x @ y))
-
-
-def _compare_rates(where: str, log: Log, derived: Array, measured: Array) -> Iterator[Suspicion]:
-    """A position's derivative against the measured speed, both (T,) in rad/s, smoothed over nine samples."""
-    n = min(9, max(len(log) // 10, 1))
-    ratio = _ratio(moving_average(measured, n)[n:-n], moving_average(derived, n)[n:-n])
-    if ratio is None or 0.7 < ratio < 1.4:
-        return
-    for factor, what in _RATIOS.items():
-        if ratio * factor > 0 and abs(np.log(ratio / factor)) < 0.25:
-            message = f"its derivative is {ratio:.3g} times the measured speed: {what}"
-            yield Suspicion(
-                "error", where, "degrees", message, "correct the `unit` (deg, deg/s, rpm), or the column's sign"
-            )
-            return
-    message = f"its derivative is {ratio:.3g} times the measured speed"
-    yield Suspicion("warning", where, "speed", message, "check both columns, their units and any gear ratio")
 
 
 def _twins(log: Log) -> Iterator[Suspicion]:

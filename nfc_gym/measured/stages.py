@@ -64,8 +64,11 @@ class Stages:
                 file.unlink()
 
 
-def require_free(out: Path, key: str, overwrite: bool, own: Iterable[str] = ()) -> None:
-    """Whether a run may write to a folder; the arguments and what is raised are those of `Stages`."""
+def require_free(out: Path, key: str | None, overwrite: bool, own: Iterable[str] = ()) -> None:
+    """Whether a run may write to a folder; the arguments and what is raised are those of `Stages`.
+
+    A `key` that is not known yet, None, leaves open whose unfinished run lies there.
+    """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} exists and is not a folder: choose another --out")
     if not out.exists() or overwrite:
@@ -81,7 +84,7 @@ def require_free(out: Path, key: str, overwrite: bool, own: Iterable[str] = ()) 
         raise InputError(
             f"{out} exists and holds {foreign[0]!r}, which is not a run's: choose another --out, or say --overwrite"
         )
-    if begun and _key(out) not in ("", key):
+    if begun and key is not None and _key(out) not in ("", key):
         raise InputError(
             f"{out} holds an unfinished run on other inputs or another seed: choose another --out, or say --overwrite"
         )

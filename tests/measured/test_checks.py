@@ -8,6 +8,7 @@ import pytest
 
 from nfc_gym.core import InputError
 from nfc_gym.measured.checks import check, require
+from nfc_gym.measured.findings import parted
 
 Build = Any
 DEGREES = 180 / np.pi
@@ -187,6 +188,72 @@ def test_everything_wrong_is_said_at_once_and_once(build: Build) -> None:
     assert sum("in 3 of 3 logs" in line for line in found) == 1
     with pytest.raises(InputError, match=r"(?s)'bot'.*'gyr'|'gyr'.*'bot'"):
         require(path)
+
+
+def test_a_wrong_time_does_not_hide_the_channels(build: Build) -> None:
+    """One run tells both; of columns that can be read nothing is said."""
+    spoil = lambda t: (gap(t), change("q", slice(50, 60), np.nan)(t))  # noqa: E731
+    found = errors(build(spoil))
+    assert len(found) == 2
+    assert "gap of 0.51 s" in found[0]
+    assert "10 of 400 rows are NaN" in found[1]
+    found = errors(build(drop("v"), ("{column: t}", "{column: tt}"), ("column: q,", "column: q3,")))
+    assert [line.partition(": in 3 of 3 logs")[0] for line in found] == [
+        "time",
+        "channels.joint:hinge:pos",
+        "channels.joint:hinge:vel",
+    ]
+    # Where columns differ in length nobody knows the log's rows, and only the time is told.
+    found = errors(build(lambda t: t.update(q=t["q"][:-1]), ("{column: t}", "{column: tt}")))
+    assert len(found) == 1
+    assert "no column 'tt'" in found[0]
+
+
+@pytest.mark.parametrize("value", [0.5, 0.99])
+def test_the_message_about_time_is_whole(build: Build, tmp_path: Path, value: float) -> None:
+    (found,) = check(build(change("t", slice(100, 101), value)))
+    assert found.message.endswith(f"at row 100 (0.99 to {value:g} s, 1 such row)")
+    assert found.advice == "remove repeated rows, or cut the file there into two logs"
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "advice"),
+    [
+        ("wrong (a; b; c); do this; or that", "wrong (a; b; c)", "do this; or that"),
+        ("wrong (a (b; c) d; e); do", "wrong (a (b; c) d; e)", "do"),
+        ("column 'q(' is not there; do (so)", "column 'q(' is not there", "do (so)"),
+        ("wrong", "wrong", ""),
+    ],
+)
+def test_messages_are_parted_outside_of_brackets(text: str, message: str, advice: str) -> None:
+    assert parted(text) == (message, advice)
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "words"),
+    [
+        (1e3, "s", "0.001 times the measured speed, as if times in ms were declared as s"),
+        (1e6, "ms", "0.001 times the measured speed, as if times in us were declared as ms"),
+        (1e-3, "s", "1e+03 times the measured speed"),
+        (1.0, "ms", "1e+03 times the measured speed, as if times in s were declared as ms"),
+    ],
+)
+def test_a_wrong_unit_of_time_is_an_error_that_says_so(build: Build, factor: float, unit: str, words: str) -> None:
+    found = errors(build(scale("t", factor), ("time: {column: t}", f"time: {{column: t, unit: {unit}}}")))
+    assert any(f"check `time.unit`: the derivative of positions is {words}" in line for line in found)
+
+
+def test_logs_too_slow_for_every_horizon_are_an_error(build: Build) -> None:
+    no_speed = ('  "joint:hinge:vel": {column: v, unit: rad/s, noise: 0.01}\n', "")
+    no_rates = ('  "sensor:gyro": {columns: [gx, gy, gz], unit: rad/s, noise: 0.01}\n', "")
+    path = build(scale("t", 1e3), no_speed, no_rates)
+    (found,) = errors(path)
+    assert "every horizon, 0.05 to 0.4 s, lies below one sampling interval, 10 s" in found
+    assert "check `time.unit`" in found
+    with pytest.raises(InputError, match="below one sampling interval"):
+        require(path)
+    # A sample every 0.4 s: the last horizon is one.
+    assert errors(build(scale("t", 40.0), no_speed, no_rates)) == []
 
 
 def test_require_gives_the_data_set(build: Build) -> None:

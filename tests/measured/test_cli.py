@@ -146,6 +146,13 @@ def test_options_that_do_not_go_together(args: list[str], words: str) -> None:
     assert words in plain(result.stderr)
 
 
+def test_predict_says_what_its_columns_and_rows_are() -> None:
+    text = plain(call("predict", "--help").stdout)
+    assert "Its columns follow the channels in the order of the mapping" in text
+    assert "Its rows are those of the log, at the same times" in text
+    assert "is replaced" in text
+
+
 def test_as_a_program(tmp_path: Path) -> None:
     """Through a real process: `--debug` after the command, an absent file, the version."""
     run = [sys.executable, "-c", "from nfc_gym.cli import main; main()"]

@@ -43,6 +43,28 @@ def test_a_file_instead_of_a_folder(tmp_path: Path, line: list[str]) -> None:
     assert file.read_text() == "mine"
 
 
+@pytest.mark.parametrize("fold", [[], ["--fold", "a"]])
+def test_a_finished_run_is_refused_before_anything_is_read(tmp_path: Path, fold: list[str]) -> None:
+    """The mapping is not there either: that would be told after."""
+    out = tmp_path / "out"
+    folder = out / fold[1] if fold else out
+    folder.mkdir(parents=True)
+    (folder / "report.json").write_text("earlier")
+    result = call([*COMMANDS[0], *fold], out)
+    assert result.exit_code == 2
+    assert f"{folder} holds the report of a finished run: choose another --out" in result.stderr
+    assert "no such file" in call([*COMMANDS[0], *fold, "--overwrite"], out).stderr
+    assert (folder / "report.json").read_text() == "earlier"
+
+
+def test_files_of_others_are_refused_before_anything_is_read(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "run_1" / ".stages").mkdir(parents=True)  # a fold's, as a run of one fold leaves it
+    assert "no such file" in call(COMMANDS[0], out).stderr
+    (out / "photo.jpg").write_text("mine")
+    assert "holds 'photo.jpg', which is not a run's" in call(COMMANDS[0], out).stderr
+
+
 def test_a_folder_instead_of_a_file(tmp_path: Path) -> None:
     result = call(COMMANDS[1], tmp_path)
     assert result.exit_code == 2
