@@ -12,6 +12,7 @@ from nfc_gym.measured.smoothing import Local, estimate_noise, fresh_samples, loc
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back, vector_to_quat
 
 Array = NDArray[np.float64]
+_FEWEST = 8  # rows of a channel from which its course is told without those that are masked
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 
@@ -39,8 +40,15 @@ def channel_noise(log: Log, name: str) -> float:
     channel = log.channels[name]
     if channel.noise is not None:
         return channel.noise
-    index = fresh_samples(log.time, channel.values, channel.rate)
+    index = _measured(log, channel)
     return estimate_noise(_turned(channel.values[index]) if ":quat" in name else channel.values[index])
+
+
+def _measured(log: Log, channel: Channel) -> NDArray[np.intp]:
+    """Rows that hold a measurement of their own: renewed, and not masked; all renewed ones where hardly any is left."""
+    index = fresh_samples(log.time, channel.values, channel.rate)
+    kept = index if channel.mask is None else index[channel.mask[index]]
+    return kept if len(kept) >= _FEWEST else index
 
 
 def _turned(quat: Array) -> Array:
@@ -52,9 +60,13 @@ def _turned(quat: Array) -> Array:
 
 
 def _smooth(log: Log, channel: Channel, values: Array, points: int, raw: bool) -> Local:
-    index, wide = fresh_samples(log.time, channel.values, channel.rate), values.reshape(len(log), -1)
+    index, wide = _measured(log, channel), values.reshape(len(log), -1)
     fit = local_polynomial(log.time[index], wide[index], log.time, points)
-    return replace(fit, value=wide) if raw and len(index) == len(log) else fit
+    if not raw or (channel.mask is None and len(index) < len(log)):
+        return fit
+    value = fit.value.copy()
+    value[index] = wide[index]
+    return replace(fit, value=value)
 
 
 class _Builder:
@@ -132,11 +144,11 @@ class _Builder:
         key, channel = attitude
         quat = channel.values / np.linalg.norm(channel.values, axis=1, keepdims=True)
         noise = channel_noise(self.log, key)
-        index = fresh_samples(self.log.time, channel.values, channel.rate)
+        index = _measured(self.log, channel)
         vectors = np.zeros((len(quat), 3))
         vectors[index] = _turned(quat[index])
         fit = _smooth(self.log, channel, vectors, self.points, self.raw)
-        hold = index[np.searchsorted(index, np.arange(len(quat)), side="right") - 1]
+        hold = index[np.maximum(np.searchsorted(index, np.arange(len(quat)), side="right") - 1, 0)]
         self.qpos[:, q + 3 : q + 7] = quat_multiply(quat[hold], vector_to_quat(fit.value - vectors[hold]))
         self.qpos_sd[:, v + 3 : v + 6] = noise * fit.value_gain[:, None]
         self.qvel[:, v + 3 : v + 6], self.qvel_sd[:, v + 3 : v + 6] = fit.slope, noise * fit.slope_gain[:, None]

@@ -1,5 +1,6 @@
 """Local polynomials reproduce what they can represent, say truly how noisy they are, and noise is read off a signal."""
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +8,7 @@ from hypothesis import strategies as st
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.smoothing import estimate_noise, fresh_samples, local_polynomial, moving_average
-from nfc_gym.measured.states import channel_noise
+from nfc_gym.measured.states import channel_noise, estimate_states
 from nfc_gym.physics.state import quat_multiply, vector_to_quat
 
 uneven = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.015, 80))
@@ -117,3 +118,23 @@ def test_the_noise_of_an_attitude_is_estimated_as_an_angle() -> None:
     seen = quat_multiply(turned, vector_to_quat(0.01 * rng.standard_normal((len(t), 3))))
     log = Log("flight", t, {}, {"body:base:quat": Channel(seen)})
     assert channel_noise(log, "body:base:quat") == pytest.approx(0.01, rel=0.05)
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_masked_rows_are_no_measurements_of_a_state(raw: bool) -> None:
+    text = """<mujoco><worldbody><body name="base"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    rng, t = np.random.default_rng(0), 0.01 * np.arange(400)
+    place = np.stack([np.sin(t), np.cos(t), t], 1)
+    turned = vector_to_quat(np.stack([0.2 * t, 0 * t, 0 * t], 1))
+    valid = np.ones(400, bool)
+    valid[[0, *range(100, 103), 250, 399]] = False
+    held = np.maximum.accumulate(np.where(valid, np.arange(400), 1))  # as readers leave rows without a value
+    channels = {
+        "body:base:pos": Channel(place[held] + 1e-6 * rng.standard_normal((400, 3)), noise=1e-6, mask=valid),
+        "body:base:quat": Channel(turned[held], noise=1e-6, mask=valid),
+    }
+    states = estimate_states(mujoco.MjModel.from_xml_string(text), Log("flight", t, {}, channels), raw=raw)
+    np.testing.assert_allclose(states.qpos[:, :3], place, atol=2e-5)
+    np.testing.assert_allclose(states.qpos[:, 3:], turned, atol=2e-5)
+    np.testing.assert_allclose(states.qvel[:, 3], 0.2, atol=1e-3)
+    assert states.qpos_sd[101, 0] > states.qpos_sd[60, 0]
