@@ -49,6 +49,7 @@ def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]
                 yield Finding("error", where, f"axes {list(channel.axes)} where the sensor has {size} components")
     yield from _fields(mapping, model)
     yield from _steps(mapping, model)
+    yield from _unused(mapping)
     if mapping.segments.mode == "rollout":
         yield from stiffness_findings(_nominal(mapping, model), float(mapping.segments.timestep or model.opt.timestep))
 
@@ -128,6 +129,22 @@ def _steps(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
     if segments.mode == "rollout" and step > segments.length:
         message = f"one step of {step:g} s is longer than a segment of {segments.length:g} s"
         yield Finding("error", "segments", message, "give a shorter segments.timestep, or mend the model's")
+
+
+def _unused(mapping: Mapping) -> Iterator[Finding]:
+    """What a mapping says in vain in its mode."""
+    mode = mapping.segments.mode
+    if mode == "rollout":
+        return
+    for name, control in mapping.controls.items():
+        if control.servo is not None:
+            advice = "give the command that the actuator gets, or use mode: rollout"
+            yield Finding(
+                "warning", f"controls.{name}.servo", f"a servo acts in roll-outs alone, not in mode {mode}", advice
+            )
+    for entry in mapping.known if mode == "forward" else ():
+        advice = "use mode: rollout, or name it under `parameters`"
+        yield Finding("warning", f"known.{entry.field}", "is not written to the model in mode forward", advice)
 
 
 def _field_advice(field: str, model: mujoco.MjModel) -> str:

@@ -338,3 +338,13 @@ def test_idle_commands_are_no_alarm(build: Build, tmp_path: Path) -> None:
     table = dict(np.load(tmp_path / "run_1.npz"))
     np.savez(tmp_path / "run_1.npz", **(table | {"goal": np.zeros(400)}))
     assert [(f.severity, f.where) for f in check(tmp_path / "mapping.yaml")] == [("note", "run_1: controls.ctrl:servo")]
+
+
+def test_what_has_no_effect_in_a_mode_is_told(build: Build) -> None:
+    edits = (
+        ("segments: {length: 0.4}", "segments: {mode: forward}\nknown:\n  - {field: dof_damping, of: [hinge], column: goal}"),
+        ('{column: goal, unit: rad}', '{column: goal, unit: rad, servo: {joint: hinge, gain: 1.0, limit: 1.0}}'),
+    )  # fmt: skip
+    found = {f.where: f.message for f in check(build(None, *edits)) if f.severity == "warning"}
+    assert found["known.dof_damping"] == "is not written to the model in mode forward"
+    assert found["controls.ctrl:servo.servo"] == "a servo acts in roll-outs alone, not in mode forward"
