@@ -341,10 +341,12 @@ def test_idle_commands_are_no_alarm(build: Build, tmp_path: Path) -> None:
 
 
 def test_what_has_no_effect_in_a_mode_is_told(build: Build) -> None:
+    known = "known:\n  - {field: dof_damping, of: [hinge], column: goal}"
+    servo = "{column: goal, unit: rad, servo: {joint: hinge, gain: 1.0, limit: 1.0}}"
     edits = (
-        ("segments: {length: 0.4}", "segments: {mode: forward}\nknown:\n  - {field: dof_damping, of: [hinge], column: goal}"),
-        ('{column: goal, unit: rad}', '{column: goal, unit: rad, servo: {joint: hinge, gain: 1.0, limit: 1.0}}'),
-    )  # fmt: skip
+        ("segments: {length: 0.4}", f"segments: {{mode: forward}}\n{known}"),
+        ("{column: goal, unit: rad}", servo),
+    )
     found = {f.where: f.message for f in check(build(None, *edits)) if f.severity == "warning"}
     assert found["known.dof_damping"] == "is not written to the model in mode forward"
     assert found["controls.ctrl:servo.servo"] == "a servo acts in roll-outs alone, not in mode forward"
