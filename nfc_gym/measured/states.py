@@ -40,7 +40,7 @@ def channel_noise(log: Log, name: str) -> float:
     channel = log.channels[name]
     if channel.noise is not None:
         return channel.noise
-    index = _measured(log, channel)
+    index = fresh_samples(log.time, channel.values, channel.rate)
     return estimate_noise(_turned(channel.values[index]) if ":quat" in name else channel.values[index])
 
 
