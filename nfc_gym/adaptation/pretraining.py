@@ -223,7 +223,8 @@ class Run:
         state = path.with_name(path.name + ".training")
         if state.is_file():
             self.load_state(state)
-            self.record.say(f"going on from step {self.steps:,} of {steps:,}")
+            over = self.steps >= steps
+            self.record.say(f"{'finished before, at' if over else 'going on from'} step {self.steps:,} of {steps:,}")
         elif start is not None:
             self.begin_from(start)
         else:

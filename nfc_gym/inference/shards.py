@@ -5,6 +5,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,12 @@ def maps_path(folder: Path, shard: int) -> Path:
     return folder / f"maps_{shard:05d}.safetensors"
 
 
+def _unlike(key: str, before: Any, now: Any) -> str:
+    """What two manifests disagree in, with both values where these are plain."""
+    plain = not isinstance(before, list | dict) and not isinstance(now, list | dict)
+    return f"{key} {before!r}, now {now!r}" if plain else f"another {key}"
+
+
 class WindowWriter:
     """Writes a set shard by shard, each whole or not at all, and goes on where an earlier run stopped.
 
@@ -84,11 +91,11 @@ class WindowWriter:
             before = Manifest.read(folder)
             # As the file would have it: JSON knows no tuples.
             now = json.loads(replace(manifest, finished=before.finished).text())
-            odd = [k for k, v in json.loads(before.text()).items() if v != now[k]]
+            odd = [_unlike(k, v, now[k]) for k, v in json.loads(before.text()).items() if v != now[k]]
             if odd:
                 raise InputError(
-                    f"{folder}: holds windows made with another {', '.join(odd)}; choose another folder, or the same "
-                    "arguments to go on"
+                    f"{folder}: holds windows that were made otherwise ({'; '.join(odd)}); give the same arguments to "
+                    "go on, or another folder: Windows(first, second) reads both as one set"
                 )
         elif any(folder.glob("shard_*.safetensors")):
             raise InputError(f"{folder}: holds shards without a {MANIFEST}; choose another folder")

@@ -30,9 +30,10 @@ def model_path(name: str, folder: Path) -> Path:
     except (OSError, ValueError) as e:  # too long for a name, or with a zero in it
         raise InputError(f"model {name[:80]!r}: no name of a file ({getattr(e, 'strerror', None) or e})") from None
     there = sorted(p.name for p in path.parent.glob("*") if p.suffix in (".xml", ".urdf"))
+    rough = "" if "rough" not in name.lower() else " (on a plane: RecordLog writes that of rough ground with its logs)"
     raise InputError(
         f"model {name!r}: no such file in {folder}, and no robot has that id; "
-        f"models there: {', '.join(there) or 'none'}; robots: {', '.join(assets.ROBOTS)}"
+        f"models there: {', '.join(there) or 'none'}; robots: {', '.join(assets.ROBOTS)}{rough}"
     )
 
 
