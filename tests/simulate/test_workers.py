@@ -198,4 +198,4 @@ def test_the_command_says_what_it_made(tmp_path: Path) -> None:
     assert len(Windows(tmp_path, robot="jackal")) == 6
     bad = subprocess.run([*call, "--windows", "7", "--jobs", "1"], capture_output=True, text=True, cwd=ROOT)
     assert bad.returncode == 2
-    assert "another windows" in bad.stderr
+    assert "windows 6, now 7" in bad.stderr
