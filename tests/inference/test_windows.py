@@ -109,7 +109,7 @@ def test_rounds_are_read_as_one(tmp_path: Path) -> None:
 
 def test_another_set_is_not_mixed_in(tmp_path: Path) -> None:
     written(tmp_path, (0,))
-    with pytest.raises(InputError, match="another seed; choose another folder"):
+    with pytest.raises(InputError, match=r"made otherwise \(seed 0, now 1\)"):
         WindowWriter(tmp_path, replace(MANIFEST, seed=1))
     (tmp_path / "manifest.json").unlink()
     with pytest.raises(InputError, match=r"shards without a manifest\.json"):
