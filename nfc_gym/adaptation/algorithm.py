@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute
 from nfc_gym.adaptation.worlds import full_id
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.random import mixed
 from nfc_gym.wrappers.anomaly import opened
 
@@ -74,9 +74,7 @@ class AdaptConfig:
     def __post_init__(self) -> None:
         least = {"missions": 1, "worlds": 1, "steps": 1, "seed": 0} | ({} if self.episode is None else {"episode": 1})
         for name, low in least.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
-                raise InputError(f"adapt: {name} is {value!r}; want a whole number, {low} or more")
+            require_whole(f"adapt: {name}", getattr(self, name), low)
         if self.judged == 1 or self.judged < 0:
             raise InputError(f"adapt: judged is {self.judged}; want 0, or 2 episodes or more")
         if not 0 <= self.beta < float("inf"):

@@ -8,6 +8,7 @@ from typing import Any
 from safetensors.torch import save_file
 from torch import Tensor, nn, optim
 
+from nfc_gym.core.differences import differences
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
 from nfc_gym.inference.state import read, require_format
@@ -71,7 +72,7 @@ def load(
     require_format(path, metadata, FORMAT)
     told = json.loads(metadata["state"])
     wanted = json.loads(json.dumps(dict(of)))
-    differ = [f"{k} {told['of'].get(k)!r}, now {v!r}" for k, v in wanted.items() if told["of"].get(k) != v]
+    differ = list(differences(told["of"], wanted))
     if differ:
         raise InputError(
             f"{path} is of another run ({'; '.join(differ)}): remove it to begin anew, or use another --out"

@@ -17,6 +17,7 @@ from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import require_whole
 from nfc_gym.envs import scene
 from nfc_gym.envs.batching import Ids, final_info, ids_of, masked, rows_of, seeds_of, vector_options
 from nfc_gym.envs.contract import (
@@ -75,10 +76,10 @@ class RobotVectorEnv(VectorEnv):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        self._kind, self._nthread = robot_class(robot), _whole("nthread", nthread, 0)
+        self._kind, self._nthread = robot_class(robot), require_whole("nthread", nthread, 0)
         self._given = Settings.of(self._kind, settings)
         self.screen = Screen(render_mode, (None, "rgb_array"), self._given)
-        self.num_envs, self.rough, self.render_mode = _whole("num_envs", num_envs, 1), bool(rough), render_mode
+        self.num_envs, self.rough, self.render_mode = require_whole("num_envs", num_envs, 1), bool(rough), render_mode
         self.frame_skip, self.autoreset_mode = self._kind.frame_skip, AutoresetMode(autoreset_mode)
         self.control_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
@@ -343,13 +344,6 @@ class RobotVectorEnv(VectorEnv):
             perceived = self._sims.perceived or None
             obs["elevation"] = self._elevation.around(self._view.qpos, perceived, self._sims.chosen, self._steps, rows)
         return obs
-
-
-def _whole(name: str, value: Any, least: int) -> int:
-    """An argument that is a whole number, `least` or more."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name} is {value!r}, want a whole number, {least} or more")
-    return int(value)
 
 
 def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotVectorEnv:

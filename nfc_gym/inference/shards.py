@@ -5,11 +5,11 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.core.differences import differences
 from nfc_gym.core.errors import InputError, MissingExtra
 from nfc_gym.core.files import replacing, write_whole
 from nfc_gym.inference.manifest import MANIFEST, Manifest
@@ -67,12 +67,6 @@ def maps_path(folder: Path, shard: int) -> Path:
     return folder / f"maps_{shard:05d}.safetensors"
 
 
-def _unlike(key: str, before: Any, now: Any) -> str:
-    """What two manifests disagree in, with both values where these are plain."""
-    plain = not isinstance(before, list | dict) and not isinstance(now, list | dict)
-    return f"{key} {before!r}, now {now!r}" if plain else f"another {key}"
-
-
 class WindowWriter:
     """Writes a set shard by shard, each whole or not at all, and goes on where an earlier run stopped.
 
@@ -91,7 +85,7 @@ class WindowWriter:
             before = Manifest.read(folder)
             # As the file would have it: JSON knows no tuples.
             now = json.loads(replace(manifest, finished=before.finished).text())
-            odd = [_unlike(k, v, now[k]) for k, v in json.loads(before.text()).items() if v != now[k]]
+            odd = list(differences(json.loads(before.text()), now))
             if odd:
                 raise InputError(
                     f"{folder}: holds windows that were made otherwise ({'; '.join(odd)}); give the same arguments to "

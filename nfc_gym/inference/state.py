@@ -1,7 +1,6 @@
 """A training run's state as one safetensors file: tensors by name, the rest as JSON in its metadata."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from nfc_gym import __version__
+from nfc_gym.core.differences import differences
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
 
@@ -41,7 +41,7 @@ def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: format {metadata.get('format')!r}, want {FORMAT!r}: remove it to train anew")
     plain = json.loads(metadata["state"])
-    differ = list(_differences(plain["of"], json.loads(json.dumps(description))))
+    differ = list(differences(plain["of"], json.loads(json.dumps(description))))
     if differ:
         raise InputError(
             f"{path} is of another run ({'; '.join(differ)}): remove it to train anew, or train to another place"
@@ -57,17 +57,6 @@ def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
     run.optimiser.load_state_dict(state)
     run.step, run.loss_sum = plain["step"], plain["loss_sum"]
     run.outcome = type(run.outcome)(**plain["outcome"])
-
-
-def _differences(kept: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
-    """What two descriptions disagree in, with both values where these are plain."""
-    for key, value in now.items():
-        before = kept.get(key)
-        if isinstance(value, dict) and isinstance(before, dict):
-            yield from _differences(before, value)
-        elif before != value:
-            plain = not isinstance(value, list | dict)
-            yield f"{key} {before!r}, now {value!r}" if plain else f"another {key}"
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

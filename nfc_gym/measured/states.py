@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Channel, Log
+from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.smoothing import Local, estimate_noise, fresh_samples, local_polynomial, moving_average
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back, vector_to_quat
 
@@ -40,8 +41,8 @@ def channel_noise(log: Log, name: str) -> float:
     channel = log.channels[name]
     if channel.noise is not None:
         return channel.noise
-    index = fresh_samples(log.time, channel.values, channel.rate)
-    return estimate_noise(_turned(channel.values[index]) if ":quat" in name else channel.values[index])
+    values = channel.values[fresh_samples(log.time, channel.values, channel.rate)]
+    return estimate_noise(_turned(values) if parse_channel(name).quantity == "quat" else values)
 
 
 def _measured(log: Log, channel: Channel) -> NDArray[np.intp]:

@@ -93,12 +93,13 @@ COMPOUND = {
 _READ = {"servo_kv": ("actuator_gainprm", 0), "servo_kp": ("actuator_gainprm", 0)}
 _WIDE = 100  # characters of a `repr` on one line
 _ANY, _AT_LEAST_0 = (-np.inf, np.inf), (0.0, np.inf)
-# Field -> (least, most) that nature allows; a mass must be more than 0.
+_SOLID = (np.nextafter(0.0, 1.0), np.inf)  # a mass: more than 0
+# Field -> (least, most) that nature allows, masses apart.
 _POSSIBLE = {
     "geom_restitution": (0.0, 1.0),
     **dict.fromkeys(
         (
-            "body_mass", "geom_friction", "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
+            "geom_friction", "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
             "tendon_stiffness", "tendon_damping", "tendon_frictionloss", "servo_kp", "servo_kv", "opt.density",
             "opt.viscosity",
         ),
@@ -208,6 +209,8 @@ class ParameterSpace:
         twice = {n for n in self.names if self.names.count(n) > 1}
         if twice:
             raise InputError(f"parameters named twice: {', '.join(sorted(twice))}")
+        possible = [_SOLID if b.name == "body_mass" else _POSSIBLE.get(b.name, _ANY) for b in self._bound]
+        self._least, self._most = np.reshape(np.array(possible, float), (-1, 2)).T
         self.low = np.array([p.low for p in parameters], float)
         self.high = np.array([p.high for p in parameters], float)
         self.nominal = np.array(
@@ -275,6 +278,8 @@ class ParameterSpace:
           InputError: naming the parameter and what it can be.
         """
         psi = np.asarray(psi, float)
+        if not ((psi < self._least) | (psi > self._most)).any():  # at every reset: all parameters at once
+            return
         for i, (p, bound) in enumerate(zip(self.parameters, self._bound, strict=True)):
             _require_possible(p, bound, psi[..., i])
 

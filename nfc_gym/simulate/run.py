@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable
 from nfc_gym.core.posterior import Sampler, load_source
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.windows import Manifest, Windows, WindowWriter
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.simulate import workers
@@ -104,8 +105,7 @@ def _check(
         ("jobs", jobs, 0),
         ("per_shard", per_shard, 1),
     ):
-        if not isinstance(value, int | np.integer) or value < least:
-            raise InputError(f"{name} is {value!r}, want a whole number, {least} or more")
+        require_whole(name, value, least)
     for name, share in (("effects", effects), ("policy_share", policy_share), ("motor", motor)):
         if not 0 <= share <= 1:  # nan is no share either
             raise InputError(f"{name} is {share!r}, want a share from 0 to 1")

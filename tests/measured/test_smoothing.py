@@ -118,6 +118,8 @@ def test_the_noise_of_an_attitude_is_estimated_as_an_angle() -> None:
     seen = quat_multiply(turned, vector_to_quat(0.01 * rng.standard_normal((len(t), 3))))
     log = Log("flight", t, {}, {"body:base:quat": Channel(seen)})
     assert channel_noise(log, "body:base:quat") == pytest.approx(0.01, rel=0.05)
+    plain = Log("flight", t, {}, {"sensor:imu:quat_x": Channel(0.01 * rng.standard_normal(len(t)))})
+    assert channel_noise(plain, "sensor:imu:quat_x") == pytest.approx(0.01, rel=0.1)  # a name, not an attitude
 
 
 @pytest.mark.parametrize("raw", [False, True])
