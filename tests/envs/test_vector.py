@@ -306,3 +306,12 @@ def test_maps_of_all_may_be_named_where_some_are_reset() -> None:
     envs.reset(seed=0, options={"terrain_id": 0})
     envs.reset(options={"reset_mask": np.array([True, False, True]), "terrain_id": np.array([1, 1, 2])})
     assert envs.unwrapped.terrain_id.tolist() == [1, 0, 2]
+
+
+def test_threads_change_no_bit() -> None:
+    one, two = (vector("nfc_gym/AntFlat-v0", n=8, nthread=k, context=["psi"]) for k in (1, 2))
+    same(one.reset(seed=0), two.reset(seed=0))
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        actions = rng.uniform(-1, 1, one.action_space.shape)
+        same(one.step(actions), two.step(actions))
