@@ -100,7 +100,8 @@ class Assimilation:
         beyond = self.reach * (space.high - space.low)
         # What cannot be negative stays as positive as the prior has it, or at a fiftieth of nominal.
         floor = np.where(space.low >= 0, np.minimum(space.low, 0.02 * np.abs(space.nominal)), -np.inf)
-        self.box = Box(np.maximum(space.low - beyond, floor), space.high + beyond)
+        low, high = np.maximum(space.low - beyond, floor), space.high + beyond
+        self.box = Box(np.maximum(low, space.least), np.minimum(high, space.most))
 
     # ---- `Inference` ----------------------------------------------------------------------------------------------
 

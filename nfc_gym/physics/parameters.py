@@ -196,6 +196,10 @@ class ParameterSpace:
       model: the nominal model, from which omitted nominal values are read.
       parameters: in the order of the psi vector.
 
+    Attributes:
+      low, high, nominal: (d,) of the prior.
+      least, most: (d,) what nature allows, wherever the prior's bounds are.
+
     Raises:
       InputError: a field, an object or a component does not exist; bounds are not ordered; the nominal lies outside; a
         mass may become zero, or is that of a body without any.
@@ -210,7 +214,7 @@ class ParameterSpace:
         if twice:
             raise InputError(f"parameters named twice: {', '.join(sorted(twice))}")
         possible = [_SOLID if b.name == "body_mass" else _POSSIBLE.get(b.name, _ANY) for b in self._bound]
-        self._least, self._most = np.reshape(np.array(possible, float), (-1, 2)).T
+        self.least, self.most = np.reshape(np.array(possible, float), (-1, 2)).T
         self.low = np.array([p.low for p in parameters], float)
         self.high = np.array([p.high for p in parameters], float)
         self.nominal = np.array(
@@ -278,7 +282,7 @@ class ParameterSpace:
           InputError: naming the parameter and what it can be.
         """
         psi = np.asarray(psi, float)
-        if not ((psi < self._least) | (psi > self._most)).any():  # at every reset: all parameters at once
+        if not ((psi < self.least) | (psi > self.most)).any():  # at every reset: all parameters at once
             return
         for i, (p, bound) in enumerate(zip(self.parameters, self._bound, strict=True)):
             _require_possible(p, bound, psi[..., i])

@@ -91,3 +91,13 @@ def test_a_trajectory_of_another_robot_is_refused() -> None:
         InputError, match=r"holds no elevation maps: make the world with context=\['psi', 'elevation'\]"
     ):
         Assimilation("nfc_gym/JackalRough-v0").infer(driven({}, 20))
+
+
+@pytest.mark.parametrize("place", ["AntFlat", "QuadrupedFlat", "HumanoidFlat", "QuadcopterFlat", "JackalRough"])
+def test_however_far_beyond_the_prior_all_that_is_believed_is_possible(place: str) -> None:
+    """A ball never bounces higher than it fell, and no mass is negative: no draw stops a mission at a reset."""
+    q = Assimilation(f"nfc_gym/{place}-v0", reach=2.0)
+    space = q.machine.space
+    assert (q.box.high > space.high).any()
+    z = np.random.default_rng(0).standard_normal((200, len(space))) * 4
+    space.require_possible(q.box.psi(z))
