@@ -12,7 +12,6 @@ from nfc_gym.core import (
     MissingExtra,
     NfcError,
     Sampler,
-    SimulationUnstable,
     register_loader,
 )
 from nfc_gym.envs import registry
@@ -33,4 +32,4 @@ def _open_posterior(path: Path) -> Sampler:
 
 register_loader(".safetensors", _open_posterior)  # wherever a source may be a path, it may be a posterior
 
-__all__ = ["Channel", "InputError", "Log", "MissingExtra", "NfcError", "SimulationUnstable", "__version__"]
+__all__ = ["Channel", "InputError", "Log", "MissingExtra", "NfcError", "__version__"]

@@ -1,6 +1,6 @@
 """Plain data that every other part may import: logs, fidelities, posteriors, errors. Needs numpy alone."""
 
-from nfc_gym.core.errors import InputError, MissingExtra, NfcError, SimulationUnstable
+from nfc_gym.core.errors import InputError, MissingExtra, NfcError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.log import Channel, Log
 from nfc_gym.core.posterior import Posterior, Sampler, load_source, register_loader
@@ -14,7 +14,6 @@ __all__ = [
     "NfcError",
     "Posterior",
     "Sampler",
-    "SimulationUnstable",
     "load_source",
     "register_loader",
 ]

@@ -9,9 +9,5 @@ class InputError(NfcError, ValueError):
     """What the user gave cannot be used: the message names the value and says what would be valid."""
 
 
-class SimulationUnstable(NfcError):
-    """The simulation diverged (NaN, infinity or MuJoCo's own warning) for the model and inputs at hand."""
-
-
 class MissingExtra(NfcError, ImportError):
     """A capability was asked for whose optional dependencies are not installed; the message names the extra."""

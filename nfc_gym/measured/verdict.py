@@ -181,7 +181,7 @@ def spread(fitted: Fit, problem: Problem, step: Array) -> Array:
 
 
 def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any]]:
-    """Psi with intervals: its place in the model, estimate, 95 % bounds, and whether the data show it; sd (size,)."""
+    """Psi with intervals: its place in the model, estimate, 95 % bounds, and how it is known; sd (size,)."""
     space = fitted.plant.space
     rows = []
     for i, p in enumerate(space.parameters):
@@ -196,6 +196,8 @@ def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any
                 "estimate": value,
                 "low": float(max(p.low, value - 1.96 * sd[i])),
                 "high": float(min(p.high, value + 1.96 * sd[i])),
+                "anchored": p.anchored,
+                "reason": p.reason,
                 "identifiable": bool(p.anchored or sd[i] < 0.25 * width / np.sqrt(12)),
                 "left_prior": bool(not p.anchored and min(value - p.low, p.high - value) < 0.005 * width),
             }

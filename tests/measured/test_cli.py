@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from nfc_gym import InputError, SimulationUnstable, __version__
+from nfc_gym import InputError, __version__
 from nfc_gym.cli import app
 
 Build = Any
@@ -92,7 +92,6 @@ def test_options_reach_the_loop(loop: Any) -> None:
     ("error", "code", "words"),
     [
         (InputError("out exists: say --overwrite"), 2, "nfc-gym close-loop: out exists: say --overwrite"),
-        (SimulationUnstable("unstable at 0.3 s: lower the timestep"), 2, "unstable at 0.3 s: lower the timestep"),
         (
             OSError(errno.ENOSPC, "No space left on device", "o/report.json"),
             2,

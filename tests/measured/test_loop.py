@@ -155,7 +155,7 @@ def test_the_report_has_the_promised_keys(closed: Closed) -> None:
     assert set(report["chi2"]) >= {"nominal", "calibrated", "extended", "null", "null_95"}
     for row in report["parameters"]:
         assert set(row) >= {
-            "name", "unit", "nominal", "estimate", "low", "high", "identifiable", "left_prior"
+            "name", "unit", "nominal", "estimate", "low", "high", "anchored", "reason", "identifiable", "left_prior"
         }  # fmt: skip
     for row in report["effects"]:
         assert set(row) >= {"id", "family", "where", "sentence", "share_of_excess", "equivalents", "parameters"}

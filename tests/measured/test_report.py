@@ -251,6 +251,14 @@ def test_what_is_missing_makes_the_parameters_intervals_conditional(verdict: str
     assert "true values may lie far outside" in " ".join(story.notices(example() | {"verdict": verdict}))
 
 
+def test_of_what_is_anchored_it_says_so_and_why() -> None:
+    report = example()
+    report["parameters"][0] |= {"anchored": True, "reason": "weighed <twice>"}
+    assert "<td>anchored: weighed &lt;twice&gt;</td>" in render(report, pictures())
+    report["parameters"][0]["reason"] = ""
+    assert "<td>anchored</td>" in render(report, pictures())
+
+
 def test_misfit_is_in_noise_widths_with_the_worst_first() -> None:
     text = read(render(example(), pictures())).text
     part = text[text.index("Where and when") :]
