@@ -8,6 +8,7 @@ import numpy as np
 
 from nfc_gym import assets
 from nfc_gym.core import InputError
+from nfc_gym.physics.names import name_all
 
 
 def registered(name: str) -> str | None:
@@ -38,12 +39,22 @@ def model_path(name: str, folder: Path) -> Path:
 
 
 def read_spec(name: str, folder: Path) -> mujoco.MjSpec:
-    """The model as an editable `MjSpec`; raises `InputError` where there is no file or it cannot be parsed."""
+    """The model as an editable `MjSpec` in which everything that a mapping may speak of has a name.
+
+    Raises:
+      InputError: there is no file, it cannot be parsed or does not compile.
+    """
     path = model_path(name, folder)
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, mujoco.FatalError) as e:
         raise InputError(f"model {path}: not a model that MuJoCo can read: {_one_line(e)}") from None
+    try:
+        return name_all(spec)
+    except UnicodeDecodeError:  # `compile_model` says which name it is
+        return spec
+    except (ValueError, mujoco.FatalError) as e:
+        raise InputError(f"model {name}: does not compile: {_one_line(e)}") from None
 
 
 def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:

@@ -36,5 +36,30 @@ def names(model: mujoco.MjModel) -> Names:
     )
 
 
+def name_all(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Give each actuator, joint, body and sensor of a model that has no name the one that `names` calls it by.
+
+    Raises:
+      ValueError: the model does not compile.
+    """
+    called = names(spec.compile())  # which also tells each its id
+    for objects, wanted in (
+        (spec.actuators, called.actuators),
+        (spec.joints, called.joints),
+        (spec.bodies, called.bodies),
+        (spec.sensors, called.sensors),
+    ):
+        for thing in objects:
+            if not thing.name:
+                thing.name = wanted[int(thing.id)]
+    return spec
+
+
 def _filled(given: list[str], kind: str) -> list[str]:
-    return [name or f"{kind}_{i}" for i, name in enumerate(given)]
+    out = list(given)
+    for i, name in enumerate(given):
+        own = f"{kind}_{i}"
+        while not name and own in out:  # another may be called so
+            own += "_"
+        out[i] = name or own
+    return out

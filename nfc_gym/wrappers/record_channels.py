@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.names import names
+from nfc_gym.physics.names import name_all, names
 from nfc_gym.physics.state import rotate
 
 Array = NDArray[np.float64]
@@ -96,15 +96,5 @@ def model_text(env: Any, model: mujoco.MjModel, given: str | None) -> str:
         raise InputError(
             f"RecordLog: {file} has (nq, nv, nu, nbody, nsensordata) = {sizes[0]}, the environment {sizes[1]}"
         )
-    called = names(compiled)
-    for objects, wanted in (
-        (spec.actuators, called.actuators),
-        (spec.joints, called.joints),
-        (spec.bodies, called.bodies),
-        (spec.sensors, called.sensors),
-    ):
-        for thing in objects:
-            if not thing.name:
-                thing.name = wanted[int(thing.id)]
-    spec.compile()
+    name_all(spec).compile()
     return spec.to_xml()

@@ -162,6 +162,15 @@ def test_a_model_with_a_name_that_is_no_text(build: Build, tmp_path: Path) -> No
     assert r"the name b'b\xa1b' is not UTF-8" in found
 
 
+def test_what_a_model_does_not_name_goes_by_its_joint_or_its_number(build: Build, tmp_path: Path) -> None:
+    path, file = build(None, ("ctrl:servo", "ctrl:hinge")), tmp_path / "machine.xml"
+    path.write_text(path.read_text().replace("sensor:gyro", "sensor:sensor_0"))
+    file.write_text(file.read_text().replace('name="servo" ', "").replace('name="gyro" ', ""))
+    assert check(path) == []
+    path.write_text(path.read_text().replace("ctrl:hinge", "ctrl:bob"))
+    assert "the model has no actuator 'bob'; valid: hinge" in "\n".join(errors(path))
+
+
 def test_a_model_with_a_number_that_is_not_finite(build: Build) -> None:
     body = "<body name='a'><joint/><geom size='0.1' mass='{}'/></body>"
     found = "\n".join(errors(build(model=f"<mujoco><worldbody>{body.format('inf')}</worldbody></mujoco>")))
