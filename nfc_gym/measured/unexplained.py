@@ -67,13 +67,14 @@ def unexplained(
     if scanned is not None:
         joint, guess = surest(scanned.evidence), scanned.nearest
         if joint is not None and (guess is None or _joint_of(guess.law) != joint):
-            text = f"a force of unknown course on {joint} explains it best, and no law of it is sure; {reason}{near}"
-            return _joint(plant.model, joint) | out | {"description": text}
+            at = _joint(plant.model, joint)
+            text = f"a force of unknown course on {joint} explains it best, and no law of it is sure"
+            return at | out | {"description": f"{text}{_elsewhere(v, at)}; {reason}{near}"}
         if guess is not None:
             guess.law.bind(plant.model)
-            return _place(plant.model, guess.law) | out | {"description": f"{_guess(guess)}; {reason}{near}"}
-    place, group, times = _worst(v)
-    coordinate = place if place.startswith("sensor") else f"{place} ({group})"
+            at = _place(plant.model, guess.law)
+            return at | out | {"description": f"{_guess(guess)}{_elsewhere(v, at)}; {reason}{near}"}
+    place, coordinate, times = _worst(v)
     text = f"furthest beyond the noise, with {times:.3g} times its mean square; {reason}{near}"
     return {"coordinate": coordinate, "where": place} | out | {"description": text}
 
@@ -131,8 +132,16 @@ def _nearest(found: Found) -> tuple[str | None, float]:
     return found.nearest, 0.0
 
 
+def _elsewhere(v: Verified, at: dict[str, str]) -> str:
+    """Where the misfit is largest, if that is not where the force acts that would do something about it."""
+    place, coordinate, times = _worst(v)
+    if place == at["where"] or at["coordinate"].startswith(f"{place}:"):
+        return ""
+    return f"; furthest beyond the noise is {coordinate}, with {times:.3g} times its mean square"
+
+
 def _worst(v: Verified) -> tuple[str, str, float]:
-    """(place, group, times) of the columns whose misfit is most times what a perfect model would show there.
+    """(place, in words, times) of the columns whose misfit is most times what a perfect model would show there.
 
     A wrong joint shows most in itself, however small a part of all the misfit that is: what it moves is the whole
     machine, in many more numbers.
@@ -145,4 +154,4 @@ def _worst(v: Verified) -> tuple[str, str, float]:
         of = np.array([k == key for k in keys])
         times[key] = float((count * found)[of].sum() / max((count * floor)[of].sum(), 1e-9))
     place, group = max(times, key=lambda k: times[k])
-    return place, group, times[(place, group)]
+    return place, place if place.startswith("sensor") else f"{place} ({group})", times[(place, group)]

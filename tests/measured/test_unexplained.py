@@ -78,8 +78,10 @@ def test_a_force_without_a_law_is_placed_where_its_evidence_leads() -> None:
     assert found["description"].startswith(
         "a force of unknown course on root explains it best, and no law of it is sure"
     )
+    assert "; furthest beyond the noise is joint:knee (joint speed), with 9 times its mean" in found["description"]
     found = said(None, evidence={"knee": 300.0, "root": 160.0})
     assert (found["coordinate"], found["where"]) == ("joint:knee:pos", "joint:knee")
+    assert "furthest beyond" not in found["description"], "it is the same place"
     unnamed = said(None, evidence={"root": 300.0}, text=MODEL.replace('<body name="car"', "<body"))
     assert (unnamed["coordinate"], unnamed["where"]) == ("joint:root", "joint:root")
     # a law on the same joint says more than that it is the joint, one on another joint is not asked
