@@ -1,6 +1,6 @@
 """Options and infos of a vector environment: for all, for each, for some."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ def seeds_of(seed: int | Sequence[int | None] | None, n: int) -> list[int | None
     """A seed for each of n environments: s gives s, s + 1, ...; None leaves a generator as it is."""
     if seed is None:
         return [None] * n
+    if isinstance(seed, str) or not isinstance(seed, int | np.integer | Iterable):
+        raise InputError(f"seed is {seed!r}, want a whole number, or one for each of {n} environments")
     seeds: list[int | None] = [int(seed) + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
     if len(seeds) != n:
         raise InputError(f"seed holds {len(seeds)} seeds, want one for each of {n} environments")

@@ -10,7 +10,10 @@ from weakref import WeakSet
 
 from mujoco.batch import Batch
 
+from nfc_gym.core.errors import InputError
+
 _batches: WeakSet[Batch] = WeakSet()
+_stranded: WeakSet[Batch] = WeakSet()  # in a child process, without the threads that they step with
 
 
 def safe_to_fork(batch: Batch) -> Batch:
@@ -19,9 +22,24 @@ def safe_to_fork(batch: Batch) -> Batch:
     return batch
 
 
+def require_threads(batch: Batch) -> None:
+    """Refuse to step a batch of another process, which would wait for ever.
+
+    Raises:
+      InputError: it steps with several threads, and was made before this process was forked.
+    """
+    if batch in _stranded:
+        raise InputError(
+            "this vector environment was made before its process was forked, and its threads stayed behind: make one "
+            "with gymnasium.make_vec in the process that steps it, or give nthread=1"
+        )
+
+
 def _keep() -> None:
     for batch in list(_batches):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(batch))
+        if batch.nthread != 1:
+            _stranded.add(batch)
 
 
 if hasattr(os, "register_at_fork"):

@@ -113,9 +113,19 @@ class Pictures:
 
 
 class Window:
-    """MuJoCo's passive viewer on a simulation."""
+    """MuJoCo's passive viewer on a simulation.
+
+    Raises:
+      InputError: there is no display to open it on.
+    """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> None:
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            # GLFW would end the whole process.
+            raise InputError(
+                'render_mode="human" opens a window, and there is no display (neither DISPLAY nor WAYLAND_DISPLAY is '
+                'set): use "rgb_array", or `nfc-gym play ID --out FILE.mp4` for a video'
+            )
         import mujoco.viewer
 
         self._handle = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.envs.render import Camera, Pictures, Window
+from nfc_gym.envs.render import Camera, Pictures, Window, camera_of
 
 
 def warn_without_mode() -> None:
@@ -39,12 +39,17 @@ class Screen:
         self._pictures: Pictures | None = None
         self._window: Window | None = None
 
+    def require_camera(self, model: mujoco.MjModel) -> None:
+        """Refuse a camera that the scene has not, where pictures are to be made at all."""
+        if self._mode is not None:
+            camera_of(model, self.camera)
+
     def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8] | None:
         """A picture (height, width, 3), or None where a window was brought up to date, or there is no mode."""
         if self._mode == "rgb_array":
             if self._pictures is None:
                 self._pictures = Pictures(model, *self._size)
-            return self._pictures.render(model, data, self.camera)
+            return self._pictures.render(model, _now(model, data), self.camera)
         if self._mode == "human":
             if self._window is None:
                 self._window = Window(model, data, self.camera)
@@ -59,3 +64,11 @@ class Screen:
             if shown is not None:
                 shown.close()
         self._pictures = self._window = None
+
+
+def _now(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.MjData:
+    """The simulation's state with all that is derived from it; after a step what is derived is a physics step old."""
+    out = mujoco.MjData(model)
+    mujoco.mj_copyState(model, data, out, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+    mujoco.mj_forward(model, out)
+    return out

@@ -1,10 +1,12 @@
 """`Settings`: the arguments that both engines take, checked once."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
+from numbers import Real
 from typing import Any, Self
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import require_whole
 from nfc_gym.envs.render import Camera
 from nfc_gym.envs.robot import GOAL_REWARDS, Robot
 from nfc_gym.envs.terrains import Pool
@@ -63,8 +65,11 @@ class Settings:
             raise InputError(f"reward_type is {self.reward_type!r}, want one of: {', '.join(GOAL_REWARDS)}")
         if self.goal_conditioned and not kind.place_size:
             raise InputError(f"goal_conditioned: the {kind.name} has no goals to reach")
-        if isinstance(self.context, str) or any(c not in CONTEXT for c in self.context):
+        parts = () if isinstance(self.context, str) or not isinstance(self.context, Iterable) else self.context
+        if any(c not in CONTEXT for c in parts) or parts is not self.context:
             raise InputError(f"context is {self.context!r}, want a sequence of: {', '.join(CONTEXT)}")
+        require_whole("width", self.width, 1)
+        require_whole("height", self.height, 1)
         self.pool  # noqa: B018 (raises where there is no such pool)
 
     @property
@@ -84,7 +89,8 @@ class Settings:
         """Control steps between two elevation maps, given those a second."""
         if self.elevation_hz is None:
             return 1
-        period = fps / self.elevation_hz if self.elevation_hz > 0 else 0.0
+        rate = self.elevation_hz if isinstance(self.elevation_hz, Real) else 0.0
+        period = fps / rate if rate > 0 else 0.0
         if period < 1 or not float(period).is_integer():
             rates = ", ".join(f"{fps / k:g}" for k in (1, 2, 5, 10, 25, 50))
             raise InputError(

@@ -70,6 +70,7 @@ class RobotEnv(gymnasium.Env):
         self.screen = Screen(render_mode, (None, *self.metadata["render_modes"]), given)
         self.rough, self.render_mode = bool(rough), render_mode
         self.model = kind.compile(maps=1 if rough else 0)
+        self.screen.require_camera(self.model)
         self.data = mujoco.MjData(self.model)
         self.robot = given.robot(self.model)
         self.psi_space = kind.space(self.model)
@@ -306,3 +307,6 @@ def make(robot: str | type[Robot], rough: bool = False, **kwargs: Any) -> RobotE
     from nfc_gym.envs.goals import GoalRobotEnv
 
     return GoalRobotEnv(robot, rough, **kwargs)
+
+
+make.metadata = RobotEnv.metadata  # type: ignore[attr-defined]  # where Gymnasium looks for what can be rendered

@@ -29,6 +29,7 @@ from nfc_gym.envs.contract import (
     robot_class,
     wrong_action,
 )
+from nfc_gym.envs.forking import require_threads
 from nfc_gym.envs.look import HeldMaps
 from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.screen import Screen, warn_without_mode
@@ -85,12 +86,14 @@ class RobotVectorEnv(VectorEnv):
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.after_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
-        self._horizon = np.iinfo(np.int64).max if max_episode_steps is None else int(max_episode_steps)
+        endless = max_episode_steps is None or max_episode_steps == -1  # which is how Gymnasium's `make` says it
+        self._horizon = np.iinfo(np.int64).max if endless else require_whole("max_episode_steps", max_episode_steps, 1)
 
         pool = self._given.pool
         self._build([pool.map(k) for k in range(pool.size)] if rough else [])
         fps = round(1 / self.dt)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps, "autoreset_mode": self.autoreset_mode}
+        self.screen.require_camera(self.model)
         self._elevation = HeldMaps(self.num_envs, self._given.refresh_period(fps))
         self._observe = Observer(self.robot, len(self.psi_space), self._given.context)
         self.single_observation_space = self._observe.space
@@ -213,6 +216,7 @@ class RobotVectorEnv(VectorEnv):
         Raises:
           InputError: as for `RobotEnv.reset`.
         """
+        require_threads(self.batch)
         n = self.num_envs
         given = vector_options(options, self.rough, ("reset_mask",))
         ids = ids_of(given.pop("reset_mask", None), n)
@@ -244,6 +248,7 @@ class RobotVectorEnv(VectorEnv):
         resetting = self._waiting.copy() if self._waiting.any() else None
         if resetting is not None and (self._fresh or self.autoreset_mode is not AutoresetMode.NEXT_STEP):
             raise gymnasium.error.ResetNeeded(f"environments {np.flatnonzero(resetting).tolist()} must be reset first")
+        require_threads(self.batch)
         actions = np.minimum(np.maximum(actions, -self._limit), self._limit)
         view = self._view
         view.ctrl[...] = self.robot.actuate(actions, view)
@@ -268,12 +273,8 @@ class RobotVectorEnv(VectorEnv):
         if self.render_mode is None:
             warn_without_mode()
             return None
-        frames = []
-        for i in range(self.num_envs):
-            model, data = self.batch.get_model(i), self.batch.get_data(i)
-            mujoco.mj_forward(model, data)
-            frames.append(self.screen.render(model, data))
-        return tuple(frames)
+        each = range(self.num_envs)
+        return tuple(self.screen.render(self.batch.get_model(i), self.batch.get_data(i)) for i in each)  # type: ignore[misc]
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free what rendering holds."""

@@ -1,6 +1,7 @@
 """`MonitorAnomaly`: a detector that watches the transitions, and what it thinks of them in `info`."""
 
 import os
+from numbers import Real
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
@@ -37,17 +38,26 @@ def opened(detector: Detector | str | os.PathLike[str], threshold: float | None)
     if not isinstance(found, Detector):
         raise InputError(f"MonitorAnomaly: a detector has reset(rows) and update(obs, action, next_obs), got {found!r}")
     limit = getattr(found, "threshold", None) if threshold is None else threshold
-    if limit is None or not np.isfinite(limit):
+    if not isinstance(limit, Real) or not np.isfinite(float(limit)):
         raise InputError(
-            f"MonitorAnomaly: the threshold of the score must be a number, given or the detector's, got {limit}"
+            f"MonitorAnomaly: the threshold of the score must be a number, given or the detector's, got {limit!r}"
         )
     return found, float(limit)
 
 
 def scored(env: Any, detector: Detector, obs: Any, action: Any, next_obs: Any) -> Any:
-    """The detector's score of a transition, a number or (n,); its `InputError` says so where goals are in the way."""
+    """The detector's score of a transition, a number or (n,).
+
+    Raises:
+      InputError: it is NaN, which would pass for healthy; or the detector's own, which says so where goals are in the
+        way.
+    """
     try:
-        return detector.update(obs, action, next_obs)
+        score = np.asarray(detector.update(obs, action, next_obs), float)
+        if np.isnan(score).any():
+            where = f" of simulation {int(np.flatnonzero(np.isnan(score))[0])}" if score.ndim else ""
+            raise InputError(f"MonitorAnomaly: the detector's score{where} is nan, want a number")
+        return score
     except InputError as e:
         if isinstance(next_obs, dict) or not getattr(getattr(env.unwrapped, "robot", None), "goal_size", 0):
             raise
@@ -114,7 +124,7 @@ class VectorMonitorAnomaly(VectorEnvWrapper):
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step, and score the transitions."""
         observation, reward, terminated, truncated, info = self.env.step(actions)
-        score = np.array(scored(self.env, self.detector, self._last, actions, observation), float)
+        score = np.array(scored(self.env, self.detector, self._last, actions, observation))
         if score.shape != (self.num_envs,):
             raise InputError(f"MonitorAnomaly: the detector's scores have shape {score.shape}, want ({self.num_envs},)")
         first = self.rows.step(terminated, truncated)

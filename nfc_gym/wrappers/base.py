@@ -21,13 +21,18 @@ def _rebuild(cls: type, env: Any, kwargs: dict[str, Any]) -> Any:
     return cls(env, **kwargs)
 
 
-def finite(action: Any) -> Any:
+def finite(action: Any, shape: tuple[int, ...] | None = None) -> Any:
     """An action that a wrapper reads before the environment does.
 
     Raises:
-      InputError: an entry is not finite; the message names it.
+      InputError: it has another shape than the one that is asked for, or an entry that is no finite number, which the
+        message names.
     """
     action = np.asarray(action)
+    if action.dtype.kind not in "fiub":
+        raise InputError(f"action is {action.tolist()!r}, want numbers")
+    if shape is not None and action.shape != shape:
+        raise InputError(f"action has shape {action.shape}, want {shape}")
     # Counting is three times as fast as `all` on a handful of numbers, and this runs every step.
     if np.count_nonzero(np.isfinite(action)) != action.size:
         at = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])

@@ -71,8 +71,11 @@ class Injection:
             sim = self.sim
             if not self.steady:
                 self._acceleration = self.components.velocity(sim.qpos, self.delta) / self.duration
+            inertia = sim.bind("M")
+            if sim.started is True and not inertia.any():  # someone's reset left it for the first step to compute
+                sim.forward()
             applied = sim.qfrc_applied
-            applied += self.inertia.times(sim.bind("M"), self._acceleration)
+            applied += self.inertia.times(inertia, self._acceleration)
 
     def add(self) -> None:
         """Add positions and velocities outright."""
@@ -95,7 +98,10 @@ def noise_root(covariance: ArrayLike | None, size: int) -> Array:
     """
     if covariance is None:
         return np.zeros((size, 0))
-    matrix = np.asarray(covariance, float)
+    try:
+        matrix = np.asarray(covariance, float)
+    except (TypeError, ValueError):
+        raise InputError(f"ResidualDynamics: covariance is {covariance!r}, want numbers") from None
     matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         raise InputError(

@@ -6,7 +6,7 @@ is the effect that a policy trains under, bit for bit.
 
 import copy
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -81,6 +81,8 @@ def bound(effects: Given, model: mujoco.MjModel, condition: str | None = None) -
         except InputError as e:
             file = os.fspath(effects)
             raise InputError(str(e) if str(e).startswith(file) else f"{file}: {e}") from None
+    if isinstance(effects, Mapping) or not isinstance(effects, Iterable):
+        raise InputError(f"ApplyEffects: effects is {effects!r}; want a list of them, or the path of an effects.yaml")
     pairs = [_own_pair(e) for e in effects]
     pairs = [_in_condition(effect, _values(effect, theta), condition) for effect, theta in pairs]
     for effect, _ in pairs:

@@ -31,6 +31,10 @@ def camera_of(noise: Camera | None) -> terrain.DepthCamera:
     if noise is None or isinstance(noise, terrain.DepthCamera):
         return noise or terrain.DepthCamera()
     known = [f.name for f in fields(terrain.DepthCamera)]
+    if not isinstance(noise, Mapping):
+        raise InputError(
+            f"PerceiveTerrain: noise is {noise!r}; want a DepthCamera, or its settings: {', '.join(known)}"
+        )
     unknown = [k for k in noise if k not in known]
     if unknown:
         raise InputError(f"PerceiveTerrain: a depth camera has no {unknown[0]!r}; it has: {', '.join(known)}")

@@ -1,6 +1,8 @@
 """`RandomizePsi`: physical coefficients that are drawn anew for each episode."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields
+from numbers import Real
 from typing import Any
 
 import gymnasium as gym
@@ -43,11 +45,12 @@ class Prior:
         self.draws: Draws | None = None
         if isinstance(distribution, Mapping):
             self._named(distribution)
-        elif isinstance(distribution, int | float):
-            if not 0 < distribution <= 1:
-                raise InputError(f"RandomizePsi: a fraction of the prior lies in (0, 1], got {distribution:g}")
-            self.low = space.nominal - distribution * (space.nominal - space.low)
-            self.high = space.nominal + distribution * (space.high - space.nominal)
+        elif isinstance(distribution, Real):
+            fraction = float(distribution)
+            if not 0 < fraction <= 1:
+                raise InputError(f"RandomizePsi: a fraction of the prior lies in (0, 1], got {fraction:g}")
+            self.low = space.nominal - fraction * (space.nominal - space.low)
+            self.high = space.nominal + fraction * (space.high - space.nominal)
             self.low, self.high = (np.where(space.free, b, space.nominal) for b in (self.low, self.high))
         else:
             self.draws = Draws(distribution, "psi", "RandomizePsi")
@@ -57,8 +60,9 @@ class Prior:
 
     def _named(self, bounds: Mapping[str, Sequence[float]]) -> None:
         for name, pair in bounds.items():
-            if np.shape(pair) != (2,) or not np.isfinite(pair).all() or not pair[0] <= pair[1]:
-                raise InputError(f"RandomizePsi: {name!r} needs (low, high) with low <= high, got {pair}")
+            ends = np.array(pair) if np.shape(pair) == (2,) else np.zeros(0)
+            if ends.dtype.kind not in "fiu" or not ends.size or not np.isfinite(ends).all() or ends[0] > ends[1]:
+                raise InputError(f"RandomizePsi: {name!r} needs (low, high) with low <= high, got {pair!r}")
         self.low = self.space.vector({n: float(b[0]) for n, b in bounds.items()})
         self.high = self.space.vector({n: float(b[1]) for n, b in bounds.items()})
 
@@ -89,10 +93,19 @@ def space_of(env: Any, model: mujoco.MjModel, space: Space | None, names: Sequen
         space = list(names)
     if isinstance(space, ParameterSpace):
         return space
-    return ParameterSpace(
-        model,
-        [_mass(model, p) if isinstance(p, str) else Parameter(**{**p, "of": tuple(p.get("of", ()))}) for p in space],
-    )
+    each = [space] if isinstance(space, str) else space
+    return ParameterSpace(model, [_mass(model, p) if isinstance(p, str) else _parameter(p) for p in each])
+
+
+def _parameter(table: Any) -> Parameter:
+    """A parameter from a table; `of` may be left out of one of `opt`."""
+    known = {f.name: f.default is MISSING for f in fields(Parameter)}
+    row = {"of": (), **table} if isinstance(table, Mapping) else {}
+    if set(row) - set(known) or {name for name, needed in known.items() if needed} - set(row):
+        needed, others = (", ".join(k for k in known if known[k] is which) for which in (True, False))
+        raise InputError(f"RandomizePsi: {table!r} is no parameter: want a table of {needed}, and perhaps {others}")
+    of = row["of"]
+    return Parameter(**{**row, "of": (of,) if isinstance(of, str) else tuple(of)})
 
 
 def _mass(model: mujoco.MjModel, body: str) -> Parameter:

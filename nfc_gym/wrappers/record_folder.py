@@ -39,6 +39,8 @@ class LogFolder:
         self.env, self.sim, self.folder, self.model_file = env, sim, Path(path), model_file
         self.columns = columns(sim.nominal)
         self.controls = [f"ctrl:{name}" for name in names(sim.nominal).actuators]
+        if self.folder.exists() and not self.folder.is_dir():
+            raise InputError(f"RecordLog: {self.folder} is a file; `path` is the folder that episodes are written to")
         self.folder.mkdir(parents=True, exist_ok=True)
         self.count = len(list(self.folder.glob("episode_*.parquet")))
         self.text = ""

@@ -8,14 +8,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import require_whole
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
 from nfc_gym.wrappers.rows import Rows
 
 ACTION, OBSERVATION = "action", "observation"
+_LIKE = 'such as {"action": {"sd": 0.02, "delay": 1}}'
 Noise = Mapping[str, Mapping[str, float | Sequence[float]]]
 
 
@@ -48,18 +51,21 @@ class Channel:
                 f"PerturbSignals: {key}: no {unknown[0]!r}; there are: {', '.join(Fault.__dataclass_fields__)}"
             )
         self.fault = Fault(**fault)
-        if int(self.fault.delay) != self.fault.delay or self.fault.delay < 0:
-            raise InputError(f"PerturbSignals: {key}: delay counts control steps, 0 or more, got {self.fault.delay}")
+        require_whole(f"PerturbSignals: {key}: delay, in control steps,", self.fault.delay, 0)
         self.sd, self.bias, self.bias_sd = (self._wide(key, space, n) for n in ("sd", "bias", "bias_sd"))
         self.shape, self.dtype = (*batch, *space.shape), space.dtype
-        self.low = space.low if np.isfinite(space.low).any() else None
-        self.high = space.high
+        self.low, self.high = space.low, space.high
+        self.bounded = bool(np.isfinite([space.low, space.high]).any())
         self.noisy, self.drifting = bool(np.any(self.sd)), bool(np.any(self.bias_sd))
         self.total = np.zeros(self.shape) + self.bias
         self.past: deque[NDArray] = deque(maxlen=int(self.fault.delay) + 1)
 
     def _wide(self, key: str, space: spaces.Box, name: str) -> NDArray[np.float64]:
-        value = np.asarray(getattr(self.fault, name), float)
+        given = getattr(self.fault, name)
+        try:
+            value = np.asarray(given, float)
+        except (TypeError, ValueError):
+            value = np.array(np.nan)
         if (
             value.shape not in ((), space.shape)
             or not np.isfinite(value).all()
@@ -67,7 +73,7 @@ class Channel:
         ):
             sign = "" if name == "bias" else ", none below 0"
             raise InputError(
-                f"PerturbSignals: {key}: {name} is a finite number or {space.shape} of them{sign}, got {value}"
+                f"PerturbSignals: {key}: {name} is a finite number or {space.shape} of them{sign}, got {given!r}"
             )
         return value
 
@@ -90,7 +96,7 @@ class Channel:
         out = values + self.total
         if self.noisy:
             out = out + self.sd * rng.standard_normal(self.shape)
-        if self.low is not None:
+        if self.bounded:
             out = np.minimum(np.maximum(out, self.low), self.high)
         return out.astype(values.dtype if values.dtype.kind == "f" else self.dtype)
 
@@ -120,9 +126,13 @@ def channels(noise: Noise, observed: gym.Space, acted: gym.Space, batch: tuple[i
         dict(observed.items()) if isinstance(observed, spaces.Dict) else {OBSERVATION: observed}
     )
     known[ACTION] = acted
-    for key in noise:
+    if not isinstance(noise, Mapping):
+        raise InputError(f"PerturbSignals: noise is {noise!r}; want signal -> fault, {_LIKE}")
+    for key, fault in noise.items():
         if key not in known:
             raise InputError(f"PerturbSignals: no signal {key!r}; there are: {', '.join(known)}")
+        if not isinstance(fault, Mapping):
+            raise InputError(f"PerturbSignals: {key} is {fault!r}; want a fault as a mapping, {_LIKE}")
     return {key: Channel(key, known[key], fault, batch) for key, fault in noise.items()}
 
 
@@ -133,15 +143,17 @@ class _Perturbing:
     rng: np.random.Generator | None
 
     def _act(self, action: Any) -> Any:
+        if self.rng is None:
+            raise ResetNeeded("PerturbSignals: step before the first reset")
         channel = self.channels.get(ACTION)
-        return action if channel is None or self.rng is None else channel(finite(action), self.rng)
+        return action if channel is None else channel(finite(action, channel.shape), self.rng)
 
     def _begin(self, first: NDArray[np.bool_] | None) -> None:
         for channel in self.channels.values():
             channel.begin(first, self.rng)  # type: ignore[arg-type]
 
     def _see(self, observation: Any, again: NDArray[np.bool_] | None = None) -> Any:
-        assert self.rng is not None, "step before reset"
+        assert self.rng is not None, "`reset` makes one, and `_act` asks for it"
         if not isinstance(observation, dict):
             channel = self.channels.get(OBSERVATION)
             return observation if channel is None else channel(observation, self.rng, again)

@@ -11,6 +11,7 @@ is stepped here in place of its own `_step_mujoco_simulation`.
 
 import copy
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -27,7 +28,41 @@ ATTRIBUTE = "_nfc_simulation"  # of an unwrapped environment
 
 
 def _nothing() -> None:
-    """What a simulation is pickled as: its wrappers make it anew."""
+    """What a simulation of many is pickled as: its wrappers make it anew."""
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What a simulation is pickled as: its wrappers make it anew, and from where it began, not from what they edited.
+
+    Attributes:
+      nominal: the model before any edit; None where the environment itself goes back to nominal.
+      touched: fields that were edited.
+    """
+
+    nominal: mujoco.MjModel | None
+    touched: tuple[str, ...]
+
+
+class _Hook:
+    """A method of a simulation in a list of an environment's hooks; in a copy of the environment it does nothing."""
+
+    def __init__(self, method: Callable[[], None]) -> None:
+        self.method = method
+
+    def __call__(self, _: Any) -> None:
+        self.method()
+
+    def __reduce__(self) -> tuple[Callable[[], Callable[[Any], None]], tuple[()]]:
+        return _no_hook, ()
+
+
+def _idle(_: Any) -> None:
+    """A hook that was copied without its simulation."""
+
+
+def _no_hook() -> Callable[[Any], None]:
+    return _idle
 
 
 class Simulation:
@@ -69,7 +104,7 @@ class Simulation:
         """Forget the hooks of wrappers that are gone."""
         refresh(self.on_control, self.on_substep, self.on_after)
 
-    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return _nothing, ()
 
     @property
@@ -114,18 +149,26 @@ class SingleSimulation(Simulation):
     own psi: edits are then made right after a reset. Any other's model is edited right before.
     """
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: Any, left: _Left | None = None) -> None:
         super().__init__(env)
-        own = getattr(env, "fields", None)
+        own, nominal = getattr(env, "fields", None), left.nominal if left else None
         self.own_fields = isinstance(own, ModelFields)
-        self.fields = own if isinstance(own, ModelFields) else ModelFields(env.model, copy.copy(env.model))
+        self.fields = own if isinstance(own, ModelFields) else ModelFields(env.model, nominal or copy.copy(env.model))
         self.nominal = self.fields.nominal_model
+        if left is not None and nominal is not None:
+            for name in left.touched:
+                self.fields[name]
+            self.fields.restore()
+            self.fields.commit()
         self._steps: tuple[Any, str] | None = stepper_of(env)
         self._inside = False
         self._calls = self._written = 0
         self._time = np.inf
         self.started = True
         self._look()
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        return _Left, (None, ()) if self.own_fields else (self.nominal, tuple(self.fields.touched))
 
     @property
     def owner(self) -> Any:
@@ -195,11 +238,11 @@ class SingleSimulation(Simulation):
         if not self.attached and not own:
             setattr(owner, how, Stepped(owner, how, self))
         if not self.attached and whole:
-            owner.control_hooks.append(lambda _: self._begin())
+            _put(owner.control_hooks, self._begin)
         if not self.attached and hasattr(owner, "after_hooks"):
-            owner.after_hooks.append(lambda _: self._end())
+            _put(owner.after_hooks, self._end)
         if own and not self.between and (substeps or not whole):
-            owner.substep_hooks.append(self._act if whole else self._called)
+            _put(owner.substep_hooks, self._act if whole else self._called)
             self.between = True
         self.attached = True
 
@@ -243,17 +286,17 @@ class SingleSimulation(Simulation):
         self._time = self.data.time
         self._inside = False
 
-    def _act(self, _: Any) -> None:
+    def _act(self) -> None:
         """Before a physics step of an environment that has hooks of its own."""
         for hook in self.on_substep:
             hook()
 
-    def _called(self, env: Any) -> None:
+    def _called(self) -> None:
         """The same where the environment does not say which physics step is a control step's first."""
         if self._calls == 0:
             self._begin()
-        self._calls = (self._calls + 1) % int(env.frame_skip)
-        self._act(env)
+        self._calls = (self._calls + 1) % int(self.owner.frame_skip)
+        self._act()
 
     def run(self, original: Callable[..., None], plain: bool, ctrl: Array, frames: int) -> None:
         """A control step in place of `MujocoEnv._step_mujoco_simulation`."""
@@ -275,6 +318,11 @@ class SingleSimulation(Simulation):
         self._end()
 
 
+def _put(hooks: list[Any], method: Callable[[], None]) -> None:
+    """Add a hook; those of the environment that this one was copied from go."""
+    hooks[:] = [hook for hook in hooks if hook is not _idle] + [_Hook(method)]
+
+
 def simulation_of(env: Any, who: str) -> SingleSimulation:
     """The simulation beneath an environment, the same one for all its wrappers.
 
@@ -291,6 +339,6 @@ def simulation_of(env: Any, who: str) -> SingleSimulation:
             f"{who} needs a MuJoCo environment: {type(base).__name__} has no `unwrapped.model` (mujoco.MjModel) and "
             "`unwrapped.data` (mujoco.MjData)"
         )
-    made = SingleSimulation(base)
+    made = SingleSimulation(base, known if isinstance(known, _Left) else None)
     setattr(base, ATTRIBUTE, made)
     return made

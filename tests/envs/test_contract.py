@@ -91,7 +91,12 @@ def test_psi_may_leave_the_prior_but_not_physics() -> None:
     [
         ({"context": ["psy"]}, "want a sequence of: psi, elevation"),
         ({"context": "psi"}, "want a sequence"),
+        ({"context": None}, "want a sequence"),
         ({"elevation_hz": 30}, "50 divided by a whole number"),
+        ({"elevation_hz": "a"}, "50 divided by a whole number"),
+        ({"width": 10.5}, "width is 10.5, want a whole number, 1 or more"),
+        ({"height": 0}, "height is 0, want a whole number, 1 or more"),
+        ({"camera": "front", "render_mode": "rgb_array"}, "no camera is called 'front'; the scene has track"),
         ({"task": "fly"}, "it has: goal, figure8"),
         ({"render_mode": "ascii"}, "human, rgb_array"),
         ({"terrain_pool": 0}, "1 or more"),

@@ -1,5 +1,6 @@
 """The single environment: terrain, elevation maps, hooks, pictures."""
 
+import sys
 from typing import Any
 
 import gymnasium
@@ -223,6 +224,42 @@ def test_pictures_of_a_vector_environment(pictured: gymnasium.Env) -> None:
     envs.close()
 
 
+def test_pictures_show_the_state_as_it_is_and_as_a_vector_row_does() -> None:
+    """After a step what MuJoCo derives from the state is a physics step old."""
+    flat = {"render_mode": "rgb_array", "width": 160, "height": 120, "context": []}
+    single = made("nfc_gym/JackalFlat-v0", **flat)
+    envs = gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=1, **flat)
+    single.reset(seed=3)
+    envs.reset(seed=3)
+    for _ in range(5):
+        single.step(np.array([1.0, 0.5]))
+        envs.step(np.array([[1.0, 0.5]]))
+    np.testing.assert_array_equal(single.render(), envs.render()[0])  # type: ignore[index]
+    before = single.unwrapped.data.xpos.copy()  # type: ignore[attr-defined]
+    single.render()
+    np.testing.assert_array_equal(single.unwrapped.data.xpos, before)  # type: ignore[attr-defined]
+    single.close()
+    envs.close()
+
+
+def test_a_list_of_pictures_is_gymnasiums() -> None:
+    env = made("nfc_gym/JackalFlat-v0", render_mode="rgb_array_list", width=32, height=24, context=[])
+    env.reset(seed=0)
+    env.step(np.zeros(2))
+    assert [p.shape for p in env.render()] == 2 * [(24, 32, 3)]  # type: ignore[union-attr]
+    env.close()
+
+
+def test_a_window_without_a_display_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not sys.platform.startswith("linux"):
+        pytest.skip("other systems have displays of their own")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    env = made("nfc_gym/JackalFlat-v0", render_mode="human", context=[])
+    with pytest.raises(InputError, match=r'opens a window, and there is no display .* use "rgb_array"'):
+        env.reset(seed=0)
+
+
 def test_the_window_is_sent_changed_heights(monkeypatch: pytest.MonkeyPatch) -> None:
     """`human` drives MuJoCo's passive viewer; here a stand-in of it notes what it is told."""
     import mujoco.viewer
@@ -246,6 +283,7 @@ def test_the_window_is_sent_changed_heights(monkeypatch: pytest.MonkeyPatch) -> 
         def close(self) -> None:
             told.append("close")
 
+    monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(mujoco.viewer, "launch_passive", lambda *args, **kwargs: Handle())
     env = made(ROUGH, render_mode="human")
     env.reset(seed=0, options={"terrain_id": 0})

@@ -301,6 +301,41 @@ def test_a_forked_worker_may_forget_the_environments_of_its_parent() -> None:
     same(held[0].step(np.zeros((N, 2)))[2], np.zeros(N, bool))
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.parametrize(("threads", "word"), [(2, "its threads stayed behind"), (1, "stepped")])
+def test_a_forked_worker_is_told_that_it_cannot_step_what_its_parent_made(threads: int, word: str) -> None:
+    envs = vector("nfc_gym/JackalFlat-v0", nthread=threads)
+    envs.reset(seed=0)
+    context = multiprocessing.get_context("fork")
+    said = context.Queue()
+
+    def step() -> None:
+        try:
+            envs.step(np.zeros((N, 2)))
+            said.put("stepped")
+        except InputError as e:
+            said.put(str(e))
+
+    worker = context.Process(target=step)
+    worker.start()
+    found = said.get(timeout=60)
+    worker.join(20)
+    worker.kill()
+    assert word in found
+    same(envs.step(np.zeros((N, 2)))[2], np.zeros(N, bool))
+
+
+def test_the_length_of_episodes_is_a_whole_number() -> None:
+    for wrong in (0, 2.5, "a"):
+        with pytest.raises(InputError, match=r"max_episode_steps is .*, want a whole number, 1 or more"):
+            vector("nfc_gym/JackalFlat-v0", max_episode_steps=wrong)
+    endless = vector("nfc_gym/JackalFlat-v0", max_episode_steps=-1)
+    endless.reset(seed=0)
+    assert not endless.step(np.zeros((N, 2)))[3].any()
+    with pytest.raises(InputError, match=r"seed is 1\.5, want a whole number"):
+        endless.reset(seed=1.5)
+
+
 def test_maps_of_all_may_be_named_where_some_are_reset() -> None:
     envs = vector("nfc_gym/JackalRough-v0", context=["psi"])
     envs.reset(seed=0, options={"terrain_id": 0})

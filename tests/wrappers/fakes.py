@@ -127,3 +127,29 @@ def same(a: Any, b: Any) -> None:
             same(x, y)
     else:
         np.testing.assert_array_equal(a, b)
+
+
+class Own(gym.Env):
+    """Steps its model itself, and offers a place between two physics steps."""
+
+    def __init__(self) -> None:
+        self.model = mujoco.MjModel.from_xml_string(CUBE)
+        self.data, self.frame_skip, self.substep_hooks = mujoco.MjData(self.model), 4, []
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self.model.nq + self.model.nv,), np.float64)
+        self.action_space = spaces.Box(-30, 30, (1,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.data.ctrl[:] = action
+        for _ in range(self.frame_skip):
+            for hook in self.substep_hooks:
+                hook(self)
+            mujoco.mj_step(self.model, self.data)
+        return self._seen(), 0.0, False, False, {}
+
+    def _seen(self) -> np.ndarray:
+        return np.concatenate([self.data.qpos, self.data.qvel])

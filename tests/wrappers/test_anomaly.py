@@ -111,3 +111,20 @@ def test_an_observation_with_the_goal_in_it_is_told_of(vector: bool) -> None:
             continue
         with pytest.raises(InputError, match=r'15 entries.*make the environment with context=\["psi"\]'):
             monitored.step(np.zeros(monitored.action_space.shape))
+
+
+def test_a_score_that_is_no_number_is_no_healthy_one() -> None:
+    class Broken(Jump):
+        def update(self, obs, action, next_obs):
+            return super().update(obs, action, next_obs) * np.nan
+
+    env = MonitorAnomaly(Plain(), Broken())
+    env.reset()
+    with pytest.raises(InputError, match="score is nan, want a number"):
+        env.step(np.zeros(1))
+    envs = VectorMonitorAnomaly(gym.vector.SyncVectorEnv([Plain, Plain]), Broken())
+    envs.reset()
+    with pytest.raises(InputError, match="score of simulation 0 is nan"):
+        envs.step(np.zeros((2, 1)))
+    with pytest.raises(InputError, match=r"threshold of the score must be a number, .* got 'a'"):
+        MonitorAnomaly(Plain(), Jump(), threshold="a")  # type: ignore[arg-type]

@@ -4,7 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from fakes import FakeEnv, Gaussian, NoModel, ZooEnv, roll, same
+from fakes import FakeEnv, Gaussian, NoModel, Own, ZooEnv, roll, same
 
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.physics.residual import Components
@@ -174,3 +174,17 @@ def test_a_stepper_without_a_place_for_hooks_is_refused() -> None:
 
     with pytest.raises(InputError, match="substep_hooks"):
         ResidualDynamics(Own(), np.zeros(0))
+
+
+def test_the_first_control_step_counts_where_a_reset_computes_nothing() -> None:
+    """A reset that runs no `mj_forward` leaves an inertia of zero behind."""
+    dv = np.array([0.3, 0, 0, 0, 0, 0, 0])
+    env = ResidualDynamics(Own(), dv)
+    env.reset(seed=0)
+    for k in range(1, 4):
+        np.testing.assert_allclose(env.step(NONE)[0][8], k * dv[0], rtol=1e-9)
+
+
+def test_a_covariance_of_words_is_refused() -> None:
+    with pytest.raises(InputError, match="covariance is 'a', want numbers"):
+        ResidualDynamics(FakeEnv(), np.zeros(7), covariance="a")  # type: ignore[arg-type]

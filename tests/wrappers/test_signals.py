@@ -127,6 +127,10 @@ def test_rows_of_a_vector_environment_forget_on_their_own(mode) -> None:
         ({"observation": {"sd": -1.0}}, "below 0"),
         ({"observation": {"bias": [1.0, 2.0, 3.0]}}, r"\(2,\)"),
         ({"action": {"delay": 0.5}}, "delay"),
+        ({"action": {"delay": "a"}}, "delay, in control steps, is 'a', want a whole number"),
+        ({"action": {"sd": "a"}}, "sd is a finite number or .* got 'a'"),
+        ({"action": 5}, "action is 5; want a fault as a mapping, such as"),
+        (None, "noise is None; want signal -> fault, such as"),
     ],
 )
 def test_bad_input_is_refused_by_name(noise, message: str) -> None:
@@ -140,3 +144,25 @@ def test_keys_that_are_no_numbers_are_refused() -> None:
 
     with pytest.raises(InputError, match="no Box"):
         PerturbSignals(Discrete(), {"action": {"sd": 1.0}})
+
+
+def test_one_bound_is_kept_too() -> None:
+    class Below(Plain):
+        observation_space = spaces.Box(-np.inf, 1.0, (2,), np.float64)
+
+    env = PerturbSignals(Below(), {"observation": {"bias": 5.0}})
+    assert env.reset()[0] in env.observation_space
+
+
+@pytest.mark.parametrize("fault", [{"delay": 1}, {"bias": 0.1}])
+@pytest.mark.parametrize("action", [0.0, np.zeros((1, 1)), np.zeros(3), None, "a"])
+def test_a_wrong_action_does_not_become_a_right_one(action, fault) -> None:
+    env = PerturbSignals(Plain(), {"action": fault})
+    env.reset()
+    with pytest.raises(InputError, match=r"action has shape .*, want \(1,\)|action is .*, want numbers"):
+        env.step(action)
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    with pytest.raises(gym.error.ResetNeeded, match="before the first reset"):
+        PerturbSignals(Plain(), {"observation": {"sd": 1.0}}).step(np.zeros(1))
