@@ -1,7 +1,8 @@
 """What infers psi and residual fidelity from a trajectory, as `adapt` asks for it.
 
 Anything with `sample(n, rng)` will do: what it believes then does not depend on what was seen. With `given(window)` as
-well, like the neural posterior, it is given the window that ends at the alarm. `Sequential` adds the paper's online
+well, like the neural posterior, it is given the window that ends at the alarm; a robot that fell before a window was
+full has shown too little, and what is believed is the prior. `Sequential` adds the paper's online
 rounds to a neural posterior; `Assimilation` (in a module of its own) needs no network.
 """
 
@@ -12,10 +13,12 @@ import numpy as np
 
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.posterior import Sampler
-from nfc_gym.inference.posterior import NeuralPosterior
+from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.proposals import TRUNCATED, SequentialConfig
 from nfc_gym.inference.sequential import sequential
+from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig
 
 
@@ -33,6 +36,31 @@ class Inference(Protocol):
 
 
 @dataclass(frozen=True)
+class Unseen:
+    """Draws of psi's prior: what is believed where too little was seen."""
+
+    prior: PriorBox
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        """`n` draws, uniform in the box; parameters that are not free are nominal."""
+        low, high, nominal, free = (np.array(getattr(self.prior, k)) for k in ("low", "high", "nominal", "free"))
+        return Fidelity(psi=np.where(free, rng.uniform(low, high, (n, len(low))), nominal))
+
+
+def asked(posterior: Any, trajectory: Trajectory) -> Window | None:
+    """The window that a posterior is asked about: up to the alarm, or else all; None where that is too short for it."""
+    least = posterior.network.sizes.horizon if isinstance(posterior, NeuralPosterior) else 0
+    parts = (trajectory.until_alarm(), trajectory)
+    return next((part.window() for part in parts if len(part) >= least), None)
+
+
+def believed(posterior: Any, trajectory: Trajectory) -> Sampler:
+    """What a posterior with `given` says of a trajectory."""
+    window = asked(posterior, trajectory)
+    return Unseen(posterior.prior) if window is None else posterior.given(window)
+
+
+@dataclass(frozen=True)
 class Fixed:
     """A posterior that is used as it is.
 
@@ -45,9 +73,7 @@ class Fixed:
     def infer(self, trajectory: Trajectory) -> Sampler:
         """See `Inference`."""
         given = getattr(self.posterior, "given", None)  # of a `Fidelity`, the names of its parts
-        if callable(given):
-            return self.posterior.given(trajectory.until_alarm().window())
-        return self.posterior
+        return believed(self.posterior, trajectory) if callable(given) else self.posterior
 
     def updated(self, trajectory: Trajectory, belief: Sampler) -> "Fixed":
         """Itself."""
@@ -82,11 +108,13 @@ class Sequential:
 
     def infer(self, trajectory: Trajectory) -> Sampler:
         """See `Inference`."""
-        return self.posterior.given(trajectory.until_alarm().window())
+        return believed(self.posterior, trajectory)
 
     def updated(self, trajectory: Trajectory, belief: Sampler) -> "Sequential":
-        """Sequential NFC: rounds of simulations that close in on the window."""
-        window = trajectory.until_alarm().window()
+        """Sequential NFC: rounds of simulations that close in on the window; without a whole one there are none."""
+        window = asked(self.posterior, trajectory)
+        if window is None:
+            return self
         sequential(self.posterior.network, self.simulate, window, self.rounds, self.training, scales=False)
         return Sequential(NeuralPosterior(self.posterior.network), self.simulate, self.rounds, self.training)
 

@@ -79,7 +79,11 @@ def load(
         )
     for name, module in modules.items():
         prefix = f"{name}/"
-        module.load_state_dict({k.removeprefix(prefix): t for k, t in tensors.items() if k.startswith(prefix)})
+        try:
+            module.load_state_dict({k.removeprefix(prefix): t for k, t in tensors.items() if k.startswith(prefix)})
+        except RuntimeError as e:
+            why = " ".join(str(e).split())
+            raise InputError(f"{path} is of another run, whose {name} is another network ({why})") from None
     if optimiser is None:
         return told["plain"]
     state = optimiser.state_dict()

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,7 @@ class Trajectory:
                 # Those of before 0.1.0 was out have no maps of the way.
                 wanted = [f.name for f in fields(cls) if f.name in archive or f.name not in _LATER]
                 parts: dict[str, Any] = {name: archive[name] for name in wanted}
-        except (OSError, ValueError, KeyError) as e:
+        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as e:
             raise InputError(f"{path}: truncated, or no trajectory ({e})") from None
         scalars = {"threshold": float, "reached": bool, "ended": bool}
         return cls(**{k: scalars[k](v) if k in scalars else v for k, v in parts.items()})

@@ -116,6 +116,14 @@ class StoredWindows:
     def __len__(self) -> int:
         return len(self.rows)
 
+    @property
+    def told(self) -> dict[str, Any]:
+        """Which windows these are, as far as training from others would be another training."""
+        about = self.manifest
+        return {"environment": about.environment, "the windows' seed": about.seed, "noise": self.noise} | {
+            f"the windows' {key}": value for key, value in about.settings.items()
+        }
+
     def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
         """See `WindowSet.batches`; None is an order of its own, the same each time."""
         for arrays in self.stored.batches(size, 0 if seed is None else seed, self.rows, self.names, self.noise):

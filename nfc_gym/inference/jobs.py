@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -97,7 +98,7 @@ def read_window(path: Path) -> Window:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays: dict[str, Any] = {k: file[k] for k in file.files}
-    except (OSError, ValueError, EOFError, AttributeError) as e:
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, BadZipFile) as e:
         raise InputError(f"{path} is no .npz file ({e}); want one with `states` (n + 1, s), `actions` (n, a)") from None
     missing = [k for k in ("states", "actions") if k not in arrays]
     if missing:

@@ -6,6 +6,10 @@ from torch import Tensor, nn
 from nfc_gym.inference.encoders.base import Standard
 
 _STRENGTHS = torch.logspace(-7, 2, 28, dtype=torch.float64).tolist()  # of the ridge, in units of the inputs' variance
+_LEAST = 3  # pairs
+# Where there are fewer pairs than inputs a weak ridge goes through each, and what it leaves of one and what that one
+# has no say in are both next to nothing: only their ratio tells, and is good to many digits.
+_LEVERAGE = 1e-12
 
 
 class LinearBase(nn.Module):
@@ -17,7 +21,8 @@ class LinearBase(nn.Module):
     triangular, so the first entries of y depend on the first entries of x alone, and marginal densities stay exact.
 
     The ridge is the one of least leave-one-out error, and L is the Cholesky factor of the leave-one-out residuals'
-    covariance: what a regression gains by overfitting does not narrow it.
+    covariance: what a regression gains by overfitting does not narrow it. Nor do few windows: the fewer there are to an
+    entry of x, the less of the residuals' correlations is believed, and from fewer than three nothing is learned.
 
     Args:
       inputs: size of r.
@@ -39,6 +44,8 @@ class LinearBase(nn.Module):
     def fit(self, r: Tensor, x: Tensor) -> None:
         """From pairs r (n, inputs), x (n, D)."""
         self.scale.fit(r)
+        if len(r) < _LEAST:
+            return
         a, x = self._inputs(r).double(), x.double()
         middle, at = x.mean(0), a.mean(0)
         values, vectors = torch.linalg.eigh((a - at).T @ (a - at) / len(a))
@@ -49,7 +56,7 @@ class LinearBase(nn.Module):
         for strength in _STRENGTHS:
             inverse = 1 / (values + strength)
             leverage = 1 / len(a) + (turned.square() * inverse).sum(1, keepdim=True) / len(a)
-            wrong = (x - middle - turned @ (inverse[:, None] * moments)) / (1 - leverage).clamp(min=1e-3)
+            wrong = (x - middle - turned @ (inverse[:, None] * moments)) / (1 - leverage).clamp(min=_LEVERAGE)
             error = wrong.square().sum(0).log().sum()  # each entry in units of its own: scale-free
             if error < best:
                 best, left = error, wrong
@@ -57,6 +64,8 @@ class LinearBase(nn.Module):
                 self.weight.copy_(weight)
                 self.offset.copy_(middle - weight @ at)
         covariance = left.T @ left / len(a)
+        few = min(1.0, (covariance.shape[0] + 2) / len(a)) ** 2
+        covariance = (1 - few) * covariance + few * covariance.diagonal().diag()
         ridge = 1e-6 * covariance.diagonal().mean() * torch.eye(len(covariance), device=x.device)
         self.factor.copy_(torch.linalg.cholesky(covariance + ridge))
 

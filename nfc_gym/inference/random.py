@@ -1,15 +1,20 @@
 """Draws of torch's libraries that depend on a seed alone and leave the caller's generators as they were."""
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 import torch
 
+_one = threading.RLock()  # these generators are the process's: two threads at once would take each other's numbers
+
 
 @contextmanager
 def seeded(seed: int | np.random.Generator, device: torch.device | None = None) -> Iterator[None]:
     """Torch's generators start from `seed` (or from a draw of a numpy generator) inside, and are restored after.
+
+    Threads wait for one another.
 
     Args:
       seed: or a generator to draw one from.
@@ -21,7 +26,7 @@ def seeded(seed: int | np.random.Generator, device: torch.device | None = None) 
         gpus = list(range(torch.cuda.device_count()))
     else:
         gpus = [torch.cuda.current_device() if device.index is None else device.index] if device.type == "cuda" else []
-    with torch.random.fork_rng(gpus):
+    with _one, torch.random.fork_rng(gpus):
         torch.default_generator.manual_seed(seed)
         for gpu in gpus:
             torch.cuda.default_generators[gpu].manual_seed(seed)

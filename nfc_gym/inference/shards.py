@@ -55,10 +55,11 @@ def _check_shape(name: str, shape: Sequence[int], want: Sequence[int | None], wh
         raise InputError(f"{where}: {name} has shape {tuple(shape)}, want (n, {', '.join(map(str, want))}){why}")
 
 
-def check_finite(name: str, value: NDArray, where: str) -> None:
-    """Refuse an array (n, ...) that holds a number which is not finite, naming the window."""
+def check_finite(name: str, value: NDArray, where: str, rows: NDArray[np.integer] | None = None) -> None:
+    """Refuse an array (n, ...) that holds a number which is not finite, naming the window: one of `rows` (n,)."""
     if value.dtype.kind == "f" and not np.isfinite(value).all():
         row = int(np.argwhere(~np.isfinite(value))[0, 0])
+        row = row if rows is None else int(rows[row])
         raise InputError(f"{where}: {name} of window {row} is not finite")
 
 

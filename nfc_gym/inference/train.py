@@ -160,7 +160,7 @@ class _Run:
         config = asdict(replace(self.config, save_every=0.0))
         return {
             "config": config, "network": self.network.config.to_dict(), "prior": self.network.prior.to_dict(),
-            "windows": len(self.windows), "held_out": len(self.held_out),
+            "windows": len(self.windows), "held_out": len(self.held_out), "of": getattr(self.windows, "told", {}),
         }  # fmt: skip
 
     def loop(self, file: Path | None, report: Report) -> None:

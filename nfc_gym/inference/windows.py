@@ -107,7 +107,7 @@ class Windows:
             for k in np.unique(of):
                 at = np.flatnonzero(of == k)
                 value[at] = self._shards[k][name][rows[at] - starts[k]]
-            check_finite(name, value, str(self.folders[0]))
+            check_finite(name, value, " + ".join(map(str, self.folders)), rows)
             out[name] = value
         return out
 

@@ -38,10 +38,19 @@ class Draws:
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """(n, *shape) draws."""
         fidelity = self.sampler.sample(n, rng)
+        if not isinstance(fidelity, Fidelity):
+            raise InputError(
+                f"{self.who}: the source's sample(n, rng) must return a Fidelity, such as "
+                f"Fidelity({self.part}=array), got {type(fidelity).__name__}"
+            )
         value = getattr(fidelity, self.part)
         if value is None:
             given = ", ".join(fidelity.given) or "nothing"
             raise InputError(f"{self.who}: the source says nothing of {self.part}; it speaks of {given}")
+        if len(value) != n:
+            raise InputError(
+                f"{self.who}: the source gave {len(value)} samples of {self.part} where {n} were asked for"
+            )
         return value
 
     def expect(self, *shapes: tuple[int, ...], meaning: str) -> None:
@@ -62,4 +71,6 @@ def _sampler(source: Any, part: str, who: str) -> Sampler:
         raise InputError(
             f"{who}: a source is a posterior with sample(n, rng), an array of numbers or a path, got {source!r}"
         ) from None
+    if not array.size:
+        raise InputError(f"{who}: the source is an empty array, {array.shape}; want one sample of {part} or more")
     return Fidelity(**{part: array})

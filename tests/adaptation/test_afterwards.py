@@ -14,7 +14,7 @@ from carts import QUICK, cart, everything, trajectory, watcher
 from nfc_gym import InputError
 from nfc_gym.adaptation import learn_from_mission, load_policy
 from nfc_gym.adaptation.afterwards import LearnConfig
-from nfc_gym.adaptation.beliefs import Sequential
+from nfc_gym.adaptation.beliefs import Fixed, Sequential
 from nfc_gym.adaptation.normal import quiet_trajectories, quiet_windows, stretches, windows_of
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
 from nfc_gym.inference.config import NetworkConfig, Sizes
@@ -178,6 +178,35 @@ def test_psi_is_told_better_from_motion_like_the_missions(
     assert json.loads(json.dumps(again.report)) == json.loads(json.dumps(learned.report))
     for k, v in again.posterior.network.state_dict().items():
         assert torch.equal(v, learned.posterior.network.state_dict()[k])
+
+
+def test_a_robot_that_fell_before_a_window_was_full_has_shown_the_prior(
+    posterior: NeuralPosterior, mission: list[Trajectory]
+) -> None:
+    whole = mission[0]
+    short = replace(
+        whole, states=whole.states[:7], actions=whole.actions[:6], rewards=whole.rewards[:6], scores=np.arange(6.0),
+        estimate=whole.estimate[:7], maps=whole.maps[:0], looks=whole.looks[:0], ended=True,
+    )  # fmt: skip
+    psi = Fixed(posterior).infer(short).sample(4000, np.random.default_rng(0)).psi
+    prior = posterior.prior
+    assert psi is not None
+    assert psi.min(0) == pytest.approx(prior.low, rel=0.01)
+    assert psi.max(0) == pytest.approx(prior.high, rel=0.01)
+    rounds = Sequential(posterior, simulate=None)
+    assert rounds.infer(short).sample(3, np.random.default_rng(0)).psi is not None
+    assert rounds.updated(short, posterior) is rounds, "there is no window to close in on"
+    late = replace(whole, scores=np.concatenate([[9.0], np.zeros(len(whole) - 1)]))  # alarmed at once, and drove on
+    seen = posterior.given(late.window()).sample(5, np.random.default_rng(1)).psi
+    np.testing.assert_array_equal(Fixed(posterior).infer(late).sample(5, np.random.default_rng(1)).psi, seen)
+
+
+def test_a_damaged_trajectory_is_refused(mission: list[Trajectory], tmp_path: Path) -> None:
+    file = tmp_path / "trajectory.npz"
+    mission[0].save(file)
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(InputError, match="truncated, or no trajectory"):
+        Trajectory.load(file)
 
 
 def test_rounds_of_a_trained_network_keep_its_scales(posterior: NeuralPosterior, mission: list[Trajectory]) -> None:

@@ -110,6 +110,9 @@ def test_a_run_that_stopped_ends_as_one_that_did_not(jackal: Path, tmp_path: Pat
     other = replace(config, seed=1)
     with pytest.raises(InputError, match="another run"):
         adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=other, folder=tmp_path / "b", threads=1)
+    wider = ppo_agent(load_policy("JackalFlat"))
+    with pytest.raises(InputError, match=r"another run, whose agent is another network .*size mismatch"):
+        adapt(wider, world(), belief(), Alarm(9), config=config, folder=tmp_path / "b", threads=1)
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,18 @@ def test_a_linear_base_on_noise_is_the_prior() -> None:
     assert base(torch.randn(500, 150)).std() < 0.2
 
 
+@pytest.mark.parametrize("n", [2, 3, 5, 20, 60, 100, 110])
+def test_a_linear_base_of_few_windows_claims_nothing(n: int) -> None:
+    """With fewer pairs than inputs a weak ridge goes through every one, and says nothing of the next."""
+    torch.manual_seed(n)
+    size = 9
+    base = LinearBase(100, size)
+    base.fit(torch.randn(n, 100), torch.randn(n, size))
+    r, x = torch.randn(2000, 100), torch.randn(2000, size)
+    y = base.whiten(x, base(r))
+    assert y.square().mean().sqrt() < (5.0 if n < 10 else 1.7), "what it never saw lies within what it claims"
+
+
 def test_the_structure_heads_probabilities() -> None:
     head = Structure(4, 3)
     p = head(torch.randn(6, 4))

@@ -131,3 +131,29 @@ def test_training_says_what_is_wrong(windows: Path, prior: PriorBox, tmp_path: P
     (other / "manifest.json").write_text(json.dumps(about | {"robot": "ant"}))
     with pytest.raises(InputError, match="'ant'"):
         jobs.train_posterior(other, prior, tmp_path / "a.safetensors", SMALL, TrainConfig(), device="cpu")
+
+
+def test_training_does_not_go_on_from_other_windows_or_other_noise(
+    windows: Path, prior: PriorBox, tmp_path: Path
+) -> None:
+    """As many of them, so that nothing else differs."""
+    out, once = tmp_path / "q.safetensors", TrainConfig(epochs=1, batch=32)
+    jobs.train_posterior(windows, prior, out, SMALL, once, device="cpu")
+    jobs.train_posterior(windows, prior, out, SMALL, once, device="cpu")
+    with pytest.raises(InputError, match=r"is of another run \(noise 1\.0, now 0\.5\)"):
+        jobs.train_posterior(windows, prior, out, SMALL, once, device="cpu", noise=0.5)
+    simulate(ENV, 60, tmp_path / "others", jobs=1, seed=1)
+    with pytest.raises(InputError, match="the windows' seed 0, now 1"):
+        jobs.train_posterior(tmp_path / "others", prior, out, SMALL, once, device="cpu")
+
+
+@pytest.mark.parametrize("spoil", [lambda b: b[: len(b) // 2], lambda b: b[:200] + bytes(40) + b[240:], lambda b: b""])
+def test_a_damaged_window_is_the_files_fault(motion: Path, posterior: Path, tmp_path: Path, spoil) -> None:
+    file = tmp_path / "window.npz"
+    file.write_bytes(spoil(motion.read_bytes()))
+    with pytest.raises(InputError, match=r"is no \.npz file"):
+        jobs.infer(posterior, file)
+    with file.open("wb") as handle:
+        np.save(handle, np.zeros(3))
+    with pytest.raises(InputError, match=r"is no \.npz file"):
+        jobs.infer(posterior, file)

@@ -1,5 +1,6 @@
 """`NeuralPosterior`: core's protocol, densities in physical units, checkpoints and what is refused."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium
@@ -63,6 +64,17 @@ def test_sampling_leaves_torchs_generator_alone() -> None:
     torch.manual_seed(1)
     posterior.given(window).sample(5, rng())
     torch.testing.assert_close(torch.rand(3), expected)
+
+
+def test_threads_draw_what_one_alone_does() -> None:
+    posterior, window = cart(density="flow")
+    given = posterior.given(window)
+    draw = lambda k: given.sample(40, np.random.default_rng(k)).psi  # noqa: E731
+    alone = [draw(k) for k in range(12)]
+    with ThreadPoolExecutor(6) as pool:
+        together = list(pool.map(draw, range(12)))
+    for a, b in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_on_the_linear_base_draws_and_densities_are_the_closed_form() -> None:

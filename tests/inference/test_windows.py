@@ -161,6 +161,8 @@ def test_numbers_that_are_not_finite_never_leave(tmp_path: Path) -> None:
     path.write_bytes(whole)
     with pytest.raises(InputError, match="states of window 0 is not finite"):
         Windows(tmp_path)[:3]
+    with pytest.raises(InputError, match="states of window 0 is not finite"):  # wherever it stands in a batch
+        Windows(tmp_path)[[2, 1, 0]]
 
 
 def test_short_windows_and_missing_arrays_are_refused() -> None:
