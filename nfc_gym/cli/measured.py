@@ -95,6 +95,8 @@ def close_loop(
     with outcome(ctx, resumes=True):
         from nfc_gym.measured.loop import close_loop as run
 
+        if time_saved and posterior is None:
+            raise InputError("--time-saved says what a posterior saves: give --posterior FILE as well")
         belief, witness = consulted(posterior)
         run(
             mapping, out, seed=seed, jobs=jobs, overwrite=overwrite, resume=resume, fold=fold, posterior=belief,

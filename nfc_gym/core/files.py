@@ -14,7 +14,13 @@ _ROOM = 20_000_000  # bytes that must be free: results are a few megabytes
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside `path` to write to; on success it takes the place of `path`, on failure nothing is left of it."""
+    """A path beside `path` to write to; on success it takes the place of `path`, on failure nothing is left of it.
+
+    Raises:
+      InputError: something is there that is no file, such as a device.
+    """
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is a {'folder' if path.is_dir() else 'device'}, not a file: choose another")
     part = path.with_name(f".{path.name}.part")
     try:
         yield part

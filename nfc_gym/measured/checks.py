@@ -117,6 +117,9 @@ def _whole(dataset: Dataset) -> list[Finding]:
     return findings
 
 
+_DOES = {"fit": "is fitted to", "select": "selects", "verify": "verifies"}
+
+
 def _reached(dataset: Dataset) -> list[Finding]:
     """Whether the logs of every split hold segments with samples to compare."""
     findings: list[Finding] = []
@@ -132,7 +135,7 @@ def _reached(dataset: Dataset) -> list[Finding]:
     for split in SPLITS:
         longest = max((log.duration for log in dataset.of(split, fold)), default=0.0)
         if longest < last:
-            message = f"no log that {split if split == 'fit' else split + 's'} is as long as the longest horizon, "
+            message = f"no log that {_DOES[split]} is as long as the longest horizon, "
             message += f"{last:g} s; the longest lasts {longest:.3g} s"
             advice = "shorten segments.length and segments.horizons, record longer logs, or change `split`"
             findings.append(Finding("error", "segments", message, cause or advice))

@@ -63,6 +63,8 @@ class Dataset:
         for fold in self.folds:
             if fold.name == name:
                 return fold
+        if len(self.folds) == 1:
+            raise InputError(f"no fold {name!r}: folds come with `split: {{by: rotate}}` in the mapping")
         raise InputError(f"no fold {name!r}; there are: {', '.join(repr(f.name) for f in self.folds)}")
 
     def of(self, split: Split, fold: Fold | None = None) -> tuple[Log, ...]:

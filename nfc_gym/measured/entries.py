@@ -26,7 +26,7 @@ def _unit(value: object) -> str:
     text = str(value)
     if not units.known(text):
         raise PydanticCustomError(
-            "unit", "unknown unit; {advice}", {"advice": suggest(text, units.UNITS, most=len(units.UNITS))}
+            "unit", "unknown unit; {advice}", {"advice": suggest(units.spelt(text), units.UNITS, most=len(units.UNITS))}
         )
     return text
 

@@ -42,7 +42,7 @@ from nfc_gym.measured.report import render_summary
 from nfc_gym.measured.search import Found, Options, Search, State
 from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.splits import Fold
-from nfc_gym.measured.stages import Stages, digest, require_free, written_by
+from nfc_gym.measured.stages import Stages, digest, held, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
 from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
 from nfc_gym.measured.telling import teller
@@ -143,9 +143,12 @@ def _close_loop(
 ) -> dict[str, Any]:
     folds = [dataset.fold(fold)] if fold is not None else list(dataset.folds)
     if len(dataset.folds) == 1:
-        return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)
+        with held(out):
+            return _fold(bench, dataset, folds[0], out, seed, key, overwrite, resume, console)
     if fold is not None:  # other folds may be running beside this one; the summary is the whole run's
-        return _fold(bench, dataset, folds[0], out / fold, seed, digest(extra=key + fold), overwrite, resume, console)
+        with held(out / fold):
+            own = digest(extra=key + fold)
+            return _fold(bench, dataset, folds[0], out / fold, seed, own, overwrite, resume, console)
     require_free(out, key, overwrite, own=[f.name for f in folds])
     keys = {f.name: digest(extra=key + f.name) for f in folds}
 
@@ -166,7 +169,8 @@ def _close_loop(
         if finished(f, done):
             reports[f.name] = json.loads((out / f.name / "report.json").read_text(encoding="utf-8"))
         else:
-            reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, keys[f.name], overwrite, resume, console)
+            with held(out / f.name):
+                reports[f.name] = _fold(bench, dataset, f, out / f.name, seed, keys[f.name], overwrite, resume, console)
         done = [*done, f.name]
         stages.put("folds", done)
     whole = summary(reports)

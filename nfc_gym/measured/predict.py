@@ -51,6 +51,10 @@ def predict(
     """
     if out.is_dir():
         raise InputError(f"{out} is a folder: name the file to write in it, as --out {out / 'predicted.npz'}")
+    if out.suffix not in ("", ".npz"):
+        raise InputError(f"--out {out}: predictions are written as .npz; name it {out.with_suffix('.npz').name}")
+    if out.exists() and not out.is_file():
+        raise InputError(f"--out {out} is a device, not a file: choose another")
     require_writable(out.parent)
     mujoco.set_mju_user_warning(lambda message: None)  # what comes apart is an error here, said once
     dataset = require(mapping)[0]
@@ -79,8 +83,21 @@ def _models(bench: Bench, dataset: Dataset, fit: Path | None, stage: str) -> dic
         file = fit / fold.name / "fit.json" if len(dataset.folds) > 1 else fit / "fit.json"
         if not file.is_file():
             raise InputError(f"{file} does not exist: run close-loop on this mapping with --out {fit} first")
+        _require_own(file.with_name("report.json"), bench.dataset.mapping.model_file)
         out[fold.name] = _read_fit(file, stage, bench.plant)
     return out
+
+
+def _require_own(report: Path, model: str) -> None:
+    """Refuse a fit whose report says that it is of another model; without a report nobody knows."""
+    try:
+        given = json.loads(report.read_text(encoding="utf-8"))["model"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if Path(given).name != Path(model).name:
+        raise InputError(
+            f"{report.parent} is of the model {given}, the mapping of {model}: give the folder of this mapping"
+        )
 
 
 def _read_fit(file: Path, stage: str, plant: Plant) -> tuple[Plant, Array]:

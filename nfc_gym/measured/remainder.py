@@ -76,7 +76,7 @@ class LawSearch:
         if not self.laws or (arena.leftover < SILENT and not sure):
             return out
         effects = [e for e in arena.current.plant.effects if not refuted or e.id in refuted]
-        if effects and (rival := self._instead(arena, calibrated, effects if refuted else [])) is not None:
+        if effects and (rival := self._instead(arena, calibrated, effects, bool(refuted))) is not None:
             out.dropped = [e.id for e in effects]
             arena.say(f"a law explains more than {', '.join(out.dropped)}, which is not claimed")
             out.scanned = self.scanned
@@ -122,18 +122,23 @@ class LawSearch:
         self.rounds.append(outcome)
         return best
 
-    def _instead(self, arena: Arena, calibrated: Fit, refuted: Sequence[Effect]) -> Judged | None:
+    def _instead(self, arena: Arena, calibrated: Fit, effects: Sequence[Effect], refuted: bool) -> Judged | None:
         """A law that does better in place of effects whose form is refuted, or clearly better than all effects."""
         bare = arena
-        for effect in refuted:
+        for effect in effects if refuted else ():
             bare = bare.without(effect)
         if not refuted:
             bare = arena.facing(fit(arena.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6))
         rival = self._best(bare)
         if rival is None:
             return None
-        named, least = bare.judge(arena.current), CLEARLY
+        label, named, least = bare.label(rival), bare.judge(arena.current), CLEARLY
         if refuted:  # the common metric takes what the effects leave for noise, in which the two are equals
             bare = bare.sharper(rival.fitted)
             (rival, named), least = map(bare.enter_again, (rival, named)), 1.0
-        return rival if rival.total > least * named.total and not bare.ties(rival, named) else None
+        if rival.total > least * named.total and not bare.ties(rival, named):
+            return rival
+        last, they = self.rounds[-1], ", ".join(e.id for e in effects)
+        last.accepted, last.share, last.reason = [], 0.0, f"{label} does not do clearly better than {they}"
+        arena.say(f"left out: {last.reason}")
+        return None

@@ -189,7 +189,7 @@ def _round(r: Row) -> Row:
     label = " + ".join(taken)
     rows = [
         {k: c.get(k) for k in ("id", "gain_fit", "gain_select", "gain_select_low", "generic", "sentence")}
-        | {"outcome": _outcome(c, label, r.get("equivalents") or []), "accepted": c.get("id") == label}
+        | {"outcome": _outcome(c, label, r), "accepted": c.get("id") == label}
         for c in r.get("ranking") or []
     ]
     # A plainer law that does what the best-ranked one does is refitted after the ranking, and has no row of its own.
@@ -197,20 +197,27 @@ def _round(r: Row) -> Row:
     return {"accepted": taken, "plainer": plainer, "reason": r.get("reason") or "", "rows": rows}
 
 
-def _outcome(candidate: Row, label: str, equivalents: Sequence[Any]) -> str:
-    """Why a candidate was taken or left, from what the round decided; `label` is what it accepted, or empty."""
+def _outcome(candidate: Row, label: str, r: Row) -> str:
+    """Why a candidate was taken or left, from what its round decided; `label` is what that accepted, or empty."""
     gain, low = finite(candidate.get("gain_select")), finite(candidate.get("gain_select_low"))
     if label and candidate.get("id") == label:
         return "accepted"
-    if candidate.get("id") in equivalents:
+    if candidate.get("id") in (r.get("equivalents") or []):
         return "cannot be told from the accepted one, which is as plain or plainer"
     if gain is not None and gain <= 0:
         return "no gain on unseen logs"
     if low is not None and low <= 0:
         return "gain on what it was not fitted to is not sure: lower bound not above zero"
-    if label:
-        return "gains, but significantly less than the best"
-    return "a gain too small to name, or no larger than chance gives"
+    if not label:
+        return "a gain too small to name, or no larger than chance gives"
+    taken = next((c for c in r.get("ranking") or [] if c.get("id") == label), None)
+    if taken is not None and _total(candidate) >= _total(taken):
+        return "gains no more than a plainer one would by chance: the accepted one is preferred"
+    return "gains, but significantly less than the best"
+
+
+def _total(candidate: Row) -> float:
+    return (finite(candidate.get("gain_fit")) or 0.0) + (finite(candidate.get("gain_select")) or 0.0)
 
 
 def _misfit_rows(misfit: Row, by: str, stages: Sequence[str]) -> list[Row]:

@@ -3,14 +3,20 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import write_whole
 
-_FOLDER = ".stages"
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+_FOLDER, _LOCK = ".stages", ".lock"
 OUTPUTS = ("report.json", "report.html", "model.xml", "effects.yaml", "fit.json")
 
 
@@ -62,6 +68,25 @@ class Stages:
         for file in self.folder.iterdir():
             if file.name != "key":
                 file.unlink()
+
+
+@contextmanager
+def held(out: Path) -> Iterator[None]:
+    """A folder, made here, that no other run may write to meanwhile; the system lets go of it when a run is killed.
+
+    Raises:
+      InputError: another run writes there.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / _LOCK).open("wb") as handle:
+        try:
+            if fcntl is not None:  # elsewhere whoever starts two runs is not told
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{out}: another run is writing there: wait for it, or choose another --out") from None
+        except OSError:  # a file system without locks
+            pass
+        yield
 
 
 def require_free(out: Path, key: str | None, overwrite: bool, own: Iterable[str] = ()) -> None:

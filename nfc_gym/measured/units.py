@@ -77,9 +77,21 @@ def spread_to_si(deviation: float, unit: str) -> float:
     return deviation * _row(unit)[1]
 
 
+_SPELT = {
+    "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "meter": "m", "meters": "m", "metre": "m",
+    "metres": "m", "millimeters": "mm", "millimetres": "mm", "second": "s", "seconds": "s", "milliseconds": "ms",
+    "newton": "N", "newtons": "N", "volt": "V", "volts": "V", "ampere": "A", "amperes": "A",
+}  # fmt: skip
+
+
+def spelt(unit: str) -> str:
+    """The symbol of a unit whose name is written out; anything else as it is."""
+    return _SPELT.get(unit.lower(), unit)
+
+
 def _row(unit: str) -> tuple[str, float, float]:
     if unit not in _TABLE:
-        close = get_close_matches(unit, UNITS, 1)
+        close = get_close_matches(spelt(unit), UNITS, 1)
         hint = f"did you mean {close[0]!r}? " if close else ""
         raise InputError(f"unknown unit {unit!r}; {hint}known units: {', '.join(UNITS)}")
     return _TABLE[unit]

@@ -20,6 +20,8 @@ from nfc_gym import InputError
 from nfc_gym.adaptation import AdaptConfig, Agent, adapt, load_policy, ppo_agent, sac_agent
 from nfc_gym.adaptation.agent import OffPolicyConfig
 from nfc_gym.adaptation.choice import Choice
+from nfc_gym.adaptation.network import ActorCritic
+from nfc_gym.adaptation.policy import Policy
 from nfc_gym.adaptation.sight import Sight
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.fidelity import Fidelity
@@ -110,7 +112,7 @@ def test_a_run_that_stopped_ends_as_one_that_did_not(jackal: Path, tmp_path: Pat
     other = replace(config, seed=1)
     with pytest.raises(InputError, match="another run"):
         adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=other, folder=tmp_path / "b", threads=1)
-    wider = ppo_agent(load_policy("JackalFlat"))
+    wider = ppo_agent(Policy(fresh.sight, ActorCritic(replace(fresh.network.sizes, hidden=(24, 16)))))
     with pytest.raises(InputError, match=r"another run, whose agent is another network .*size mismatch"):
         adapt(wider, world(), belief(), Alarm(9), config=config, folder=tmp_path / "b", threads=1)
 

@@ -88,6 +88,14 @@ def test_options_reach_the_loop(loop: Any) -> None:
     }  # fmt: skip
 
 
+def test_what_a_posterior_saves_needs_one(loop: Any) -> None:
+    calls = loop(None)
+    result = call("close-loop", "m.yaml", "--out", "o", "--time-saved")
+    assert result.exit_code == 2
+    assert "give --posterior FILE as well" in plain(result.stderr)
+    assert calls == []
+
+
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -279,6 +280,15 @@ def test_nominal_prediction_needs_no_fit_and_is_mujocos_own(closed: Closed, tmp_
         np.testing.assert_allclose(said[k], [data.qpos[0], data.qvel[0]], atol=1e-9)
         data.ctrl[0] = torque
         mujoco.mj_step(model, data, 2)
+
+
+def test_a_fit_of_another_model_is_refused(closed: Closed, tmp_path: Path) -> None:
+    folder = tmp_path / "other"
+    shutil.copytree(closed.out, folder)
+    report = json.loads((folder / "report.json").read_text())
+    (folder / "report.json").write_text(json.dumps(report | {"model": "leg.xml"}))
+    with pytest.raises(InputError, match=r"other is of the model leg\.xml, the mapping of arm\.xml"):
+        predict(closed.mapping, folder, "rollout", "extended", tmp_path / "p.npz")
 
 
 def test_predict_without_a_run_says_what_to_do(closed: Closed, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from nfc_gym.cli import app
 from nfc_gym.core import InputError
-from nfc_gym.core.files import require_writable, write_together
+from nfc_gym.core.files import require_writable, write_together, write_whole
 
 COMMANDS = (["close-loop", "m.yaml"], ["predict", "m.yaml", "--stage", "nominal"], ["demo"])
 
@@ -104,6 +104,24 @@ def test_a_disk_that_is_nearly_full(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     result = call(line, tmp_path / "out")
     assert result.exit_code == 2
     assert "only 3 MB are free there, and 20 MB are wanted" in result.stderr
+
+
+def test_a_device_is_no_file_to_write(tmp_path: Path) -> None:
+    """Renaming a result over it would put a file in its place."""
+    device = tmp_path / "pipe"
+    os.mkfifo(device)
+    result = call(COMMANDS[1], device)
+    assert result.exit_code == 2
+    assert f"{device} is a device, not a file: choose another" in " ".join(result.stderr.split())
+    with pytest.raises(InputError, match="is a device, not a file"):
+        write_whole(device, "text")
+    assert device.is_fifo()
+
+
+def test_predictions_are_not_written_under_the_name_of_another_format(tmp_path: Path) -> None:
+    result = call(COMMANDS[1], tmp_path / "p.csv")
+    assert result.exit_code == 2
+    assert "predictions are written as .npz; name it p.npz" in " ".join(result.stderr.split())
 
 
 def test_a_name_that_is_too_long(tmp_path: Path) -> None:

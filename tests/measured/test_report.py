@@ -207,6 +207,16 @@ def test_candidates_say_why_they_were_left() -> None:
     assert "No more than chance." in text
 
 
+def test_what_gains_more_by_more_parameters_is_not_said_to_gain_less() -> None:
+    report = example()
+    rows = report["rounds"][0]["ranking"]
+    rows.insert(0, rows[0] | {"id": "load_friction:hinge", "gain_fit": 820.0, "gain_select": 241.0})
+    page = read(render(report, pictures())).text
+    part = page[page.index("Round 1") : page.index("Round 2")]
+    assert "201 gains no more than a plainer one would by chance: the accepted one is preferred" in part
+    assert "gains, but significantly less than the best" in part, "of those that do gain less"
+
+
 def test_values_of_each_place_keep_the_place_as_the_model_names_it() -> None:
     report = example()
     level = report["effects"][0]["parameters"]["level"]

@@ -3,13 +3,15 @@
 import errno
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from nfc_gym.core import InputError, files
-from nfc_gym.measured.stages import OUTPUTS, Stages, digest, write_whole, written_by
+from nfc_gym.measured.stages import OUTPUTS, Stages, digest, held, write_whole, written_by
 
 
 def listing(folder: Path) -> dict[str, str]:
@@ -179,3 +181,21 @@ def test_a_finished_run_is_kept_unless_overwritten(tmp_path: Path) -> None:
     assert listing(out) == before
     Stages(out, "another key", True, True)
     assert listing(out) == before  # until there is something to put in its place
+
+
+def test_a_folder_is_of_one_run_at_a_time(tmp_path: Path) -> None:
+    out, holds = tmp_path / "out", "from nfc_gym.measured.stages import held\nimport pathlib, sys, time\n"
+    holds += "with held(pathlib.Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
+    with subprocess.Popen([sys.executable, "-c", holds, str(out)], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with (
+            pytest.raises(InputError, match="another run is writing there: wait for it, or choose another --out"),
+            held(out),
+        ):
+            pass
+        other.kill()
+    with held(out):  # the system let go of what the killed one held
+        pass
+    with held(out):  # and a run that ended with an error, in the same process
+        assert out.is_dir()

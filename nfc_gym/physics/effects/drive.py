@@ -52,7 +52,8 @@ def command_unit(model: mujoco.MjModel, actuator: int) -> str:
         return "m" if slide else "rad"
     if int(model.actuator_biastype[actuator]) == _AFFINE_BIAS and model.actuator_biasprm[actuator, 2] != 0:
         return "m/s" if slide else "rad/s"
-    if model.actuator_gainprm[actuator, 0] == 1 and int(model.actuator_trntype[actuator]) == _JOINT:
+    whole = model.actuator_gainprm[actuator, 0] == 1 and model.actuator_gear[actuator, 0] == 1
+    if whole and int(model.actuator_trntype[actuator]) == _JOINT:
         return "N" if slide else "N m"
     return "1"
 

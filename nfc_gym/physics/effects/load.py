@@ -102,7 +102,7 @@ class Wind(Effect):
             return super().say(theta, sd)
         wind = theta[:3] / theta[3]
         speed = float(np.linalg.norm(wind))
-        heading = ", ".join(f"{w:.3g}" for w in wind)
+        heading = ", ".join(f"{w:.2g}" for w in wind / max(speed, 1e-300))
         return f"{self.summary} at {self.place}: {speed:.3g} m/s along ({heading}), drag {theta[3]:.3g} N s/m."
 
     @classmethod
