@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.measured.box import Box, box
 from nfc_gym.measured.fit import Fit, fit
-from nfc_gym.measured.metric import Metric, metric
+from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.rollout import Plant
 
@@ -23,6 +23,7 @@ _ROUNDS = 10  # iterations of each fit
 _SAME = 3.0  # standard errors, root mean square over the parameters, within which two fits ended in one hollow
 _THIN, _ENOUGH = 3, 12  # hollows race on every third block, where so many are left
 _BEHIND = 3.0  # standard errors that a hollow is behind there to be lost, and one number so many deviations off
+_DEEPER = 10.0  # loss by which a fit from another size must be better
 _SETTLED = 2  # fits in a row that end where others have: more of them would too
 
 
@@ -88,6 +89,29 @@ def hollows(
             best, sigma, least = x, expected, value
     away = np.stack([x for x in ends if x is not best] or [best]) - best
     return Ended(best, np.sqrt((away**2).mean(0)), sigma)
+
+
+def resized(problem: Problem, metric: Metric, found: Fit) -> Fit:
+    """A fit again from the most promising of the sizes that its effects are screened at, if that ends clearly lower.
+
+    A delay by a period of what is measured too little, or found beside another law that was not there yet, is a hollow
+    of its own: what is near says that it is best, and only the true size says that it is not.
+    """
+    tries, at = [], len(found.plant.space)
+    for effect in found.plant.effects:
+        for p in effect.params:
+            for probe in () if p.shape else p.probes:
+                x = found.x.copy()
+                x[at] = probe
+                tries.append(x)
+            at += 1
+    if not tries:
+        return found
+    with np.errstate(invalid="ignore", over="ignore"):
+        tried = loss(metric.whiten(problem.residual(found.plant, np.stack(tries)))).sum(-1)
+    best = int(np.argmin(np.where(np.isfinite(tried), tried, np.inf)))
+    again = fit(problem, metric, found.plant, tries[best], _ROUNDS)
+    return again if again.losses.sum() < found.losses.sum() - _DEEPER else found
 
 
 def _errors_between(found: Fit, limits: Box, a: Array, b: Array) -> float:

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,11 @@ from nfc_gym.measured.belief import read_belief
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.calibrate import calibrate, compared
 from nfc_gym.measured.checks import require
-from nfc_gym.measured.contest import dispersion
+from nfc_gym.measured.contest import clusters, dispersion
 from nfc_gym.measured.dataset import Dataset
-from nfc_gym.measured.elsewhere import STARTS, hollows
+from nfc_gym.measured.elsewhere import STARTS, hollows, resized
 from nfc_gym.measured.fisher import Lens
-from nfc_gym.measured.fit import Fit, stand
+from nfc_gym.measured.fit import Fit, differs, stand
 from nfc_gym.measured.halved import step_error
 from nfc_gym.measured.identify import table
 from nfc_gym.measured.kept import pack_state, unpack_state
@@ -38,6 +38,7 @@ from nfc_gym.measured.outcome import report, summary, write
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.questions import Present, blocks_for
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.report import render_summary
 from nfc_gym.measured.search import Found, Options, Search, State
 from nfc_gym.measured.settle import settle, slack
@@ -255,6 +256,7 @@ def _fold(
     return outcome
 
 
+_NOTHING = 0.5  # of the chance that an effect without size would seem smaller: a median one of these is no effect
 _TOLD = ("generic", "nearest", "dropped", "doubted", "misshapen")  # of `Found`, kept as it is
 
 
@@ -324,8 +326,22 @@ def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit, Array]:
         # What psi alone went to is another place for the same psi to begin.
         psi = calibrated.fitted.x[: len(last.plant.space)]
         extended = _settled(run, "extended", last, whole, (np.concatenate([psi, last.x[len(psi) :]]),))
+        if gone := [e for e in last.plant.effects if not differs(extended.fitted, clusters(whole), e, _NOTHING)]:
+            why = f"dropped {', '.join(e.id for e in gone)}: on all segments together its size comes to nothing"
+            run.say(why)
+            found.rounds.insert(len(found.rounds) - 1, Round([], 0.0, reason=why))  # the last one found nothing more
+            rest = _without(extended.fitted, gone)
+            extended = _settled(run, "extended, less", rest, whole) if rest.plant.effects else calibrated
     unsure = np.hypot(step_error(whole, extended.under, extended.fitted), extended.unsure)
     return calibrated.fitted, extended.fitted, unsure
+
+
+def _without(fitted: Fit, gone: Sequence[Effect]) -> Fit:
+    """A model less some of its effects, the other parameters as they were; to begin a fit from."""
+    psi, thetas = fitted.plant.split(fitted.x)
+    pairs = [(e, t) for e, t in zip(fitted.plant.effects, thetas, strict=True) if not any(e is g for g in gone)]
+    plant = fitted.plant.with_effects([e for e, _ in pairs])
+    return replace(fitted, plant=plant, x=np.concatenate([psi, *(t for _, t in pairs)]))
 
 
 @dataclass(frozen=True)
@@ -345,6 +361,8 @@ def _settled(
     if run.stages.get(stage) is None:
         run.say(f"fitting the {name} model on all {len(whole)} segments")
         fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
+        if not whole.rough and (other := resized(whole, under, fitted)) is not fitted:
+            fitted, under, extra = settle(whole, whole.covariance(plant, other.x), plant, other.x)
         if run.bench.short:
             tick = lambda k: run.say(f"fitting the {name} model over drawn starts, turn {k} of {marginal.TURNS}")  # noqa: E731
             ended = marginal.marginal(whole, under, fitted, run.seed, tick)

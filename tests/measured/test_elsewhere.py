@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nfc_gym.measured import elsewhere
 from nfc_gym.measured.box import box
-from nfc_gym.measured.elsewhere import hollows
+from nfc_gym.measured.elsewhere import hollows, resized
 from nfc_gym.measured.fit import Fit, jacobian
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.problem import Columns, Problem
@@ -98,3 +99,25 @@ def test_fits_that_end_in_one_hollow_are_not_compared_and_soon_suffice() -> None
     assert begun == [1, 2]
     assert found.x == pytest.approx(-1.0, abs=0.02)
     assert found.unsure < 0.02
+
+
+@pytest.mark.parametrize(("tilt", "end"), [(0.1, -1.0), (-0.1, -1.0), (0.0, 1.0)])
+def test_an_effects_other_sizes_are_tried_and_kept_where_they_end_lower(
+    monkeypatch: pytest.MonkeyPatch, tilt: float, end: float
+) -> None:
+    """A delay that is found a period too short sits in a hollow of its own; of two alike the one at hand stays."""
+    problem = Wells(tilt, rough=False)
+    param, shape = SimpleNamespace(shape=False, probes=(-0.7, 0.6)), SimpleNamespace(shape=True, probes=(5.0,))
+    plant: Any = SimpleNamespace(space=(), effects=(SimpleNamespace(params=(param, shape)),))
+    under = metric(problem, problem.covariance(plant, np.zeros(2)))
+
+    def stand(problem: Any, under: Any, plant: Any, x: np.ndarray, rounds: int = 0) -> Fit:
+        """The bottom of the hollow that x is in."""
+        x = np.array([np.sign(x[0]), x[1]])
+        return Fit(plant, x, under.whiten(problem.residual(plant, x[None]))[0], np.zeros((len(problem), 2, 0)))
+
+    monkeypatch.setattr(elsewhere, "fit", stand)
+    found = stand(problem, under, plant, np.array([1.0, 3.0]))
+    assert resized(problem, under, found).x.tolist() == [end, 3.0]
+    bare = Fit(SimpleNamespace(space=(), effects=()), found.x, found.white, found.jacobian)  # type: ignore[arg-type]
+    assert resized(problem, under, bare) is bare

@@ -138,6 +138,20 @@ def test_the_hidden_friction_is_found_and_sized(closed: Closed) -> None:
     assert report["effects"][0]["share_of_excess"] > 0.9
 
 
+def test_an_effect_that_comes_to_nothing_on_all_logs_is_dropped(
+    closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it gained when it was chosen; here the last test is made to say so."""
+    monkeypatch.setattr("nfc_gym.measured.loop.differs", lambda fitted, blocks, effect, level: False)
+    report = close_loop(closed.mapping, tmp_path / "out", seed=3, jobs=1)
+    assert report["effects"] == []
+    assert report["proposals"] == []
+    assert report["chi2"]["extended"] == report["chi2"]["calibrated"]
+    assert any(r["reason"].startswith("dropped coulomb:hinge: on all segments") for r in report["rounds"])
+    assert report["verdict"] == "unexplained"
+    assert yaml.safe_load((tmp_path / "out" / "effects.yaml").read_text())["effects"] == []
+
+
 def test_the_report_has_the_promised_keys(closed: Closed) -> None:
     report = closed.on_disk()
     assert same(report, closed.report)
