@@ -72,10 +72,13 @@ class Design:
 
     # ---- search -----------------------------------------------------------------------------------------------------
 
-    def families(self, rng: np.random.Generator, draws: int = _DRAWS, until: float = np.inf) -> list["Tried"]:
+    def families(
+        self, rng: np.random.Generator, draws: int = _DRAWS, until: float = np.inf, most: int | None = None
+    ) -> list["Tried"]:
         """Every family of motion, drawn so many times, as large as bounds allow; best first.
 
         Args:
+          most: of all of them together, if that is fewer.
           until: `time.monotonic()` from which on what was found is enough.
 
         Raises:
@@ -87,7 +90,7 @@ class Design:
             for f in FAMILIES
             for pattern in (patterns[k % len(patterns)] for k in range(draws))
             if len(pattern) > 1 or not f.takes_turns
-        ]
+        ][:most]
         out: list[Tried] = []
         for i in range(0, len(drawn), _BATCH):
             if out and time.monotonic() > until:
@@ -120,8 +123,8 @@ class Design:
           tick: called with the number tried and the best value so far.
         """
         began = time.monotonic()
-        best = self.families(rng, until=began + _FIRST * budget)[0]
-        done = _DRAWS * len(FAMILIES)
+        best = self.families(rng, until=began + _FIRST * budget, most=tries)[0]
+        done = min(_DRAWS * len(FAMILIES), tries)
         tick(done, best.value)
         start = best
         series = Series(start.series, start.pattern, self.stage.time)

@@ -88,7 +88,10 @@ def excite(
     task, report = _task(bench, fit, seconds, seed, say)
     stage = task.design.stage
     if not stage.open_loop:
-        say("the resting command alone does not keep this machine up: proposing a feed-forward to its controller's")
+        say(
+            "under the resting command alone the simulated machine leaves what was recorded: proposing what to add to "
+            "the commands of a recorded run, its controller's if it has one"
+        )
     last = [0.0]
 
     def tick(done: int, best: float) -> None:
