@@ -112,7 +112,9 @@ class LogColumns:
             try:
                 float(value)
             except (TypeError, ValueError):
-                raise InputError(f"column {name!r} is not numeric: row {row} holds {str(value)[:40]!r}") from None
+                comma = re.fullmatch(r"\s*[-+]?\d+,\d+\s*", str(value))
+                hint = "; save it with decimal points" if comma else ""
+                raise InputError(f"column {name!r} is not numeric: row {row} holds {str(value)[:40]!r}{hint}") from None
         return values.astype(np.float64)
 
     def _rows(self, name: str) -> Array:
@@ -133,8 +135,8 @@ def finite(values: Array, what: str, needed: NDArray[np.bool_] | None = None) ->
         row = int(np.flatnonzero(bad)[0])
         raise InputError(
             f"{what}: {int(bad.sum())} of {len(bad)} rows {'are' if bad.sum() > 1 else 'is'} NaN or infinite, "
-            f"the first row {row}; cut the log there, or, for a measured channel, name a `mask` column that is false "
-            "in those rows"
+            f"the first row {row}; cut the log there, or, if it is measured and no command, name a `mask` column that "
+            "is false in those rows"
         )
     return plausible(values, what)
 

@@ -52,15 +52,17 @@ def _of_column(name: str, unit: str, columns: LogColumns) -> Array:
     time = units.to_si(raw - raw[0], unit)
     step = np.diff(time)
     back = np.flatnonzero(step <= 0)
+    coarse = "or, if its stamps are rounded, save them whole or say `interval`, the seconds from row to row"
     if len(back) == len(step):
-        raise InputError(f"column {name!r} never increases; name the column that holds the time")
+        raise InputError(f"column {name!r} never increases; name the column that holds the time, {coarse}")
     if back.size:
         k = int(back[0])
         how = "stands still" if step[k] == 0 else "goes back"
         raise InputError(
             f"column {name!r} {how} at row {k + 1} ({time[k]:.6g} to {time[k + 1]:.6g} s, "
             f"{back.size} such row{'s' * (back.size > 1)}); "
-            "remove repeated rows, or cut the file there into two logs"
+            f"remove repeated rows, cut the file there into two logs, {coarse}"
+            + ("; or name the time of another topic" if name.startswith("/") else "")
         )
     longest = int(step.argmax())
     if step[longest] > LARGEST_GAP * np.median(step):

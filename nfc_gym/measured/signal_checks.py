@@ -12,7 +12,7 @@ from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
-from nfc_gym.measured.speed_checks import DEGREES, TURN, compare_rates, ratio, strangers
+from nfc_gym.measured.speed_checks import DEGREES, TURN, compare_rates, ratio, strangers, too_fast
 
 Array = NDArray[np.float64]
 
@@ -37,6 +37,7 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
             yield from _components(name, parsed.object, channel, model)
             yield from gravity(name, parsed.object, channel, model)
     yield from strangers(log)
+    yield from too_fast(log)
     yield from _twins(log)
 
 

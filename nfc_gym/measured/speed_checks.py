@@ -34,6 +34,7 @@ CLEAR = 0.95  # correlation with another motion's speed above which it is
 UNLIKE = 0.5  # correlation, at any offset of the clocks, below which a position follows no speed of its own
 LEAST = 100  # samples from which motions can be told from each other
 SHORTEST, FEWEST = 4, 8  # samples of the shortest stretch of motion; stretches of the longest, that a log must hold
+FASTEST = 100.0  # m/s, above which a length is more likely in another unit
 MOST = 0.2  # of the log, by which two clocks may differ
 PAUSE = 5.0  # sampling intervals; no motion is compared across longer pauses
 
@@ -172,6 +173,25 @@ def strangers(log: Log) -> Iterator[Suspicion]:
             continue
         advice = "name the columns of one and the same motion, or check the speed's frame"
         yield Suspicion("warning", f"channels.{motion.channel}", "stranger", message, advice)
+
+
+def too_fast(log: Log) -> Iterator[Suspicion]:
+    """Slides and bodies that move as nothing does that is measured so: a length in mm was declared as one in m."""
+    for name, channel in log.channels.items():
+        parsed = parse_channel(name)
+        if parsed.kind not in ("joint", "body") or channel.unit not in ("m", "m/s"):
+            continue
+        rows = _samples(log, channel)
+        if len(rows) < LEAST:
+            continue
+        values = channel.values.reshape(len(log), -1)[rows]
+        if channel.unit == "m":
+            values = moving_average(np.gradient(values, log.time[rows], axis=0), 9)[9:-9]
+        typical = float(np.quantile(np.linalg.norm(values, axis=-1), 0.9))
+        if typical > FASTEST:
+            message = f"it moves at {typical:.3g} m/s"
+            advice = "check its `unit` (is it in mm?), and that of time"
+            yield Suspicion("warning", f"channels.{name}", "fast", message, advice)
 
 
 def _alike(time: Array, of: _Motion, to: _Motion, offsets: bool = False) -> float | None:

@@ -75,6 +75,7 @@ def test_a_sound_data_set_has_no_findings(build: Build) -> None:
         (scale("qw", 2.0), ["body:base:quat", "norm", "unit quaternions"]),
         (rotate_quaternion, ["body:base:quat", "scalar order", "xyzw scalar last"]),
         (lambda t: t.update(q=np.array(["left"] * 400)), ["not numeric", "row 0", "'left'"]),
+        (lambda t: t.update(q=np.array(["0,25"] * 400)), ["row 0 holds '0,25'", "save it with decimal points"]),
         (lambda t: t.update(q=t["q"][:-1]), ["shape (399,)", "400 rows"]),
         (lambda t: t.update(q=np.stack([t["q"]] * 2, 1)), ["2 columns where 1 is wanted"]),
     ],
@@ -223,7 +224,9 @@ def test_a_wrong_time_does_not_hide_the_channels(build: Build) -> None:
 def test_the_message_about_time_is_whole(build: Build, tmp_path: Path, value: float) -> None:
     (found,) = check(build(change("t", slice(100, 101), value)))
     assert found.message.endswith(f"at row 100 (0.99 to {value:g} s, 1 such row)")
-    assert found.advice == "remove repeated rows, or cut the file there into two logs"
+    assert found.advice.startswith(
+        "remove repeated rows, cut the file there into two logs, or, if its stamps are rounded"
+    )
 
 
 @pytest.mark.parametrize(

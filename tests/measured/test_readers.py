@@ -96,6 +96,7 @@ def test_missing_files_folders_and_unknown_suffixes(tmp_path: Path) -> None:
         ("t,q\n", "no rows under the header"),
         ("t,q\n0,1,2\n1,2,3\n", "more fields than the header names"),
         ("t,q\n0,1\n1,2,3\n", "truncated or not a csv file"),
+        ("# made by a logger\n# on a Monday\nt,q\n0,1\n", "begins with a comment; the first line must be the columns'"),
     ],
 )
 def test_faulty_csv(tmp_path: Path, text: str, words: str) -> None:

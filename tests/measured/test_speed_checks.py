@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, Log
-from nfc_gym.measured.speed_checks import strangers
+from nfc_gym.measured.speed_checks import strangers, too_fast
 
 Array = NDArray[np.float64]
 T = np.arange(1500) / 100
@@ -134,3 +134,15 @@ def test_random_noisy_machines_raise_no_alarm(seed: int) -> None:
         positions.append(q + 0.1 * disturbed[0])
         speeds.append(v + disturbed[1])
     assert not [m for _, m in told(machine(positions, speeds)) if "that of" in m]
+
+
+def test_millimetres_as_metres_move_too_fast() -> None:
+    slow, fast = machine([QA], [VA], "m"), machine([1000 * QA], [1000 * VA], "m")
+    assert list(too_fast(slow)) == []
+    assert [(s.where, s.advice) for s in too_fast(fast)] == [
+        ("channels.joint:a:pos", "check its `unit` (is it in mm?), and that of time"),
+        ("channels.joint:a:vel", "check its `unit` (is it in mm?), and that of time"),
+    ]
+    still = machine([noise(0, 0.01)], [noise(1, 0.01)], "m")  # a coarse sensor of what stands is no motion
+    assert list(too_fast(still)) == []
+    assert list(too_fast(machine([1000 * QA], [1000 * VA], "rad"))) == [], "a rotor may"

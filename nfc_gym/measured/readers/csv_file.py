@@ -13,6 +13,7 @@ def read_csv(path: Path) -> Table:
     """Columns by their header; separated by commas, semicolons or tabs."""
     import pandas as pd
 
+    header_line = ""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = [line for line in itertools.islice(file, 3) if line.strip()]
@@ -28,8 +29,12 @@ def read_csv(path: Path) -> Table:
             )
         with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):  # rows longer than the header
             frame = pd.read_csv(path, sep=separator, encoding="utf-8-sig", skipinitialspace=True, index_col=False)
-    except pd.errors.ParserWarning:
+    except (pd.errors.ParserWarning, pd.errors.ParserError) as e:
+        if header_line.lstrip().startswith(("#", "//", "%")):
+            raise InputError(f"{path}: begins with a comment; the first line must be the columns' names") from None
+        if isinstance(e, pd.errors.ParserError):
+            raise broken(path, e) from None
         raise InputError(f"{path}: rows have more fields than the header names; give every column a name") from None
-    except (UnicodeDecodeError, csv.Error, pd.errors.ParserError, pd.errors.EmptyDataError) as e:
+    except (UnicodeDecodeError, csv.Error, pd.errors.EmptyDataError) as e:
         raise broken(path, e) from None
     return {str(name).strip(): frame[name].to_numpy() for name in frame.columns}
