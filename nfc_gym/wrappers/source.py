@@ -71,6 +71,6 @@ def _sampler(source: Any, part: str, who: str) -> Sampler:
         raise InputError(
             f"{who}: a source is a posterior with sample(n, rng), an array of numbers or a path, got {source!r}"
         ) from None
-    if not array.size:
-        raise InputError(f"{who}: the source is an empty array, {array.shape}; want one sample of {part} or more")
+    if array.ndim > 1 and not len(array):
+        raise InputError(f"{who}: the source holds no sample, {array.shape}; want one of {part} or more")
     return Fidelity(**{part: array})

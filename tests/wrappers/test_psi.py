@@ -10,6 +10,7 @@ from fakes import FakeEnv, Gaussian, NoModel, roll, same
 
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.wrappers import RandomizePsi, VectorRandomizePsi
+from nfc_gym.wrappers.source import Draws
 
 
 def test_a_drawn_mass_is_in_the_model_and_inertia_follows() -> None:
@@ -146,3 +147,26 @@ def test_an_environment_without_mujoco_is_refused() -> None:
         RandomizePsi(NoModel(), 1.0, ["cube"])
     with pytest.raises(InputError, match="mass"):
         RandomizePsi(FakeEnv(), np.array([-1.0]), ["cube"]).reset()
+
+
+def test_sources_that_give_no_samples_are_told() -> None:
+    class Arrays:
+        def sample(self, n, rng):
+            return np.zeros((n, 1))
+
+    class One:
+        def sample(self, n, rng):
+            return Fidelity(psi=np.ones((1, 1)))
+
+    with pytest.raises(InputError, match=r"the source holds no sample, \(0, 1\)"):
+        RandomizePsi(FakeEnv(), np.zeros((0, 1)), space=["cube"])
+    with pytest.raises(InputError, match=r"must return a Fidelity, such as Fidelity\(psi=array\), got ndarray"):
+        RandomizePsi(FakeEnv(), Arrays(), space=["cube"])
+    with pytest.raises(InputError, match="the source gave 1 samples of psi where 3 were asked for"):
+        Draws(One(), "psi", "RandomizePsi").draw(3, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("wrong", [{"name": "m"}, {"name": "m", "field": "body_mass", "of": "cube", "size": 3}])
+def test_a_table_that_is_no_parameter_is_told(wrong) -> None:
+    with pytest.raises(InputError, match="is no parameter: want a table of name, field, of"):
+        RandomizePsi(FakeEnv(), 0.5, space=[wrong])
