@@ -168,5 +168,5 @@ def test_sources_that_give_no_samples_are_told() -> None:
 
 @pytest.mark.parametrize("wrong", [{"name": "m"}, {"name": "m", "field": "body_mass", "of": "cube", "size": 3}])
 def test_a_table_that_is_no_parameter_is_told(wrong) -> None:
-    with pytest.raises(InputError, match="is no parameter: want a table of name, field, of"):
+    with pytest.raises(InputError, match="is no parameter: want a table of name, field, and perhaps of, unit"):
         RandomizePsi(FakeEnv(), 0.5, space=[wrong])
