@@ -109,8 +109,10 @@ def resized(problem: Problem, metric: Metric, found: Fit) -> Fit:
         return found
     with np.errstate(invalid="ignore", over="ignore"):
         tried = loss(metric.whiten(problem.residual(found.plant, np.stack(tries)))).sum(-1)
-    best = int(np.argmin(np.where(np.isfinite(tried), tried, np.inf)))
-    again = fit(problem, metric, found.plant, tries[best], _ROUNDS)
+    tried = np.where(np.isfinite(tried), tried, np.inf)  # some sizes are more than the simulation bears
+    if np.isinf(tried).all():
+        return found
+    again = fit(problem, metric, found.plant, tries[int(tried.argmin())], _ROUNDS)
     return again if again.losses.sum() < found.losses.sum() - _DEEPER else found
 
 

@@ -119,5 +119,7 @@ def test_an_effects_other_sizes_are_tried_and_kept_where_they_end_lower(
     monkeypatch.setattr(elsewhere, "fit", stand)
     found = stand(problem, under, plant, np.array([1.0, 3.0]))
     assert resized(problem, under, found).x.tolist() == [end, 3.0]
+    monkeypatch.setattr(Wells, "residual", lambda self, plant, x: np.full((len(x), len(self), 2), np.nan))
+    assert resized(problem, under, found) is found, "no size that was tried is simulated to its end"
     bare = Fit(SimpleNamespace(space=(), effects=()), found.x, found.white, found.jacobian)  # type: ignore[arg-type]
     assert resized(problem, under, bare) is bare
