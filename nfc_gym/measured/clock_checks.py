@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 AGREE = 0.8  # correlation from which on two signals are taken for the same motion
 SURE = 4.0  # standard deviations, with which an offset is not zero
 SHARE = 0.25  # of a sampling interval: a smaller offset is none to speak of
+COARSE = 1.0  # the same of a motion that the samples do not resolve: what happens between two of them looks like one
+RESOLVED = 0.7  # change from sample to sample over the speed's own spread, below which they do
 MOST = 2.0  # s, or a fifth of the log where that is less
 FEWEST = 16  # samples of a channel from which motion can be told
 LONGEST = 10_000  # samples of a channel that are compared
@@ -50,7 +52,8 @@ def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log], shifts: Map
             offset = clock_offset(time, travel, other, rate, min(MOST, 0.2 * log.duration))
             if offset is not None and offset.correlation > AGREE and offset.sd > 0:
                 coarsest = max(float(np.median(np.diff(t))) for t in (time, other))
-                found.setdefault((position, speed), []).append((log.name, offset, coarsest))
+                least = coarsest * (SHARE if _resolved(rate) else COARSE)
+                found.setdefault((position, speed), []).append((log.name, offset, least))
     for (position, speed), offsets in found.items():
         yield from _told(position, speed, offsets, shifts)
 
@@ -58,12 +61,16 @@ def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log], shifts: Map
 def _told(
     position: str, speed: str, offsets: list[tuple[str, Offset, float]], shifts: Mapping[str, float]
 ) -> Iterator[Finding]:
-    """The weighted mean over logs, its deviation widened where they scatter by more than their own."""
+    """The weighted mean over logs, its deviation widened where they scatter by more than their own.
+
+    Args:
+      offsets: of each log its name, the offset, and s below which an offset is none to speak of.
+    """
     each, sd = (np.array([getattr(o, key) for _, o, _ in offsets]) for key in ("seconds", "sd"))
     mean = float((each / sd**2).sum() / (1 / sd**2).sum())
     spread = ((each - mean) ** 2 / sd**2).sum() / max(len(each) - 1, 1)
     deviation = float(np.sqrt(max(spread, 1.0) / (1 / sd**2).sum()))
-    if abs(mean) < max(SURE * deviation, SHARE * float(np.median([c for _, _, c in offsets]))):
+    if abs(mean) < max(SURE * deviation, float(np.median([least for *_, least in offsets]))):
         return
     late, early = (speed, position) if mean > 0 else (position, speed)
     size = 1e3 * abs(mean)
@@ -79,6 +86,11 @@ def _told(
         f"or let the loop weigh sensor_delay:{late}"
     )
     yield Finding("warning", f"channels.{late}", message, advice)
+
+
+def _resolved(rate: Array) -> bool:
+    """Whether a speed, (T, k), goes over from sample to sample; one that jumps is another between them."""
+    return bool(np.diff(rate, axis=0).std() < RESOLVED * rate.std(0).mean())
 
 
 def _pairs(model: mujoco.MjModel | None, log: Log) -> Iterator[tuple[str, str, Array, Array]]:

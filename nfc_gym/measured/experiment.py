@@ -17,7 +17,7 @@ from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.envelope import Envelope, envelope
 from nfc_gym.measured.motions import patterns
 from nfc_gym.measured.room import room
-from nfc_gym.measured.segments import resample, servos
+from nfc_gym.measured.segments import commanded, servos
 from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import actuator_names
@@ -102,7 +102,7 @@ class Stage:
         for i, name in enumerate(self.room.names):
             a = actuator_names(model).index(name.removeprefix("ctrl:"))
             for row in range(count):
-                ctrl[row, :, a] = resample(self.time, commands[row, :, i], at, laws[name].hold == "linear")
+                ctrl[row, :, a] = commanded(self.time, commands[row, :, i], at, dt, laws[name].hold == "linear")
         bound = servos(model, {k: (c.servo.joint, c.servo.limit) for k, c in laws.items() if c.servo is not None})
         hold = lambda v: np.full((count, len(at)), float(np.median(v)))  # noqa: E731
         known = {}

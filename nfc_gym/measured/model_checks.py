@@ -18,6 +18,7 @@ from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.parameters import COMPOUND, ParameterSpace, resolve, split_field
 
 _OBJ = mujoco.mjtObj
+_EFFORTS = ("N m", "N", "A", "V", "K", "Pa")  # what drives that are no servos are commanded by
 MOST_STEPS = 100_000  # of a segment with its history; usual are a hundred
 
 
@@ -30,6 +31,7 @@ def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]
         "actuator": names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nu),
     }
     yield from _controls(mapping, names)
+    yield from _command_units(mapping, model)
     for name, channel in mapping.channels.items():
         where, parsed = f"channels.{name}", parse_channel(name)
         absent = _absent(where, "actuator" if parsed.kind == "force" else parsed.kind, parsed.object, names)
@@ -87,6 +89,31 @@ def _controls(mapping: Mapping, names: dict[str, list[str]]) -> Iterator[Finding
         )
 
 
+def _command_units(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
+    """Commands in units that their actuators do not take: a servo wants its goal, a motor no place and no speed."""
+    for name, control in mapping.controls.items():
+        a = mujoco.mj_name2id(model, _OBJ.mjOBJ_ACTUATOR, name.removeprefix("ctrl:"))
+        unit = si_unit(control.unit or "1")
+        if a < 0 or control.servo is not None or unit == "1":
+            continue
+        if int(model.actuator_trntype[a]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+            continue
+        slides = int(model.jnt_type[model.actuator_trnid[a, 0]]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+        _, stiff, damped = model.actuator_biasprm[a, :3]
+        way = "m" if slides else "rad"
+        if stiff:
+            kind, wanted = "a position servo", (way,)
+        elif damped:
+            kind, wanted = "a velocity servo", (f"{way}/s",)
+        else:
+            kind, wanted = "no servo", _EFFORTS
+        if unit not in wanted:
+            message = f"the actuator is {kind} of a joint that {'slides' if slides else 'turns'}, but the unit is"
+            yield Finding(
+                "warning", f"controls.{name}", f"{message} {unit!r}", f"want {', '.join(wanted)}; or 1 for none"
+            )
+
+
 def _absent(where: str, kind: str, name: str, names: dict[str, list[str]]) -> Finding | None:
     if name in names[kind]:
         return None
@@ -126,9 +153,10 @@ def _steps(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
         message = f"{segments.length:g} s and {segments.history:g} s of history are {count:.3g} steps of {step:g} s"
         advice = f"want at most {MOST_STEPS}: lengthen segments.timestep or the model's, or shorten the segments"
         yield Finding("error", "segments", message, advice)
-    if segments.mode == "rollout" and step > segments.length:
-        message = f"one step of {step:g} s is longer than a segment of {segments.length:g} s"
-        yield Finding("error", "segments", message, "give a shorter segments.timestep, or mend the model's")
+    if segments.mode == "rollout" and step > segments.horizons[0]:
+        message = f"one step of {step:g} s is longer than the shortest horizon, {segments.horizons[0]:g} s"
+        advice = "give a shorter segments.timestep, mend the model's, or lengthen segments.length"
+        yield Finding("error", "segments", message, advice)
 
 
 def _unused(mapping: Mapping) -> Iterator[Finding]:

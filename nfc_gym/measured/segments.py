@@ -1,5 +1,6 @@
 """Cutting logs into segments: starts, commands on the grid of physics steps, and where the samples fall on it."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,6 +17,10 @@ from nfc_gym.physics.segments import Segments, Servo
 
 Array = NDArray[np.float64]
 _LEAD = 200  # steps that a log's commands before the history are thinned to
+_STEP, _SHARE = 8.0, 0.02  # times its usual change from row to row, and of its range, from which a command steps
+_AROUND = 3  # rows on either side of a start from which its state is estimated
+_SETTLED = 0.05  # s after a step in which late drives may still pass it on
+_PUT_OFF = 0.5  # of a stride, at most, by which a start is put off
 
 
 @dataclass(frozen=True)
@@ -54,8 +59,43 @@ class Cut:
     step: Array
 
 
+def stepped(log: Log) -> NDArray[np.bool_]:
+    """(T,) rows at which a command steps: changes by much more than it usually does from one row to the next."""
+    out = np.zeros(len(log), bool)
+    for values in log.controls.values():
+        change, range_ = np.abs(np.diff(values)), np.ptp(values)
+        out[1:] |= change > max(_STEP * float(np.median(change)), _SHARE * float(range_))
+    return out
+
+
+def _calm(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(T,) rows whose state may be estimated from the rows around; and of these the ones that late drives suit too.
+
+    Where a command steps so does the acceleration, and a smooth curve through the rows on both sides has a wrong slope
+    there: always to the side of the command, as if a gain, an inertia or an offset were off.
+    """
+    rows, settled = np.flatnonzero(stepped(log)), round(_SETTLED / log.interval)
+    out = np.ones((2, len(log)), bool)
+    for k, before in enumerate((0, settled)):
+        for row in rows:
+            out[k, max(row - _AROUND + 1, 0) : row + _AROUND + before] = False
+    return out[0], out[1]
+
+
+def _put_off(log: Log, row: int, calm: tuple[NDArray[np.bool_], NDArray[np.bool_]], until: float) -> int:
+    """The first calm row from a row on whose time is no later than `until`; the row itself where none is."""
+    end = int(np.searchsorted(log.time, until + 1e-9, side="right"))
+    for each in reversed(calm):
+        found = np.flatnonzero(each[row:end])
+        if len(found):
+            return row + int(found[0])
+    return row
+
+
 def cut(logs: Sequence[Log], layout: Layout) -> Cut:
     """Place segments end to end in every log that is long enough; each holds a sample beside its start.
+
+    A start near which a command steps is put off to where its state can be told, and those behind it with it.
 
     Raises:
       InputError: no log holds even one segment.
@@ -63,10 +103,17 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
     which, starts, samples, steps = [], [], [], []
     for i, log in enumerate(logs):
         last = log.time[-1] - max(layout.horizons) + 0.5 * log.interval
-        for begin in np.arange(0.0, max(last, 0.0) + 1e-9, layout.stride) if last >= 0 else ():
+        calm, late = _calm(log), 0.0
+        for count in itertools.count():
+            begin = count * layout.stride + late
+            if begin > last + 1e-9:
+                break
             s = int(np.searchsorted(log.time, begin - 1e-9))
             if s >= len(log) - 1:  # the half interval that a log may be too short by reaches past its samples
                 continue
+            until = min(log.time[s] + _PUT_OFF * layout.stride, last)
+            later = _put_off(log, s, calm, until)
+            late, s = late + float(log.time[later] - log.time[s]), later
             near = np.abs(log.time[:, None] - (log.time[s] + np.array(layout.horizons))).argmin(0)
             if near.max() <= s:  # no sample lies as far after the start as any horizon
                 continue
@@ -93,6 +140,29 @@ def resample(time: Array, values: Array, at: Array, linear: bool) -> Array:
     if linear:
         return np.interp(at, time, values)
     return values[np.clip(np.searchsorted(time, at + 1e-9, side="right") - 1, 0, len(time) - 1)]
+
+
+def commanded(time: Array, values: Array, at: Array, dt: float, linear: bool) -> Array:
+    """A command (T,) in physics steps of dt that begin at other times: interpolated, or what is held, on average.
+
+    Where it changes within a step the step gets the mean, not all of the old value: a step of 4 ms under commands every
+    10 ms would otherwise pass on every other command 2 ms late, which looks like a lag of the machine.
+    """
+    held = resample(time, values, at, linear)
+    first, last = (np.searchsorted(time, t, side="right") for t in (at + 1e-9, at + dt - 1e-9))
+    changed = np.flatnonzero(last > first) if not linear else first[:0]
+    if not len(changed):
+        return held
+    out, begin = held.astype(float), at[changed]
+    out[changed] = (_integral(time, values, begin + dt) - _integral(time, values, begin)) / dt
+    return out
+
+
+def _integral(time: Array, values: Array, at: Array) -> Array:
+    """Of a held signal from the first sample to other times; the first value holds before it."""
+    total = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(time))])
+    beyond = values[-1] * np.maximum(at - time[-1], 0) + values[0] * np.minimum(at - time[0], 0)
+    return np.interp(at, time, total) + beyond
 
 
 def servos(model: mujoco.MjModel, laws: Mapping[str, tuple[str, float]]) -> dict[str, Servo]:
@@ -133,10 +203,18 @@ def lay(
             ]
         )
 
+    def given(key: str) -> Array:
+        return np.stack(
+            [
+                commanded(logs[i].time, logs[i].controls[key], t + offsets, layout.dt, key in linear)
+                for i, t in zip(where.log, starts, strict=True)
+            ]
+        )
+
     ctrl = np.zeros((len(where.log), len(offsets), model.nu))
     for key in logs[0].controls:
         a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, key.removeprefix("ctrl:"))
-        ctrl[:, :, a] = lane("controls", key, key in linear)
+        ctrl[:, :, a] = given(key)
     known = {}
     for key in logs[0].known:
         name, _, of = key.rpartition(":")

@@ -12,7 +12,7 @@ from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
-from nfc_gym.measured.speed_checks import DEGREES, TURN, compare_rates, ratio, strangers, too_fast
+from nfc_gym.measured.speed_checks import DEGREES, TURN, compare_rates, follows, ratio, strangers, too_fast
 
 Array = NDArray[np.float64]
 
@@ -156,12 +156,13 @@ def _angle(name: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Suspic
     if speed is not None and speed.values.shape == values.shape:
         found = list(compare_rates(where, log, values, speed.values))
         yield from found
-        if found:
+        if found or follows(log, values, speed.values):
             return
     for command in _position_commands(joint, log, model):
         farther = ratio(command, values)
         for factor, what in ((DEGREES, "the angle is in degrees"), (1 / DEGREES, "the command is in degrees")):
-            if farther is not None and farther > 0 and abs(np.log(farther / factor)) < 0.35:
+            near = 0.35 if np.abs(command).max() < MANY_TURNS else 0.7  # no joint is told to turn so far
+            if farther is not None and farther > 0 and abs(np.log(farther / factor)) < near:
                 message = f"moves {farther:.3g} times as far as it is commanded: {what} where radians are declared"
                 yield Suspicion("error", where, "degrees", message, "say `unit: deg`")
                 return
@@ -182,9 +183,23 @@ def _too_far(where: str, joint: str, values: Array, model: mujoco.MjModel | None
                 "error", where, "degrees", message, "say `unit: deg`, or correct the joint's range in the model"
             )
             return
-    if far > MANY_TURNS and np.abs(values[-1] - values[0]) < 0.5 * np.abs(np.diff(values)).sum():
+    if (
+        far > MANY_TURNS
+        and not _turns(joint, model)
+        and np.abs(values[-1] - values[0]) < 0.5 * np.abs(np.diff(values)).sum()
+    ):
         message = f"reaches {far:.4g} rad, {far / (2 * np.pi):.0f} turns, and comes back: degrees for radians?"
         yield Suspicion("warning", where, "degrees", message, "say `unit: deg` if so")
+
+
+def _turns(joint: str, model: mujoco.MjModel | None) -> bool:
+    """Whether a servo commands the joint's speed, as it does a wheel's."""
+    if model is None:
+        return False
+    servo = (model.actuator_biasprm[:, 1] == 0) & (model.actuator_biasprm[:, 2] != 0)
+    j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+    moved = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)) & (model.actuator_trnid[:, 0] == j)
+    return j >= 0 and bool((servo & moved).any())
 
 
 def _position_commands(joint: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Array]:

@@ -25,6 +25,7 @@ _RATIOS = {
     np.pi / 30: "the speed is in rpm where rad/s is declared",
     -1.0: "position and speed have opposite signs",
 }
+_SAME = 0.7, 1.4  # derivative over measured speed, between which nothing is to be explained
 _NEAR = 0.25  # a ratio's logarithm may differ so much from that of what explains it
 _CLOCKS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # units of time -> s
 
@@ -107,10 +108,16 @@ def _rate_ratio(log: Log, position: Array, speed: Array) -> float | None:
     return ratio(moving_average(speed, n)[n:-n], moving_average(derived, n)[n:-n])
 
 
+def follows(log: Log, position: Array, speed: Array) -> bool:
+    """Whether a position, (T,), moves as its measured speed says, in unit and sign."""
+    found = _rate_ratio(log, position, speed)
+    return found is not None and _SAME[0] < found < _SAME[1]
+
+
 def compare_rates(where: str, log: Log, position: Array, speed: Array) -> Iterator[Suspicion]:
     """A position's derivative against the measured speed, (T,) in rad and rad/s."""
     found = _rate_ratio(log, position, speed)
-    if found is None or 0.7 < found < 1.4:
+    if found is None or _SAME[0] < found < _SAME[1]:
         return
     for factor, what in _RATIOS.items():
         if found * factor > 0 and abs(np.log(found / factor)) < _NEAR:

@@ -183,7 +183,15 @@ def headline(report: dict[str, Any]) -> str:
     lacks = f"Missing from the model: {listed([what(e) for e in effects], 4)}"
     if word == "partly explained":
         return f"{lacks}; and something more that no known effect is shown to be{at}."
-    return f"{lacks}. With {'it' if len(effects) == 1 else 'them'} added, what remains is no more than noise."
+    return f"{lacks}. With {'it' if len(effects) == 1 else 'them'} added, what remains is {_noise(report)}."
+
+
+def _noise(report: dict[str, Any]) -> str:
+    """What is left, where nothing more is missing: a tenth above what noise leaves is not worth a word of its own."""
+    chi2 = report.get("chi2") or {}
+    after, bound = (finite(chi2.get(key)) for key in ("extended", "null_95"))
+    above = after is not None and bound is not None and after > bound
+    return "hardly more than noise" if above else "no more than noise"
 
 
 def ahead(horizon: float | None) -> str:
@@ -276,6 +284,16 @@ def rivals_of(effect: dict[str, Any], effects: Sequence[dict[str, Any]]) -> list
     return [i for i in effect.get("equivalents") or [] if i not in claimed]
 
 
+def undecided(rivals: Sequence[str], effect: dict[str, Any], report: dict[str, Any]) -> str:
+    """That the contest left an effect's rivals standing; and where they lie far enough apart to be told, that too."""
+    text = f"explains these logs no better than {listed(list(rivals), 4)}"
+    for row in report.get("identifiability") or []:
+        sigma, rival = finite(row.get("sigma")), row.get("worst_mimic")
+        if row.get("id") == effect.get("id") and rival in rivals and row.get("distinguishable") and sigma:
+            text += f", though {rival} should lie {number(sigma, 2)} sigma away: a longer record would tell"
+    return text
+
+
 def _on_effects(report: dict[str, Any]) -> list[str]:
     effects = report.get("effects") or []
     if not effects:
@@ -283,7 +301,7 @@ def _on_effects(report: dict[str, Any]) -> list[str]:
     out = []
     for e in effects:
         if rivals := rivals_of(e, effects):
-            out.append(f"{e.get('id')} cannot be told from {listed(rivals, 4)} with these logs.")
+            out.append(f"{e.get('id')} {undecided(rivals, e, report)}.")
         share = finite(e.get("share_of_excess"))
         if share is not None and share < _SLIGHT:
             part = f"takes away {percent(share)} of the excess error on the verification logs"

@@ -1,5 +1,6 @@
 """Each way to spoil a data set is found, named, and comes with advice; an unspoilt one passes without a word."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,48 @@ def test_a_mapping_that_does_not_fit_model_or_logs(build: Build, edit: tuple[str
     found = "\n".join(errors(build(None, edit)))
     for word in words:
         assert word in found
+
+
+@pytest.mark.parametrize(
+    ("actuator", "unit", "wanted"),
+    [
+        ('position name="servo" joint="hinge" kp="1"', "N m", "want rad"),
+        ('velocity name="servo" joint="hinge" kv="1"', "rad", "want rad/s"),
+        ('motor name="servo" joint="hinge"', "rad/s", "want N m, N"),
+        ('motor name="servo" joint="hinge"', "N m", ""),
+        ('motor name="servo" joint="hinge"', "1", ""),
+    ],
+)
+def test_a_command_in_a_unit_that_its_actuator_does_not_take(
+    build: Build, machine: str, actuator: str, unit: str, wanted: str
+) -> None:
+    model = re.sub(r'<position name="servo"[^>]*/>', f'<{actuator} ctrlrange="-2.5 2.5"/>', machine)
+    assert actuator in model
+    found = check(build(None, ("{column: goal, unit: rad}", f"{{column: goal, unit: {unit}}}"), model=model))
+    told = "\n".join(str(f) for f in found if f.where == "controls.ctrl:servo" and "unit" in f.message)
+    assert wanted in told
+    assert bool(told) == bool(wanted)
+
+
+def test_a_models_step_longer_than_the_shortest_horizon(build: Build, machine: str) -> None:
+    """As of one that is given in the mapping."""
+    slow = machine.replace("<mujoco", "<mujoco", 1)
+    slow = re.sub(r"(<mujoco[^>]*>)", r'\1<option timestep="0.2"/>', slow, count=1)
+    found = "\n".join(errors(build(model=slow)))
+    assert "one step of 0.2 s is longer than the shortest horizon, 0.05 s" in found
+
+
+def test_goals_of_many_turns_are_in_degrees(build: Build) -> None:
+    """Though a soft joint does not follow them by all of the way."""
+
+    def soft(table: dict[str, np.ndarray]) -> None:
+        table["goal"] = np.rad2deg(table["goal"])
+        table["q"] = 0.6 * table["q"]
+
+    found = "\n".join(
+        str(f) for f in check(build(soft, ('  "joint:hinge:vel": {column: v, unit: rad/s, noise: 0.01}\n', "")))
+    )
+    assert "the command is in degrees" in found
 
 
 def test_a_model_that_does_not_compile(build: Build) -> None:

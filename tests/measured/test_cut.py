@@ -1,10 +1,12 @@
 """Where segments begin and what they are compared at: within the log, at a sample beside the start."""
 
+import mujoco
 import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, InputError, Log
-from nfc_gym.measured.segments import Layout, cut
+from nfc_gym.measured.segments import Layout, commanded, cut
+from nfc_gym.measured.states import estimate_states
 
 LAYOUT = Layout(0.4, 0.0, (0.05, 0.1, 0.2, 0.4), 0.4, 0.005)
 
@@ -45,3 +47,55 @@ def test_every_segment_holds_a_sample_beside_its_start(interval: float, jitter: 
 def test_segments_follow_each_other_to_the_end() -> None:
     np.testing.assert_array_equal(cut([log(0.01, 121)], LAYOUT).start, [0, 40, 80])
     np.testing.assert_array_equal(cut([log(0.01, 120)], LAYOUT).start, [0, 40])
+
+
+def stepping(interval: float = 0.01, rows: int = 240, every: float = 0.4, until: float = np.inf) -> Log:
+    time = interval * np.arange(rows)
+    goal = np.where(time < until, np.floor(time / every + 1e-9) % 2, 0.0)
+    return Log("run", time, {"ctrl:motor": goal}, {"joint:hinge:pos": Channel(np.sin(time), "rad")})
+
+
+def test_no_start_lies_beside_a_step_of_a_command() -> None:
+    """With steps at every start of the grid, and with a few."""
+    for one in (stepping(), stepping(every=0.33), stepping(until=0.81)):
+        steps = np.flatnonzero(np.diff(one.controls["ctrl:motor"])) + 1
+        where = cut([one], LAYOUT)
+        assert len(steps) >= 2
+        assert np.abs(where.start[:, None] - steps).min() >= 3
+        assert (np.diff(one.time[where.start]) >= LAYOUT.stride - 1e-9).all()
+        assert len(where.start) >= 4
+        np.testing.assert_allclose(where.step * LAYOUT.dt, np.tile(LAYOUT.horizons, (len(where.start), 1)))
+
+
+def test_starts_stay_where_every_row_is_beside_a_step() -> None:
+    busy = stepping(every=0.02)
+    np.testing.assert_array_equal(cut([busy], LAYOUT).start, cut([log(0.01, 240)], LAYOUT).start)
+
+
+def test_a_step_of_the_physics_gets_the_mean_of_its_commands() -> None:
+    """What is commanded every 10 ms, in steps of 4 ms: none of it is late."""
+    time = 0.01 * np.arange(5)
+    values = np.array([0.0, 1.0, -1.0, 3.0, 2.0])
+    at = 0.004 * np.arange(-1, 13)
+    got = commanded(time, values, at, 0.004, linear=False)
+    np.testing.assert_allclose(got, [0, 0, 0, 0.5, 1, 1, -1, -1, 1, 3, 3, 2, 2, 2], atol=1e-12)
+    dividing = 0.002 * np.arange(25)  # to the bit
+    np.testing.assert_array_equal(commanded(time, values, dividing, 0.002, linear=False), np.repeat(values, 5))
+    np.testing.assert_allclose(commanded(time, values, np.array([0.015]), 0.004, linear=True), [0.0], atol=1e-12)
+
+
+def test_speeds_at_starts_do_not_lean_to_the_command() -> None:
+    """Of a mass that a stepping force moves to and fro: a curve through both sides of a step is wrong by the force."""
+    time = 0.01 * np.arange(400)
+    force = np.where(np.floor(time / 0.4 + 1e-9) % 2 == 0, 20.0, -20.0)
+    v = np.concatenate([[0.0], np.cumsum(force[:-1] * 0.01)])
+    x = np.concatenate([[0.0], np.cumsum(v[:-1] * 0.01 + 0.5 * force[:-1] * 0.01**2)])
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="rail" type="slide"/><geom size="0.1"/></body></worldbody>'
+        '<actuator><motor name="motor" joint="rail"/></actuator></mujoco>'
+    )
+    one = Log("run", time, {"ctrl:motor": force}, {"joint:rail:pos": Channel(x, "m", noise=1e-4)})
+    states = estimate_states(model, one)
+    off = np.abs(states.qvel[:, 0] - v)
+    assert off[40:361:40].min() > 0.05  # m/s, at the steps
+    assert off[cut([one], LAYOUT).start[1:]].max() < 1e-6

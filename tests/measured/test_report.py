@@ -249,7 +249,7 @@ def test_warnings_name_what_they_are_about() -> None:
         "matters little",
     ):
         assert words in said
-    assert "told from stribeck:hinge with" in said  # the lag is claimed beside it, hence no rival
+    assert "no better than stribeck:hinge." in said  # the lag is claimed beside it, hence no rival
     for words in ("joint:hinge:vel was not declared", "joint speed gets worse"):
         assert words in said
     assert "true values may lie far outside" not in said  # nothing is missing any more

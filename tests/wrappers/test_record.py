@@ -319,3 +319,16 @@ def test_other_ground_needs_another_folder(tmp_path: Path) -> None:
     for _ in range(2):
         with pytest.raises(InputError, match="terrain_id"):
             env.reset(options={"terrain_id": 1})
+
+
+def test_wheels_that_turn_and_jump_are_no_doubt(tmp_path: Path) -> None:
+    """A rover's wheels turn many times to and fro, and their speeds are others between two samples."""
+    env = RecordLog(gym.make("nfc_gym/JackalFlat-v0", max_episode_steps=160), tmp_path)
+    rng = np.random.default_rng(0)
+    for episode in range(3):
+        env.reset(seed=episode)
+        for command in rng.uniform(-1, 1, (8, 2)).astype(np.float32):
+            for _ in range(20):
+                env.step(command)
+    env.close()
+    assert [str(f) for f in check(tmp_path / "mapping.yaml") if f.severity != "note"] == []
