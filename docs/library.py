@@ -68,16 +68,17 @@ from the code (`python docs/library.py`), and [effects.md](effects.md) says how 
 As a row, as `ApplyEffects` takes it and `effects.yaml` holds it:
 
 ```yaml
-{family: coulomb, where: shoulder, parameters: {level: 0.2}}   # N m; where: a name of the model, or a list of names
+{family: coulomb, where: shoulder, parameters: {level: 0.2}}   # N m; where: a name, a list of names, or all
 ```
 
 ## All families
 - **where**: what the names in `where` are names of. In the plural one or several, which then have the values in
-  common.
-- **parameters**: name, unit, and the family's own bounds; a run sets others, to fit your machine. An effect vanishes
-  where its parameters are 0, or at the null that is named. A *shape* parameter has no null: it says what the effect
-  is like, and the others say how much of it there is. What is *of the day* may differ between the `condition`s of the
-  logs. *Own unit* is that of the place: of an actuator's command, of a channel, of a joint's force.
+  common. `all` stands for every one that the family applies to, unless something in the model is called so.
+- **parameters**: name, unit, and the family's own bounds of a fit; a run sets others, to fit your machine. A value that
+  you give may lie beyond them: anywhere where they begin below 0, else from 0 on, or as is *given*; a *share* ends
+  at 1. An effect vanishes where its parameters are 0, or at the null that is named. A *shape* parameter has no null: it
+  says what the effect is like, and the others say how much of it there is. What is *of the day* may differ between the
+  `condition`s of the logs. *Own unit* is that of the place: of an actuator's command, of a channel, of a joint's force.
 - **kept in**: where a run writes what it found. `model.xml` carries what MJCF can say, and what it carries needs no
   wrapper: plain MuJoCo simulates it. `effects.yaml` lists the others. Both are named where it depends: a delay
   shorter than a physics step, a lag of an actuator that has an activation already, or soil that resists wheels
@@ -242,6 +243,9 @@ def _told(names: Sequence[str], unit: str, p: Param) -> str:
     listed = f"`{names[0]}` … `{names[-1]}`" if numbered else ", ".join(f"`{n}`" for n in names)
     notes = [unit] if unit != "1" else []
     notes.append(f"{_number(p.low)} to {_number(p.high)}")
+    notes += ["*share*"] if p.natural else []
+    if p.floor is not None:
+        notes.append("*given*: any" if p.floor == -np.inf else f"*given*: more than {_number(p.floor)}")
     notes += [f"null {_number(p.null)}"] if p.null and not p.shape else []
     notes += ["*shape*"] if p.shape else []
     notes += ["*of the day*"] if p.ambient else []
@@ -254,7 +258,7 @@ def _variant(family: type[Effect], effects: Sequence[Effect]) -> str:
     alike: dict[tuple[object, ...], tuple[list[str], str, Param]] = {}
     for i, p in enumerate(family.declare(names)):
         unit = _unit(e.params[i].unit for e in effects)
-        key = unit, p.low, p.high, p.null, p.shape, p.ambient
+        key = unit, p.low, p.high, p.null, p.shape, p.ambient, p.floor, p.natural
         alike.setdefault(key, ([], unit, p))[0].append(p.name)
     return ", ".join(_told(*told) for told in alike.values())
 
@@ -296,7 +300,8 @@ def rows(generic: bool) -> list[str]:
         if not own:
             raise RuntimeError(f"{family.family} has no place in the model above: add what it sits on")
         place, numbers, file = names.places(own), parameters(family, own), kept(own, made, model)
-        lines.append(f"| `{family.family}` | {family.summary} | {place} | {numbers} | {file} |")
+        what = f"{family.summary} ({family.remark})" if family.remark else family.summary
+        lines.append(f"| `{family.family}` | {what} | {place} | {numbers} | {file} |")
     return lines
 
 
