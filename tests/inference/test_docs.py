@@ -38,5 +38,5 @@ def test_train_then_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     few = programs[3].replace("given)", "given, draws=2)").replace("rate=0.01", "rate=0.05")
     exec(few.replace("other_actions)", "other_actions, rate=0.1)"), names)
     assert names["detector"].threshold is not None
-    assert {p.name for p in tmp_path.iterdir()} == {"run", "jackal.safetensors", "today.safetensors"}
+    assert {p.name for p in tmp_path.iterdir()} == {"run", "jackal_posterior.safetensors", "today.safetensors"}
     env.close()
