@@ -40,8 +40,9 @@ from timing import Table
 from nfc_gym.adaptation import pretrain
 from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.sight import VectorSight
-from nfc_gym.adaptation.worlds import full_id, vector_env
+from nfc_gym.adaptation.worlds import vector_env
 from nfc_gym.core.errors import InputError
+from nfc_gym.simulate.machine import full_id
 
 EPISODES = 64
 PLAIN = "Plain-v0"  # the id that the reference is given: an environment that shows one vector

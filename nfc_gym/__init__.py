@@ -1,12 +1,29 @@
-"""nfc_gym: find what a MuJoCo model of a robot lacks from logs of the real machine, and put it there.
+"""nfc_gym: simulated robots, what their simulator lacks of the real machine, and policies that cope with it.
 
-Importing this package needs the core dependencies alone: neither torch nor a plotting or table library is loaded.
+Environments: `import nfc_gym`, then `gymnasium.make("nfc_gym/JackalFlat-v0")` or `gymnasium.make_vec`: Ant, Humanoid,
+Quadruped, Quadcopter and Jackal, on Flat and on Rough ground. What is believed of their physics and of the terrain is
+part of what they observe.
+
+Wrappers (`nfc_gym.wrappers`): effects, drawn or inferred physics, terrain, noisy signals, alarms and logs, around these
+and any other MuJoCo environment.
+
+Logs (`nfc_gym.measured`): from logs of the real machine, calibrate a MuJoCo model, find which effect it lacks, put it
+there, and say what to record next.
+
+Posteriors (`nfc_gym.simulate`, `nfc_gym.inference`): networks that infer the physics from a window of motion, and
+detectors of what is not normal, trained on simulations.
+
+Policies (`nfc_gym.adaptation`): pretrain by PPO under random physics, adapt to what was found, on a mission or from
+logs. One comes with the package for each environment.
 """
+
+# Importing this package needs the core dependencies alone: neither torch nor a plotting or table library is loaded.
 
 from pathlib import Path
 
 from nfc_gym.core import (
     Channel,
+    Fidelity,
     InputError,
     Log,
     MissingExtra,
@@ -32,4 +49,4 @@ def _open_posterior(path: Path) -> Sampler:
 
 register_loader(".safetensors", _open_posterior)  # wherever a source may be a path, it may be a posterior
 
-__all__ = ["Channel", "InputError", "Log", "MissingExtra", "NfcError", "__version__"]
+__all__ = ["Channel", "Fidelity", "InputError", "Log", "MissingExtra", "NfcError", "__version__"]

@@ -14,11 +14,12 @@ from nfc_gym.adaptation.ppo import Diverged
 from nfc_gym.adaptation.pretraining import RECIPES, SPREAD
 from nfc_gym.adaptation.record import Record, in_words
 from nfc_gym.adaptation.sight import VectorSight
-from nfc_gym.adaptation.worlds import full_id, training_env, vector_env
+from nfc_gym.adaptation.worlds import training_env, vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable
 from nfc_gym.inference.jobs import device_of
 from nfc_gym.inference.random import mixed
+from nfc_gym.simulate.machine import full_id
 
 from .agent import Agent
 from .collecting import sizes_of

@@ -3,10 +3,9 @@
 Needs the extra `rl`. Importing this package loads neither torch nor TorchRL; its names do.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from nfc_gym.core import MissingExtra
+from nfc_gym.core.lazy import export
 
 if TYPE_CHECKING:
     from nfc_gym.adaptation.afterwards import LearnConfig, Learned, learn_from_mission
@@ -40,11 +39,4 @@ __all__ = [
     "hand_over", "learn_from_mission", "load_policy", "ppo_agent", "pretrain", "sac_agent",
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
-        return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-    except ModuleNotFoundError as e:
-        raise MissingExtra(f"nfc_gym.adaptation needs {e.name}: pip install 'nfc_gym[rl]'") from None
+export(__name__, _HOME, "rl")

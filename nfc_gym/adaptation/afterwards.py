@@ -30,7 +30,6 @@ from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.normal import Normal, quiet_trajectories
 from nfc_gym.adaptation.relearning import relearned
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
-from nfc_gym.adaptation.worlds import full_id
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_whole
 from nfc_gym.inference import detector_file
@@ -42,7 +41,7 @@ from nfc_gym.inference.posterior import NeuralPosterior, load
 from nfc_gym.inference.progress import Spoken, quiet
 from nfc_gym.inference.rates import Threshold
 from nfc_gym.inference.train import TrainConfig
-from nfc_gym.simulate.machine import MOTOR
+from nfc_gym.simulate.machine import MOTOR, full_id
 
 Array = NDArray[np.float64]
 REPORT, STATE = "learned.json", "state.safetensors"

@@ -162,8 +162,42 @@ class Agent:
         return action.clamp(-1, 1).cpu().numpy()
 
     def action_size(self) -> int:
-        """k, from one call."""
-        return int(self(np.zeros(self.sight.size, np.float32)).shape[-1])
+        """k, from one call.
+
+        Raises:
+          InputError: the actor wants more than `observation`, or its action is no continuous vector.
+        """
+        more = [repr(k) for k in getattr(self.actor, "in_keys", ()) if k != "observation"]
+        if more:
+            raise InputError(
+                f"agent: the actor wants {', '.join(more)}, and all that it is shown is 'observation': a recurrent "
+                "one, whose memory somebody must keep, will not do"
+            )
+        shown = TensorDict({"observation": torch.zeros(self.sight.size, device=self.device)})
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            step = self.actor(shown)
+        action = step["action"]
+        if _discrete(self.actor, step) or not action.is_floating_point() or action.ndim != 1:
+            raise InputError(
+                "agent: actions must be a continuous vector, such as of a TanhNormal; the actor gives "
+                f"{action.dtype} of shape {tuple(action.shape)} by its {_named(self.actor)}"
+            )
+        return len(action)
+
+
+def _discrete(actor: Actor, step: TensorDictBase) -> bool:
+    """Whether a step's distribution is over a choice of some, as far as it says so."""
+    try:
+        support: Any = actor.get_dist(step).support
+        return bool(support.is_discrete)
+    except (AttributeError, NotImplementedError, TypeError):  # TorchRL's TanhNormal calls its own constraint
+        return False
+
+
+def _named(actor: Actor) -> str:
+    """What draws an actor's actions."""
+    last: Any = actor[-1] if hasattr(actor, "__getitem__") else actor
+    return getattr(last, "distribution_class", type(last)).__name__
 
 
 def ppo_agent(policy: Policy, config: PPOConfig | None = None) -> Agent:

@@ -19,7 +19,7 @@ from torch import nn
 
 from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.agent import Agent
-from nfc_gym.adaptation.beliefs import Inference, inference_of, width
+from nfc_gym.adaptation.beliefs import Inference, inference_of, require_width, width
 from nfc_gym.adaptation.choice import Choice, weights_of
 from nfc_gym.adaptation.earned import RATE, chance, require_home
 from nfc_gym.adaptation.evaluate import evaluate
@@ -31,11 +31,11 @@ from nfc_gym.adaptation.optimise import optimise, pi_h_for
 from nfc_gym.adaptation.record import Record, in_words
 from nfc_gym.adaptation.sight import Sight, VectorSight
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute
-from nfc_gym.adaptation.worlds import full_id
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
 from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.random import mixed
+from nfc_gym.simulate.machine import full_id
 from nfc_gym.wrappers.anomaly import opened
 
 STATE = "state.safetensors"
@@ -158,9 +158,8 @@ class _Run:
         self.settings, self.home = settings, home
         self.detector, self.threshold = opened(detector, threshold)
         self.inference = inference_of(posterior)
-        self.folder = None if folder is None else Path(folder)
-        if self.folder is not None and self.folder.exists() and not self.folder.is_dir():
-            raise InputError(f"adapt: {self.folder} is a file; `folder` is where trajectories and state are kept")
+        require_width(posterior, world.unwrapped.psi_space)
+        self.folder = None if folder is None else _made(Path(folder))
         self.record = Record(None if self.folder is None else self.folder / "log", console)
         self.pi_h: Gaussian | None = None
         self.past = [copy.deepcopy(weights_of(agent))]  # what was deployed
@@ -181,8 +180,9 @@ class _Run:
         """One episode in the world, watched by the detector."""
         seed = mixed(self.config.seed, self.t) % 2**31
         tau = execute(self.agent, self.world, self.detector, self.threshold, seed)
+        top = float(tau.scores.max())  # over the threshold, where that is a measure of it
         self.now = {"return": tau.total, "length": len(tau), "reached": tau.reached,
-                    "score": float(tau.scores.max()) / self.threshold}  # fmt: skip
+                    "score": top / self.threshold if self.threshold > 0 else top}  # fmt: skip
         if self.home is not None:
             self.now["chance"] = chance(self.home, [*(row["return"] for row in self.history), tau.total])
             if self.now["chance"] < RATE and not tau.anomalous:
@@ -193,8 +193,7 @@ class _Run:
     def infer(self, tau: Trajectory) -> Sampler:
         """What the trajectory tells about psi and residual fidelity."""
         self.belief = belief = self.inference.infer(tau)
-        space = self.world.unwrapped.psi_space
-        self.now["width"] = width(belief, space.low, space.high)
+        self.now["width"] = width(belief, self.world.unwrapped.psi_space)
         return belief
 
     def hallucinate(self, belief: Sampler) -> VectorSight | RayWorlds:
@@ -316,12 +315,23 @@ class _Run:
         self.record.say(f"going on from mission {self.t} of {self.config.missions}")
 
 
+def _made(folder: Path) -> Path:
+    """The folder of a run, with its place for curves, made where it is not there yet."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"adapt: {folder} is a file; `folder` is where trajectories and state are kept")
+    try:
+        (folder / "log").mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise InputError(f"adapt: folder {folder} cannot be written ({e.strerror or e}); choose another one") from None
+    return folder
+
+
 def check_fit(agent: Agent, world: Any) -> None:
     """Refuse an agent that cannot act in a world.
 
     Raises:
       InputError: it is no agent, the world is a vector environment or none of this package's, of another robot, or has
-        another action; the agent's actor does not take what the world shows.
+        another action; the agent's actor does not take what the world shows, or wants more; its actions are discrete.
     """
     if not isinstance(agent, Agent):
         raise InputError(

@@ -20,6 +20,7 @@ from nfc_gym.inference.proposals import TRUNCATED, SequentialConfig
 from nfc_gym.inference.sequential import sequential
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig
+from nfc_gym.physics.parameters import ParameterSpace
 
 
 @runtime_checkable
@@ -142,7 +143,44 @@ def inference_of(posterior: Any) -> Inference:
     )
 
 
-def width(belief: Sampler, low: np.ndarray, high: np.ndarray) -> float:
-    """Mean standard deviation of a belief's psi over that of a uniform prior between bounds; nan without psi."""
-    psi = belief.sample(256, np.random.default_rng(0)).psi
-    return float("nan") if psi is None else float((psi.std(0) / ((high - low) / 12**0.5)).mean())
+def width(belief: Sampler, space: ParameterSpace) -> float:
+    """Mean standard deviation of a belief's psi over that of a uniform prior between a space's bounds; nan without psi.
+
+    Raises:
+      InputError: its psi is of another width.
+    """
+    psi = _psi(belief, 256, space)
+    return float("nan") if psi is None else float((psi.std(0) / ((space.high - space.low) / 12**0.5)).mean())
+
+
+def require_width(posterior: Any, space: ParameterSpace) -> None:
+    """Refuse what infers other parameters than a space's, where that shows before there is a trajectory.
+
+    Raises:
+      InputError: naming both widths.
+    """
+    posterior = getattr(posterior, "posterior", posterior)
+    if isinstance(posterior, NeuralPosterior):
+        _require(len(posterior.prior.low), space)
+    elif isinstance(posterior, Sampler):
+        _psi(posterior, 1, space)
+
+
+def _psi(belief: Sampler, n: int, space: ParameterSpace) -> np.ndarray | None:
+    """(n, d) draws of its psi; None where it says nothing of it."""
+    drawn = belief.sample(n, np.random.default_rng(0))
+    if not isinstance(drawn, Fidelity):
+        raise InputError(
+            f"adapt: the posterior's sample(n, rng) must return a Fidelity, such as Fidelity(psi=array), got "
+            f"{type(drawn).__name__}"
+        )
+    if drawn.psi is not None:
+        _require(drawn.psi.shape[-1], space)
+    return drawn.psi
+
+
+def _require(size: int, space: ParameterSpace) -> None:
+    if size != len(space):
+        raise InputError(
+            f"adapt: the posterior's psi has {size} entries, the world's {len(space)}: {', '.join(space.names)}"
+        )

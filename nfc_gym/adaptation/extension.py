@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from nfc_gym.adaptation.corrected import Fields, Parameters, model_like, value_in
 from nfc_gym.adaptation.extended import Calibrated, Found, Named
-from nfc_gym.adaptation.worlds import full_id, vector_env
+from nfc_gym.adaptation.worlds import vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.effects.conditions import Conditioned
-from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.machine import Machine, full_id
 from nfc_gym.wrappers import VectorApplyEffects, VectorRandomizePsi
 from nfc_gym.wrappers.effects import check_signals
 

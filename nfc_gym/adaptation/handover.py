@@ -31,11 +31,12 @@ from nfc_gym.adaptation.record import Record
 from nfc_gym.adaptation.returns import figure, from_plain, gain, to_plain
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.threads import limit_threads
-from nfc_gym.adaptation.worlds import full_id, vector_env
+from nfc_gym.adaptation.worlds import vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together, write_whole
 from nfc_gym.inference.jobs import device_of
 from nfc_gym.inference.random import mixed
+from nfc_gym.simulate.machine import full_id
 
 EPISODES = 100  # by which a policy is judged in each world
 POLICY, REPORT, PAGE, KEPT = "policy.safetensors", "report.json", "report.html", "judged.json"

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from nfc_gym.adaptation.policy import Policy, load_policy
-from nfc_gym.adaptation.worlds import full_id, robot_of
+from nfc_gym.adaptation.worlds import robot_of
 from nfc_gym.core.errors import InputError, MissingExtra
+from nfc_gym.simulate.machine import full_id
 
 VIDEOS, PICTURES = (".mp4", ".avi"), (".png", ".jpg", ".jpeg")
 _SHEET = (3, 4)  # rows and columns

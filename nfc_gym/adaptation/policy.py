@@ -16,10 +16,10 @@ from torchrl.modules import ProbabilisticActor
 from nfc_gym import __version__, assets
 from nfc_gym.adaptation.network import CLIP, ActorCritic, Sizes
 from nfc_gym.adaptation.sight import Sight
-from nfc_gym.adaptation.worlds import full_id
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
 from nfc_gym.inference.state import read, require_format
+from nfc_gym.simulate.machine import full_id
 from nfc_gym.simulate.policy import Perceptron
 
 FORMAT = "nfc_gym-policy-1"

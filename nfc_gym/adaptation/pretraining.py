@@ -30,11 +30,12 @@ from nfc_gym.adaptation.ppo import ONWARD, Diverged, OnPolicy, PPOConfig, clippe
 from nfc_gym.adaptation.record import Episodes, Record, in_words
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.threads import limit_threads
-from nfc_gym.adaptation.worlds import full_id, robot_of, training_env, vector_env
+from nfc_gym.adaptation.worlds import robot_of, training_env, vector_env
 from nfc_gym.core.errors import InputError, NfcError
 from nfc_gym.core.files import require_writable
 from nfc_gym.inference.jobs import device_of
 from nfc_gym.inference.random import mixed
+from nfc_gym.simulate.machine import full_id
 
 SAVE_EVERY = 20.0  # s between two states on disk
 _TOGETHER = 8192  # steps an iteration that few simulations make

@@ -14,6 +14,7 @@ from nfc_gym.core.files import replacing
 from nfc_gym.inference.posterior import Window
 from nfc_gym.inference.rates import Threshold, threshold_at
 from nfc_gym.terrain.egocentric import SIZE
+from nfc_gym.wrappers.anomaly import scored
 
 Array = NDArray[np.float64]
 LOOK = 25  # control steps from one map that is kept to the next: 1 m at 2 m/s, of 6.4 m to each side
@@ -154,6 +155,9 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
 
     An episode that ends by itself, its goal not reached, before the detector has scored anything is anomalous: who
     falls at once was never found to be normal.
+
+    Raises:
+      InputError: the observation lacks `proprio`; a score or a reward is no number.
     """
     observation, _ = world.reset(seed=seed)
     detector.reset()
@@ -167,9 +171,9 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
             looks.append(len(actions))
         action = np.asarray(policy(observation), np.float64)
         after, reward, ended, truncated, info = world.step(action)
-        scores.append(float(detector.update(observation, action, after)))
+        scores.append(float(scored(world, detector, observation, action, after)))
+        rewards.append(_reward(reward, len(actions)))
         actions.append(action)
-        rewards.append(float(reward))
         states.append(_proprio(after))
         estimate.append(_estimate(world))
         reached |= bool(info.get("success", False))
@@ -181,6 +185,14 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
         np.array(states), np.array(actions), np.array(rewards), np.array(scores), threshold, np.array(estimate),
         elevation, reached, bool(ended), np.array(maps, np.float32).reshape(-1, SIZE, SIZE), np.array(looks, np.intp),
     )  # fmt: skip
+
+
+def _reward(reward: Any, step: int) -> float:
+    """A step's; of one that is no number nothing could be learned, and no return be told."""
+    given = np.asarray(reward)
+    if given.shape or given.dtype.kind not in "fiub" or not np.isfinite(given):
+        raise InputError(f"adapt: the world's reward at step {step} is {reward!r}, want a finite number")
+    return float(given)
 
 
 def _proprio(observation: Any) -> Array:

@@ -13,7 +13,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import GymWrapper, default_info_dict_reader
 
 from nfc_gym.adaptation.sight import VectorSight
-from nfc_gym.core.errors import InputError
+from nfc_gym.simulate.machine import full_id
 from nfc_gym.wrappers import VectorRandomizePsi
 
 Wrap = Callable[[VectorEnv], VectorEnv]
@@ -67,16 +67,6 @@ def vector_env(name: str, n: int, *, threads: int = 0, episode: int | None = Non
     return gymnasium.make_vec(
         full, num_envs=n, context=["psi"], autoreset_mode="Disabled", nthread=threads, **more, **settings
     )
-
-
-def full_id(name: str) -> str:
-    """`JackalFlat` and the like -> `nfc_gym/JackalFlat-v0`; raises `InputError` where there is no such environment."""
-    full = name if name.startswith("nfc_gym/") else f"nfc_gym/{name}"
-    full = full if full.endswith("-v0") else f"{full}-v0"
-    if full not in gymnasium.registry:
-        known = sorted(k for k in gymnasium.registry if k.startswith("nfc_gym/"))
-        raise InputError(f"no environment {name!r}; there are: {', '.join(known)}")
-    return full
 
 
 def robot_of(environment: str) -> str:

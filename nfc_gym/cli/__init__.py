@@ -3,44 +3,56 @@
 Exit codes: 0 finished, whatever the verdict; 2 bad input; 3 interrupted, the same command resumes; 1 a fault of ours.
 """
 
+import inspect
 import io
 import sys
 from typing import Annotated
 
 import typer
 
-from nfc_gym import __version__
+import nfc_gym
 from nfc_gym.cli import measured, mission, policies, posteriors
 
+
+def flowing(text: str | None) -> str:
+    """A docstring as help shows it: the lines of a paragraph flow together, indented lines stay as they are."""
+    paragraphs = inspect.cleandoc(text or "").split("\n\n")
+    return "\n\n".join(p if p.startswith(" ") or "\n " in p else p.replace("\n", " ") for p in paragraphs)
+
+
 app = typer.Typer(
-    help="Find what a MuJoCo model lacks, from logs of the real machine, and put it there.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+    help=flowing(nfc_gym.__doc__), no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
 )
 
-# In the order of `nfc-gym --help`.
+# In the groups and the order of `nfc-gym --help`.
 COMMANDS = {
-    "check": measured.check,
-    "close-loop": measured.close_loop,
-    "predict": measured.predict,
-    "excite": measured.excite,
-    "simulate": posteriors.simulate,
-    "train": posteriors.train,
-    "infer": posteriors.infer,
-    "demo": measured.demo,
-    "pretrain": policies.pretrain,
-    "play": policies.play,
-    "adapt": policies.adapt,
-    "learn": mission.learn,
+    "Logs of a machine": {
+        "check": measured.check,
+        "close-loop": measured.close_loop,
+        "predict": measured.predict,
+        "excite": measured.excite,
+        "demo": measured.demo,
+    },
+    "Posteriors": {
+        "simulate": posteriors.simulate,
+        "train": posteriors.train,
+        "infer": posteriors.infer,
+        "learn": mission.learn,
+    },
+    "Policies": {
+        "pretrain": policies.pretrain,
+        "play": policies.play,
+        "adapt": policies.adapt,
+    },
 }
-for _name, _command in COMMANDS.items():
-    app.command(_name)(_command)
+for _group, _commands in COMMANDS.items():
+    for _name, _command in _commands.items():
+        app.command(_name, help=flowing(_command.__doc__), rich_help_panel=_group)(_command)
 
 
 def _say_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(__version__)
+        typer.echo(nfc_gym.__version__)
         raise typer.Exit
 
 

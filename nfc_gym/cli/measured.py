@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from nfc_gym.cli.outcome import BAD_INPUT, outcome, printable
-from nfc_gym.core import InputError
+from nfc_gym.cli.outcome import BAD_INPUT, outcome, printable, say_written
+from nfc_gym.core import InputError, kinds
 
 if TYPE_CHECKING:
     from nfc_gym.measured.checks import Finding
@@ -93,6 +93,7 @@ def close_loop(
 ) -> None:
     """Calibrate the model, find what it lacks, add it; report the error before and after on logs nobody fitted to."""
     with outcome(ctx, resumes=True):
+        kinds.require_kind(out, kinds.REPORT)
         from nfc_gym.measured.loop import close_loop as run
 
         if time_saved and posterior is None:
@@ -153,9 +154,23 @@ def predict(
             )
         if restart is not None and mode is not Mode.rollout:
             raise InputError(f"--restart goes with --mode rollout, not {mode.value}")
+        if out.is_file():
+            kinds.require_kind(out, kinds.ARRAYS)
+            _require_no_log(mapping, out)
         from nfc_gym.measured.predict import predict as run
 
-        run(mapping, fit, mode.value, stage.value, out, restart=restart)
+        found = run(mapping, fit, mode.value, stage.value, out, restart=restart)
+        logs = f"{len(found)} log{'s' * (len(found) != 1)}"
+        say_written(out, f"{mode.value} of {logs} by the {stage.value} model, an array each")
+
+
+def _require_no_log(mapping: Path, out: Path) -> None:
+    """Refuse to write over what was measured: by its content a log is no other kind than predictions or commands."""
+    from nfc_gym.measured.mapping import load_mapping
+    from nfc_gym.measured.splits import find_logs
+
+    if out.resolve() in {source.path.resolve() for source in find_logs(load_mapping(mapping), mapping.parent)}:
+        raise InputError(f"{out} is a log of {mapping}, and would be written over: choose another --out")
 
 
 def excite(
@@ -170,7 +185,9 @@ def excite(
     seconds: Annotated[float, typer.Option(metavar="S", help="Length of the proposed recording.")] = 10.0,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.csv", help="Commands; .json and .html go beside it. Default: excite.csv."),
+        typer.Option(
+            metavar="FILE.csv", help="Commands; .json and .html go beside it. Default: excite.csv beside the mapping."
+        ),
     ] = None,
     seed: Seed = 0,
     tries: Annotated[int, typer.Option(min=1, help="Motions to try in simulation, at most.")] = 250,
@@ -194,6 +211,8 @@ def excite(
     Example: nfc-gym excite mapping.yaml --fit result --out next.csv
     """
     with outcome(ctx):
+        if out is not None and overwrite and out.is_file():
+            _require_no_log(mapping, out)
         from nfc_gym.measured.excite import excite as run
 
         run(

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from nfc_gym.cli.outcome import outcome
-from nfc_gym.core import InputError
+from nfc_gym.core import InputError, kinds
 
 _MEASURES = {
     "false_alarms": "false alarms, share of normal windows",
@@ -83,6 +83,10 @@ def learn(
     with outcome(ctx, resumes=True):
         if posterior is None and detector is None:
             raise InputError("there is nothing to train: give --posterior FILE, --detector FILE or both")
+        folder = mission / "learned" if out is None else out
+        kinds.require_kind(folder, kinds.LEARNED)
+        kinds.require_kind(folder / "posterior.safetensors", kinds.POSTERIOR)
+        kinds.require_kind(folder / "detector.safetensors", kinds.DETECTOR)
         from dataclasses import replace
 
         from nfc_gym.adaptation import LearnConfig, learn_from_mission
@@ -96,9 +100,9 @@ def learn(
             normal=quiet_windows if normal is Normal.windows else quiet_trajectories,
             beside=None if beside is None else StoredWindows(Windows(beside)),
             config=replace(config, training=replace(config.training, epochs=epochs)),
-            folder=out, jobs=jobs, device=device, console=Console(stderr=True),
+            folder=folder, jobs=jobs, device=device, console=Console(stderr=True),
         )  # fmt: skip
-        _print_learned(learned.report, mission / "learned" if out is None else out)
+        _print_learned(learned.report, folder)
 
 
 def _print_learned(report: Mapping[str, Any], folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a command ends with: one clear message on stderr, and the exit code that goes with it."""
+"""What a command ends with: where its result is, or one clear message on stderr and the exit code for it."""
 
 import errno
 import signal
@@ -6,6 +6,7 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import NoReturn
 
 import typer
@@ -71,6 +72,11 @@ def _fail(ctx: typer.Context, code: int, message: str) -> NoReturn:
         console.print(traceback.format_exc(), markup=False)
     console.print(f"nfc-gym {ctx.info_name}: {printable(message)}", markup=False)
     raise typer.Exit(code)
+
+
+def say_written(path: Path, what: str) -> None:
+    """One line on stdout: where a result is, and what it is."""
+    typer.echo(printable(f"{path}: {what}"))
 
 
 def printable(text: str) -> str:

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from nfc_gym.cli.outcome import outcome
-from nfc_gym.core import InputError
+from nfc_gym.core import InputError, kinds
 
 Environment = Annotated[str, typer.Argument(metavar="ID", help="For instance nfc_gym/JackalFlat-v0, or JackalFlat.")]
 
@@ -59,6 +59,7 @@ def pretrain(
     Example: nfc-gym pretrain JackalFlat --steps 5000000 --out jackal.safetensors
     """
     with outcome(ctx, resumes=True):
+        kinds.require_kind(out, kinds.POLICY)
         from nfc_gym.adaptation import pretrain as run
 
         run(
@@ -146,6 +147,8 @@ def adapt(
     Example: nfc-gym adapt JackalFlat --effects result --out adapted
     """
     with outcome(ctx, resumes=True):
+        kinds.require_kind(out, kinds.ADAPTED)
+        kinds.require_kind(out / "policy.safetensors", kinds.POLICY)
         from nfc_gym.adaptation import FineTuneConfig, hand_over
 
         hand_over(

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from nfc_gym.cli.outcome import outcome
-from nfc_gym.core import InputError
+from nfc_gym.cli.outcome import outcome, say_written
+from nfc_gym.cli.policies import Environment
+from nfc_gym.core import InputError, kinds
 
 if TYPE_CHECKING:
     from nfc_gym.inference.posterior import Window
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def simulate(
     ctx: typer.Context,
-    environment: Annotated[str, typer.Argument(metavar="ID", help="For instance nfc_gym/JackalFlat-v0.")],
+    environment: Environment,
     windows: Annotated[int, typer.Option(metavar="N", min=1, help="How many windows.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for manifest.json and the shards.")],
     seed: Annotated[int, typer.Option(min=0, help="The same arguments and seed give the same bits.")] = 0,
@@ -59,9 +60,10 @@ def simulate(
     finished shards stay. DIR holds manifest.json, which says what every array is, and shard_00000.safetensors, ...;
     nfc_gym.inference.windows.Windows(DIR) reads them. A sequential round draws psi from --proposal.
 
-    Example: nfc-gym simulate nfc_gym/JackalFlat-v0 --windows 100000 --out windows/jackal
+    Example: nfc-gym simulate JackalFlat --windows 100000 --out windows/jackal
     """
     with outcome(ctx, resumes=True):
+        kinds.require_kind(out, kinds.WINDOWS)
         from nfc_gym.simulate import simulate as run
 
         mover = policy
@@ -118,6 +120,7 @@ def train(
     Example: nfc-gym train windows/jackal --out jackal.safetensors
     """
     with outcome(ctx, resumes=True):
+        kinds.require_kind(out, kinds.STRUCTURE if structure else kinds.POSTERIOR)
         from nfc_gym.core import MissingExtra
         from nfc_gym.inference.windows import Manifest
         from nfc_gym.simulate.machine import Machine
@@ -148,7 +151,7 @@ def train(
             said = f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
         else:
             said = "nothing that was learned held on the windows held out: simulate more of them"
-        typer.echo(f"{out}: {said} ({done.seconds:.0f} s)")
+        say_written(out, f"{said} ({done.seconds:.0f} s)")
 
 
 def infer(
@@ -196,13 +199,18 @@ def infer(
 
         mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
         seen = _window(posterior, window, log, until) if mapped else window
-        _, found = jobs.infer(posterior, seen, samples=samples, seed=seed, out=out)
+        drawn, found = jobs.infer(posterior, seen, samples=samples, seed=seed, out=out)
         table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
         for each in found:
             note = "  not shown" if each.width >= jobs.AS_WIDE else ""
             interval = f"{each.low:.4g} to {each.high:.4g}"
             table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
         Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 140).print(table)
+        if out is not None and out.suffix == ".npz":
+            parts = [part for part in ("psi", "delta_s") if getattr(drawn, part) is not None]
+            say_written(out, f"{samples} draws of {' and '.join(parts)}")
+        elif out is not None:
+            say_written(out, "the posterior given this window")
 
 
 def _window(posterior: Path, mapping: Path, log: str | None, until: float | None) -> "Window":

@@ -18,6 +18,9 @@ from nfc_gym.terrain.egocentric import SIZE
 
 OPTIONS = ("psi", "psi_belief", "heightfield", "perceived", "terrain_id", "terrain_residual")
 FLAT = Heightfield(np.zeros(SHAPE, np.float32))
+# MuJoCo's warnings of what `info["unstable"]` says. It prints and logs the first of each in a simulation alone: counted
+# as there already they stay off the user's terminal and folder, and handlers of the whole process as they are.
+UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 
 
 def robot_class(robot: str | type[Robot]) -> type[Robot]:
@@ -191,6 +194,21 @@ def seen_psi(space: ParameterSpace, psi: Array) -> NDArray[np.float32]:
 def rest_key(model: mujoco.MjModel) -> int:
     """Keyframe that simulations are reset to: `home`, or -1, the model's own state, where it has no keyframes."""
     return int(model.key("home").id) if model.nkey else -1
+
+
+def as_numbers(action: Any) -> Array:
+    """An action as a fresh array, of whatever shape.
+
+    Raises:
+      InputError: it is no array of numbers.
+    """
+    try:
+        given = np.asarray(action)
+        if given.dtype.kind not in "USc":
+            return np.array(given, np.float64)
+    except (TypeError, ValueError):
+        pass
+    raise InputError(f"action is {action!r}, want numbers in [-1, 1]")
 
 
 def wrong_action(action: NDArray, shape: tuple[int, ...]) -> InputError:

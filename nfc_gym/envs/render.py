@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 
 Camera = str | Mapping[str, Any]
+TRACK = "track"  # the camera of each robot's file
 
 
 def camera_of(model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
@@ -21,6 +22,9 @@ def camera_of(model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
       model: the scene.
       camera: a name, or {"lookat": (x, y, z) m, "distance": m, "azimuth": degrees, "elevation": degrees}, or
         {"trackbody": name, ...} to follow a body; what is left out is MuJoCo's default.
+
+    Raises:
+      InputError: there is no such camera, or no such setting of a free one.
     """
     view = mujoco.MjvCamera()
     if isinstance(camera, str):
@@ -30,6 +34,8 @@ def camera_of(model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
         view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(camera)
         return view
     known = ("lookat", "distance", "azimuth", "elevation", "trackbody")
+    if not isinstance(camera, Mapping):
+        raise InputError(f"camera is {camera!r}, want the name of one, or a free one's {', '.join(known)}")
     mujoco.mjv_defaultFreeCamera(model, view)
     for key, value in camera.items():
         if key not in known:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.envs.render import Camera, Pictures, Window, camera_of
+from nfc_gym.envs.render import TRACK, Camera, Pictures, Window, camera_of
 
 
 def warn_without_mode() -> None:
@@ -40,8 +40,8 @@ class Screen:
         self._window: Window | None = None
 
     def require_camera(self, model: mujoco.MjModel) -> None:
-        """Refuse a camera that the scene has not, where pictures are to be made at all."""
-        if self._mode is not None:
+        """Refuse a camera that the scene has not; of a robot that is not to be seen the default need not be there."""
+        if self._mode is not None or self.camera != TRACK:
             camera_of(model, self.camera)
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8] | None:

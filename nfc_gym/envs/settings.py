@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.whole import require_whole
-from nfc_gym.envs.render import Camera
+from nfc_gym.envs.render import TRACK, Camera
 from nfc_gym.envs.robot import GOAL_REWARDS, Robot
 from nfc_gym.envs.terrains import Pool
 
@@ -37,7 +37,7 @@ class Settings:
     kind: type[Robot] = field(repr=False)
     task: str | None = None
     goal_conditioned: bool = False
-    reward_type: str = "sparse"
+    reward_type: str = GOAL_REWARDS[0]
     context: Sequence[str] = CONTEXT
     elevation_hz: float | None = None
     difficulty: float = 0.5
@@ -46,7 +46,7 @@ class Settings:
     terrain_kind: str | None = None
     width: int = 640
     height: int = 480
-    camera: Camera = "track"
+    camera: Camera = TRACK
 
     @classmethod
     def of(cls, kind: type[Robot], given: dict[str, Any]) -> Self:
@@ -63,6 +63,8 @@ class Settings:
             raise InputError(f"{kind.name} has no task {self.task!r}; it has: {', '.join(kind.tasks)}")
         if self.reward_type not in GOAL_REWARDS:
             raise InputError(f"reward_type is {self.reward_type!r}, want one of: {', '.join(GOAL_REWARDS)}")
+        if self.reward_type != GOAL_REWARDS[0] and not self.goal_conditioned:
+            raise InputError(f"reward_type is {self.reward_type!r}, which wants goal_conditioned=True beside it")
         if self.goal_conditioned and not kind.place_size:
             raise InputError(f"goal_conditioned: the {kind.name} has no goals to reach")
         parts = () if isinstance(self.context, str) or not isinstance(self.context, Iterable) else self.context

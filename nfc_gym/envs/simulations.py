@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.envs import scene
 from nfc_gym.envs.batching import Ids, terrain_ids
-from nfc_gym.envs.contract import FLAT, psi_of, rest_key, seen_psi
+from nfc_gym.envs.contract import FLAT, UNSTABLE, psi_of, rest_key, seen_psi
 from nfc_gym.envs.forking import safe_to_fork
 from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.view import View
@@ -82,7 +82,7 @@ class Simulations:
             drawn = (u[:, 0] * len(self.maps)).astype(np.intp)
             self.chosen[ids] = terrain_ids(given.get("terrain_id", drawn), k, len(self.maps))
             self._dataid[ids] = self.chosen[ids]
-        self.batch.reset(ids, self.rest, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self.still(ids, mujoco.mjtStage.mjSTAGE_NONE)
         start = self.robot.begin(u[:, 1:], lambda xy: self.ground(xy, self.chosen[ids]))
         self.view.qpos[ids], self.view.qvel[ids] = start.qpos, start.qvel
         self.batch.forward(ids)
@@ -92,6 +92,11 @@ class Simulations:
             new = np.empty((self.n, *value.shape[1:]), value.dtype) if old is None else old.copy()
             new[ids] = value
             self.view.task[name] = new
+
+    def still(self, ids: Ids, stage: mujoco.mjtStage = mujoco.mjtStage.mjSTAGE_ACC) -> None:
+        """Put simulations back to rest, and compute stages of them."""
+        self.batch.reset(ids, self.rest, stage=stage.value)
+        self.batch.warning[ids[:, None], UNSTABLE, 1] = 1
 
     def _write_psi(self, ids: Ids, given: Mapping[str, Any]) -> None:
         shape = (len(ids),)

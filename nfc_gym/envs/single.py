@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from nfc_gym.envs import scene
 from nfc_gym.envs.contract import (
     FLAT,
+    UNSTABLE,
     Observer,
+    as_numbers,
     box,
     broken,
     checked_options,
@@ -168,10 +170,10 @@ class RobotEnv(gymnasium.Env):
           action: (action_size,); values outside [-1, 1] are clipped.
 
         Raises:
-          InputError: another shape, or an entry that is not finite, which the message names.
+          InputError: another shape, or an entry that is no finite number, which the message names.
           ResetNeeded: no episode was begun yet.
         """
-        action = np.array(action, np.float64)
+        action = as_numbers(action)
         values = action.tolist()  # a handful of numbers: looked at faster one by one than by numpy
         if action.shape != self._shape or not all(map(isfinite, values)):
             raise wrong_action(action, self._shape)
@@ -257,6 +259,7 @@ class RobotEnv(gymnasium.Env):
             mujoco.mj_resetData(self.model, self.data)
         else:
             mujoco.mj_resetDataKeyframe(self.model, self.data, self._home)
+        self.data.warning.number[UNSTABLE] = 1
 
     def _observation(self) -> Any:
         return self._observe(self._view, self._seen, self._elevation() if self._observe.elevation else None)
@@ -290,6 +293,7 @@ class RobotEnv(gymnasium.Env):
         self.fields.commit()
         if self.rough:
             scene.write(self.model, 0, self._terrain.heights)
+        self.data.warning.number[UNSTABLE] = 1
         mujoco.mj_setState(self.model, self.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION.value)
         mujoco.mj_forward(self.model, self.data)
         self._view.task, self._view.now, self._view.before = saved["view"]

@@ -22,6 +22,7 @@ from nfc_gym.envs import scene
 from nfc_gym.envs.batching import Ids, final_info, ids_of, masked, rows_of, seeds_of, vector_options
 from nfc_gym.envs.contract import (
     Observer,
+    as_numbers,
     box,
     broken,
     nothing_yet,
@@ -239,10 +240,10 @@ class RobotVectorEnv(VectorEnv):
           Fresh arrays: observations, rewards (n,) float64, terminations and truncations (n,) bool, infos.
 
         Raises:
-          InputError: another shape, or an entry that is not finite, which the message names.
+          InputError: another shape, or an entry that is no finite number, which the message names.
           ResetNeeded: an environment was not reset (after its episode, where autoreset is off).
         """
-        actions = np.asarray(actions, np.float64)
+        actions = as_numbers(actions)
         if actions.shape != self._limit.shape or not np.isfinite(actions).all():
             raise wrong_action(actions, self._limit.shape)
         resetting = self._waiting.copy() if self._waiting.any() else None
@@ -315,8 +316,7 @@ class RobotVectorEnv(VectorEnv):
             unstable &= active
         if not unstable.any():
             return None
-        ids = np.flatnonzero(unstable)
-        self.batch.reset(ids, self._sims.rest)
+        self._sims.still(np.flatnonzero(unstable))
         return unstable
 
     def _run(self, active: NDArray[np.bool_] | None) -> None:

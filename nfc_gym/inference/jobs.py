@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.files import replacing
@@ -60,10 +61,12 @@ def train_posterior(
       noise: what multiplies the sensor noise that the windows' manifest assumes, for sensors that are better or worse.
 
     Raises:
-      InputError: no such windows, windows without maps where the network needs them, or a name of another ending.
+      InputError: no such windows, windows without maps where the network needs them, a name of another ending, or
+        something else than a posterior is there.
     """
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: a posterior is kept in a file that ends in .safetensors")
+    kinds.require_kind(out, kinds.POSTERIOR)
     stored = Windows(folder, robot=prior.robot, psi_names=prior.names)
     if config.elevation and "map" not in stored.names:
         raise InputError(f"{folder}: the windows have no elevation maps; make them with `nfc-gym simulate ... --maps`")
@@ -131,10 +134,13 @@ def infer(
         this window; wrappers and `nfc-gym simulate --proposal` take either.
 
     Raises:
-      InputError: a damaged file, a window that is not the network's, or another ending.
+      InputError: a damaged file, a window that is not the network's, another ending, or something else than that is
+        at `out`.
     """
     if out is not None and out.suffix not in (".npz", ".safetensors"):
         raise InputError(f"{out}: draws are kept in .npz, the posterior given the window in .safetensors")
+    if out is not None:
+        kinds.require_kind(out, kinds.DRAWS if out.suffix == ".npz" else kinds.POSTERIOR)
     given = load(posterior).given(window if isinstance(window, Window) else read_window(window))
     parts = [p for p in given.network.parts if p != "delta_e"]
     drawn = given.of(*parts).sample(samples, np.random.default_rng(seed))

@@ -96,6 +96,7 @@ class Bench:
         states: Sequence[States],
         most: int | None = None,
         horizons: tuple[float, ...] | None = None,
+        put_off: bool = True,
     ) -> RolloutProblem:
         """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs.
 
@@ -103,8 +104,9 @@ class Bench:
 
         Args:
           horizons: s, at which segments that end at the last are compared; default as the mapping says.
+          put_off: see `Layout`.
         """
-        whole = self._rollouts(logs, states, horizons)
+        whole = self._rollouts(logs, states, horizons, put_off)
         whole.rough = whole.rough and self._touching
         if most is None or len(whole) <= most:
             return whole
@@ -118,14 +120,18 @@ class Bench:
         return every.touches(self.plant, self.plant.null)
 
     def _rollouts(
-        self, logs: Sequence[Log], states: Sequence[States], horizons: tuple[float, ...] | None = None
+        self,
+        logs: Sequence[Log],
+        states: Sequence[States],
+        horizons: tuple[float, ...] | None = None,
+        put_off: bool = True,
     ) -> RolloutProblem:
         segments, model = self.dataset.mapping.segments, self.plant.model
         length, horizons = (segments.length, segments.horizons) if horizons is None else (horizons[-1], horizons)
         controls = self.dataset.mapping.controls
         laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
         linear = frozenset(k for k, c in controls.items() if c.hold == "linear")
-        layout = Layout(length, segments.history, horizons, length, model.opt.timestep)
+        layout = Layout(length, segments.history, horizons, length, model.opt.timestep, put_off)
         return RolloutProblem(
             model, logs, states, layout, servos(model, laws), linear, settle=segments.start == "settled"
         )

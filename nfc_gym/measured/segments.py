@@ -33,6 +33,7 @@ class Layout:
       horizons: s after the start at which prediction and measurement are compared.
       stride: s between starts; the length where segments follow each other.
       dt: physics step, s.
+      put_off: whether a start waits until no command steps beside it; not where states are known and not estimated.
     """
 
     length: float
@@ -40,6 +41,7 @@ class Layout:
     horizons: tuple[float, ...]
     stride: float
     dt: float
+    put_off: bool = True
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,8 @@ def _put_off(log: Log, row: int, calm: tuple[NDArray[np.bool_], NDArray[np.bool_
 def cut(logs: Sequence[Log], layout: Layout) -> Cut:
     """Place segments end to end in every log that is long enough; each holds a sample beside its start.
 
-    A start near which a command steps is put off to where its state can be told, and those behind it with it.
+    A start near which a command steps is put off to where its state can be told (`Layout.put_off`), and those behind it
+    with it.
 
     Raises:
       InputError: no log holds even one segment.
@@ -111,9 +114,9 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
             s = int(np.searchsorted(log.time, begin - 1e-9))
             if s >= len(log) - 1:  # the half interval that a log may be too short by reaches past its samples
                 continue
-            until = min(log.time[s] + _PUT_OFF * layout.stride, last)
-            later = _put_off(log, s, calm, until)
-            late, s = late + float(log.time[later] - log.time[s]), later
+            if layout.put_off:
+                later = _put_off(log, s, calm, min(log.time[s] + _PUT_OFF * layout.stride, last))
+                late, s = late + float(log.time[later] - log.time[s]), later
             near = np.abs(log.time[:, None] - (log.time[s] + np.array(layout.horizons))).argmin(0)
             if near.max() <= s:  # no sample lies as far after the start as any horizon
                 continue

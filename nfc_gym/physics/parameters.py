@@ -23,13 +23,19 @@ Array = NDArray[np.float64]
 
 
 def numbers(value: Any, name: str) -> Array:
-    """A number, or numbers, as an array; anything else raises `InputError` with the value's name."""
+    """A number, or numbers, as an array; anything else raises `InputError` with the value's name.
+
+    A text that reads like a number is none, nor is a flag: whoever gives one has mistaken something.
+    """
     try:
-        return np.asarray(value, float)
+        given = np.asarray(value)
+        if given.dtype.kind not in "USbc":
+            return given.astype(float)
     except (TypeError, ValueError):
-        text = repr(value)
-        shown = text if len(text) <= 80 else f"{text[:77]}..."
-        raise InputError(f"{name} is {shown}, want a number or an array of numbers") from None
+        pass
+    text = repr(value)
+    shown = text if len(text) <= 80 else f"{text[:77]}..."
+    raise InputError(f"{name} is {shown}, want a number or an array of numbers")
 
 
 @dataclass(frozen=True)

@@ -67,11 +67,24 @@ MOTOR = 0.02
 TERRAINS = ("rough", "slopes", "steps", "mixed", "obstacles")  # kinds that windows are made on; Flat is a plane
 
 
+def full_id(name: str) -> str:
+    """`JackalFlat` and the like -> `nfc_gym/JackalFlat-v0`.
+
+    Raises:
+      InputError: this package has no such environment.
+    """
+    known = [f"nfc_gym/{robot}{ground}-v0" for robot in ROBOTS for ground in ("Flat", "Rough")]
+    full = f"nfc_gym/{name.removeprefix('nfc_gym:').removeprefix('nfc_gym/').removesuffix('-v0')}-v0"
+    if full not in known:
+        raise InputError(f"no environment {name!r} to simulate; there are: {', '.join(known)}")
+    return full
+
+
 class Machine:
     """A registered environment, as windows of it are made.
 
     Args:
-      environment: id, `nfc_gym/JackalFlat-v0`.
+      environment: id, `nfc_gym/JackalFlat-v0` or `JackalFlat`.
 
     Raises:
       InputError: no such id.
@@ -79,12 +92,8 @@ class Machine:
 
     def __init__(self, environment: str) -> None:
         register()
-        known = [f"nfc_gym/{robot}{ground}-v0" for robot in ROBOTS for ground in ("Flat", "Rough")]
-        name = environment.removeprefix("nfc_gym:")
-        if name not in known:
-            raise InputError(f"no environment {environment!r} to simulate; there are: {', '.join(known)}")
-        self.environment = name
-        self.kwargs: dict[str, Any] = dict(gymnasium.registry[name].kwargs)
+        self.environment = full_id(environment)
+        self.kwargs: dict[str, Any] = dict(gymnasium.registry[self.environment].kwargs)
         self.kind, self.rough = robot_class(self.kwargs["robot"]), bool(self.kwargs["rough"])
         self.settings = Settings.of(self.kind, {})
         self.habit = HABITS[self.kind.name]

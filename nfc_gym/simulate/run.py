@@ -47,7 +47,7 @@ def simulate(
     """Simulate windows, or go on where an earlier call with the same arguments was interrupted.
 
     Args:
-      environment: id, `nfc_gym/JackalFlat-v0`.
+      environment: id, `nfc_gym/JackalFlat-v0` or `JackalFlat`.
       windows: how many.
       out: folder for them.
       seed: the same arguments and seed give the same bits, whatever `jobs` and `ray` are.

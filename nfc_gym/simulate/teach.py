@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
@@ -54,10 +55,12 @@ def train_structure(
       report: is told of the progress.
 
     Raises:
-      InputError: windows on rough ground, without effects, or of a robot that feels forces.
+      InputError: windows on rough ground, without effects, or of a robot that feels forces; or something else than a
+        structure head is at `out`.
     """
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: a structure head is kept in a file that ends in .safetensors")
+    kinds.require_kind(out, kinds.STRUCTURE)
     stored = Windows(folder)
     about, machine = stored.manifest, Machine(stored.manifest.environment)
     require_unfeeling(machine)

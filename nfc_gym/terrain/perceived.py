@@ -77,6 +77,7 @@ class PerceivedMap:
         quat: ArrayLike,
         yaw: ArrayLike,
         time: ArrayLike,
+        mask: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.float32]:
         """The map as it is known at a time.
 
@@ -86,9 +87,11 @@ class PerceivedMap:
           quat: (4,) or (num, 4) true base orientations, w first.
           yaw: () or (num,) true headings [rad].
           time: () or (num,) [s], not decreasing from one reset to the next.
+          mask: (num,) which robots of a batch look, by default all; of the other arrays' entries the rest is not used.
 
         Returns:
-          (SIZE, SIZE) or (num, SIZE, SIZE) float32 [m], a fresh array, laid out as `elevation` has it.
+          (SIZE, SIZE) or (num, SIZE, SIZE) float32 [m], a fresh array, laid out as `elevation` has it; with a mask a
+          map for each robot that it names.
 
         Raises:
           InputError: before the first reset, time that runs backwards, shapes that do not fit, values not finite.
@@ -106,15 +109,19 @@ class PerceivedMap:
         fields = [heightfield] * count if isinstance(heightfield, Heightfield) else list(heightfield)
         if len(fields) != count:
             raise InputError(f"{len(fields)} heightfields for {count} robots; want one for all or one each")
-        maps = np.empty((count, SIZE, SIZE), np.float32)
+        chosen = np.ones(count, bool) if mask is None else np.asarray(mask, bool)
+        maps = np.empty((int(chosen.sum()), SIZE, SIZE), np.float32)
+        fresh = iter(maps)
         times = np.broadcast_to(np.asarray(time, np.float64), lead).reshape(count)
         poses = zip(base.reshape(-1, 3), turn.reshape(-1, 4), heading.reshape(-1), times, strict=True)
         for k, (place, quaternion, angle, now) in enumerate(poses):
+            if not chosen[k]:
+                continue
             robot, field = self._robots[k], fields[k]
             if robot is None:
                 raise InputError("update before reset: call reset(rng) first")
             robot.advance(field, place, quaternion, float(now))
-            self._valid[k] = robot.draw(field, place, float(angle), maps[k])
+            self._valid[k] = robot.draw(field, place, float(angle), next(fresh))
         return maps[0] if self.num is None else maps
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import load_source
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
-from nfc_gym.wrappers.rows import Rows
+from nfc_gym.wrappers.rows import Rows, with_rows
 
 
 @runtime_checkable
@@ -45,19 +45,41 @@ def opened(detector: Detector | str | os.PathLike[str], threshold: float | None)
     return found, float(limit)
 
 
-def scored(env: Any, detector: Detector, obs: Any, action: Any, next_obs: Any) -> Any:
-    """The detector's score of a transition, a number or (n,).
+def scored(
+    env: Any, detector: Detector, obs: Any, action: Any, next_obs: Any, counts: NDArray[np.bool_] | None = None
+) -> NDArray[np.float64]:
+    """The detector's score of a transition, (), or of those of a vector environment, (n,).
+
+    Args:
+      env: in which it was; errors look at it.
+      detector, obs, action, next_obs: see `Detector`.
+      counts: (n,) rows of a vector environment in which it is a transition; the others score 0, whatever is said.
 
     Raises:
-      InputError: it is NaN, which would pass for healthy; or the detector's own, which says so where goals are in the
-        way.
+      InputError: it is no number, or NaN, which would pass for healthy; there are more or less of them than
+        transitions; or the detector's own, which says so where goals are in the way.
     """
+    score = _numbers(_updated(env, detector, obs, action, next_obs), () if counts is None else counts.shape)
+    if counts is not None:
+        score[~counts] = 0
+    if np.isnan(score).any():
+        where = f" of simulation {int(np.flatnonzero(np.isnan(score))[0])}" if score.ndim else ""
+        raise InputError(f"MonitorAnomaly: the detector's score{where} is nan, want a number")
+    return score
+
+
+def _numbers(score: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    given = np.asarray(score)
+    if given.dtype.kind not in "fiub" or (given.shape and not shape):
+        raise InputError(f"MonitorAnomaly: the detector's score is {score!r}, want a number")
+    if given.shape != shape:
+        raise InputError(f"MonitorAnomaly: the detector's scores have shape {given.shape}, want {shape}")
+    return given.astype(float)
+
+
+def _updated(env: Any, detector: Detector, obs: Any, action: Any, next_obs: Any) -> Any:
     try:
-        score = np.asarray(detector.update(obs, action, next_obs), float)
-        if np.isnan(score).any():
-            where = f" of simulation {int(np.flatnonzero(np.isnan(score))[0])}" if score.ndim else ""
-            raise InputError(f"MonitorAnomaly: the detector's score{where} is nan, want a number")
-        return score
+        return detector.update(obs, action, next_obs)
     except InputError as e:
         if isinstance(next_obs, dict) or not getattr(getattr(env.unwrapped, "robot", None), "goal_size", 0):
             raise
@@ -93,16 +115,18 @@ class MonitorAnomaly(EnvWrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and score the transition."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        score = np.float64(scored(self.env, self.detector, self._last, action, observation))
+        score = scored(self.env, self.detector, self._last, action, observation)[()]
         self._last = observation
         info = {**info, "anomaly": np.bool_(score >= self.threshold), "anomaly_score": score}
         return observation, reward, terminated, truncated, info
 
 
 class VectorMonitorAnomaly(VectorEnvWrapper):
-    """The same around any vector environment: (n,) arrays, with the masks that Gymnasium puts beside them.
+    """`MonitorAnomaly` around any vector environment; arguments as there.
 
-    Of a row whose episode begins with the observation returned there is no transition: False and 0.
+    What it tells are (n,) arrays, with the masks that Gymnasium puts beside them. Of a row whose episode begins
+    with the observation returned there is no transition: False and 0. With same-step autoreset the last one of the
+    episode before is scored by its `final_obs`, and told in `final_info`.
     """
 
     def __init__(
@@ -124,17 +148,22 @@ class VectorMonitorAnomaly(VectorEnvWrapper):
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step, and score the transitions."""
         observation, reward, terminated, truncated, info = self.env.step(actions)
-        score = np.array(scored(self.env, self.detector, self._last, actions, observation))
-        if score.shape != (self.num_envs,):
-            raise InputError(f"MonitorAnomaly: the detector's scores have shape {score.shape}, want ({self.num_envs},)")
-        first = self.rows.step(terminated, truncated)
+        first, ended = self.rows.step(terminated, truncated), self.rows.ended(info)
+        reached = with_rows(observation, ended, list(info["final_obs"][ended])) if ended.any() else observation
+        score = scored(self.env, self.detector, self._last, actions, reached, ~first | ended)
+        if ended.any():
+            told = self._told(np.where(ended, score, 0.0), ended)
+            info = {**info, "final_info": {**info.get("final_info", {}), **told}, "_final_info": ended}
         if first.any():
             self.detector.reset(first)
-            score[first] = 0
+            score = np.where(first, 0.0, score)
         self._last = observation
         return observation, reward, terminated, truncated, self._with(info, score, first)
 
     def _with(self, info: dict[str, Any], score: NDArray, first: NDArray[np.bool_]) -> dict[str, Any]:
-        everyone = np.ones(self.num_envs, bool)
-        mine = {"anomaly": (score >= self.threshold) & ~first, "anomaly_score": score}
-        return {**info, **mine, **{f"_{k}": everyone for k in mine}}
+        told = self._told(score, np.ones(self.num_envs, bool))
+        return {**info, **told, "anomaly": told["anomaly"] & ~first}
+
+    def _told(self, score: NDArray, rows: NDArray[np.bool_]) -> dict[str, Any]:
+        mine = {"anomaly": (score >= self.threshold) & rows, "anomaly_score": score}
+        return {**mine, **{f"_{k}": rows for k in mine}}

@@ -16,10 +16,11 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.residual import Components
+from nfc_gym.physics.residual import OBSERVED, Components
 from nfc_gym.physics.state import Inertia, move
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
+from nfc_gym.wrappers.rows import with_last
 from nfc_gym.wrappers.simulation import Simulation, simulation_of
 from nfc_gym.wrappers.source import Draws, Source
 
@@ -83,10 +84,10 @@ class Injection:
         move(self.sim.model, self.sim.qpos, np.ascontiguousarray(step[..., :nv]))
         self.sim.qvel[...] += step[..., nv:]
 
-    def observe(self, values: Array) -> Array:
-        """An observation (..., s) with those entries of delta_s that are no physical state."""
-        out = np.array(values)
-        out[..., self.components.observed] += self.delta[..., self.components.observed]
+    def observe(self, values: Array, delta: Array | None = None) -> Array:
+        """An observation (..., s) with those entries of delta_s, by default the step's, that are no physical state."""
+        out, entries = np.array(values), self.components.observed
+        out[..., entries] += (self.delta if delta is None else delta)[..., entries]
         return out
 
 
@@ -126,9 +127,10 @@ def box_key(space: gym.Space, key: str | None, size: int) -> str | None:
         boxes = [k for k, s in space.items() if s.shape == (size,)]
         key = key or next(iter(boxes), None)
         if key not in boxes:
-            raise InputError(
-                f"ResidualDynamics: no key {key!r} of width {size} in the observation: {list(space.items())}"
-            )
+            there = ", ".join(f"{k!r} {s.shape}" for k, s in space.items())
+            wanted = f"a key of the observation with shape ({size},), which entries named {OBSERVED!r} perturb"
+            found = f"key={key!r} is none" if key else "there is none"
+            raise InputError(f"ResidualDynamics: delta_s of {size} entries wants {wanted}; {found}: {there}")
         return key
     if space.shape != (size,):
         raise InputError(f"ResidualDynamics: delta_s has {size} entries where the observation has shape {space.shape}")
@@ -141,12 +143,12 @@ class _Observing:
     injection: Injection
     key: str | None
 
-    def _observed(self, observation: Any) -> Any:
+    def _observed(self, observation: Any, delta: Array | None = None) -> Any:
         if not self.injection.observing:
             return observation
         if self.key is None:
-            return self.injection.observe(observation)
-        return {**observation, self.key: self.injection.observe(observation[self.key])}
+            return self.injection.observe(observation, delta)
+        return {**observation, self.key: self.injection.observe(observation[self.key], delta)}
 
 
 class ResidualDynamics(_Observing, EnvWrapper):
@@ -203,7 +205,10 @@ class ResidualDynamics(_Observing, EnvWrapper):
 
 
 class VectorResidualDynamics(_Observing, VectorEnvWrapper):
-    """The same around a vector environment on `mujoco.batch`: a bias of its own for each episode of each simulation."""
+    """`ResidualDynamics` around a vector environment on `mujoco.batch`; arguments as there.
+
+    Each episode of each simulation has a bias of its own.
+    """
 
     def __init__(
         self,
@@ -220,6 +225,7 @@ class VectorResidualDynamics(_Observing, VectorEnvWrapper):
         self.key = box_key(env.single_observation_space, key, bound.size) if bound.observed.size else None
         sim.attach("ResidualDynamics", after=mode == "state", substeps=False)
         self.injection = Injection(sim, bound, mode, root)
+        self._before = self.injection.delta  # (n, s) what acted last in episodes that same-step autoreset ends
         sim.on_reset.add(self._draw)
 
     @property
@@ -230,7 +236,7 @@ class VectorResidualDynamics(_Observing, VectorEnvWrapper):
     def _draw(self, ids: NDArray[np.intp]) -> None:
         bias = self.injection.bias.copy()
         bias[ids] = self.draws.draw(len(ids), self.stream(None))
-        self.injection.bias = bias
+        self.injection.bias, self._before = bias, self.injection.delta
         self.injection.delta = np.where(np.isin(np.arange(len(bias)), ids)[:, None], bias, self.injection.delta)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -240,9 +246,10 @@ class VectorResidualDynamics(_Observing, VectorEnvWrapper):
         return self._observed(observation), info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step, and perturb what is observed."""
-        observation, *rest = self.env.step(actions)
-        return self._observed(observation), *rest
+        """Step, and perturb what is observed, an episode's last observation by what acted in it."""
+        observation, reward, terminated, truncated, info = self.env.step(actions)
+        info = with_last(info, lambda row, last: self._observed(last, self._before[row]))
+        return self._observed(observation), reward, terminated, truncated, info
 
 
 def prepare(

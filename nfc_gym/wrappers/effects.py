@@ -274,10 +274,11 @@ class ApplyEffects(EnvWrapper):
 
 
 class VectorApplyEffects(VectorEnvWrapper):
-    """The same around a vector environment on `mujoco.batch`: each simulation has hidden states of its own.
+    """`ApplyEffects` around a vector environment on `mujoco.batch`; arguments as there, and `values`.
 
-    Signals that are functions are given the episodes' times (n,). With `values`, an array (n, k) for each effect, every
-    simulation has values of its own in place of those in `effects`; what sensors report keeps the latter.
+    Each simulation has hidden states of its own. Signals that are functions are given the episodes' times (n,).
+    With `values`, an array (n, k) for each effect, every simulation has values of its own in place of those in
+    `effects`; what sensors report keeps the latter.
     """
 
     def __init__(

@@ -7,7 +7,6 @@ told of psi (`psi_belief`) throughout: it is trained to believe the mean, as it 
 """
 
 import copy
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
-from nfc_gym.core.posterior import Sampler, load_source
 from nfc_gym.physics.residual import Components
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
 from nfc_gym.wrappers.batched import batch_simulation_of
@@ -29,18 +27,15 @@ from nfc_gym.wrappers.dynamics import Injection, Mode, checked_mode, component_n
 from nfc_gym.wrappers.order import PSI, TERRAIN
 from nfc_gym.wrappers.psi import Psi, Space, space_of
 from nfc_gym.wrappers.simulation import Simulation, simulation_of
+from nfc_gym.wrappers.source import Source, sampler_of
 from nfc_gym.wrappers.terrain import Ground
 
 Array = NDArray[np.float64]
-Source = Sampler | str | os.PathLike[str]
 
 
 def drawn(posterior: Source, samples: int) -> Fidelity:
     """Samples of a posterior, always the same ones: what the action means must not change from run to run."""
-    found = load_source(posterior) if isinstance(posterior, str | os.PathLike) else posterior
-    if not isinstance(found, Sampler):
-        raise InputError(f"Hallucinate: a posterior has sample(n, rng), or is a path; got {posterior!r}")
-    return found.sample(samples, np.random.default_rng(0))
+    return sampler_of(posterior, "psi", "Hallucinate").sample(samples, np.random.default_rng(0))
 
 
 def wider(space: gym.Space, more: int) -> spaces.Box:
@@ -78,7 +73,8 @@ class Hallucinate(_Hallucinating, EnvWrapper):
 
     Args:
       env: any MuJoCo environment whose action is a Box (k,).
-      posterior: with `sample(n, rng)`, or a path. Parts that its samples lack are left as they are.
+      posterior: with `sample(n, rng)`, an array (n, d) of draws of psi, or a path. Parts that its samples lack are left
+        as they are.
       beta: how far from the mean pi_h = 1 leads, in standard deviations.
       modes: principal modes of delta_e at most.
       samples: how many are drawn, once, to tell mean and covariance.
@@ -187,10 +183,11 @@ class Hallucinate(_Hallucinating, EnvWrapper):
 
 
 class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
-    """The same around a vector environment on `mujoco.batch`: each simulation holds what its own first action said.
+    """`Hallucinate` around a vector environment on `mujoco.batch`; arguments as there.
 
-    delta_e cannot be chosen by an action there, since the batch is built anew for other terrains: a posterior that
-    speaks of it is refused (draw residual terrains between roll-outs with `VectorResidualTerrain`).
+    Each simulation holds what its own first action said. delta_e cannot be chosen by an action there, since the
+    batch is built anew for other terrains: a posterior that speaks of it is refused (draw residual terrains between
+    roll-outs with `VectorResidualTerrain`).
     """
 
     def __init__(

@@ -8,7 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
@@ -18,7 +18,7 @@ from nfc_gym.physics.state import yaw
 from nfc_gym.terrain.egocentric import SIZE
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
-from nfc_gym.wrappers.rows import Rows
+from nfc_gym.wrappers.rows import Rows, with_last
 from nfc_gym.wrappers.simulation import simulation_of
 from nfc_gym.wrappers.terrain import read_ground
 
@@ -43,8 +43,18 @@ def camera_of(noise: Camera | None) -> terrain.DepthCamera:
 
 
 def with_map(space: gym.Space) -> spaces.Dict:
-    """An observation space with the key `elevation`, put into a Dict beside `observation` where it is none."""
+    """An observation space with the key `elevation`, put into a Dict beside `observation` where it is none.
+
+    Raises:
+      InputError: it has that key as something else than one map, which cannot be put in its place.
+    """
     parts = dict(space.items()) if isinstance(space, spaces.Dict) else {"observation": space}
+    shape = parts[KEY].shape if KEY in parts else (SIZE, SIZE)
+    if shape != (SIZE, SIZE):
+        raise InputError(
+            f"PerceiveTerrain: {KEY!r} of the observation has shape {shape}, want {(SIZE, SIZE)}, one map; put "
+            "PerceiveTerrain inside of what stacks or changes it"
+        )
     return spaces.Dict({**parts, KEY: spaces.Box(-np.inf, np.inf, (SIZE, SIZE), np.float32)})
 
 
@@ -106,7 +116,10 @@ class PerceiveTerrain(EnvWrapper):
 
 
 class VectorPerceiveTerrain(VectorEnvWrapper):
-    """The same around a vector environment on `mujoco.batch`: each robot has a camera and a drift of its own."""
+    """`PerceiveTerrain` around a vector environment on `mujoco.batch`; arguments as there.
+
+    Each robot has a camera and a drift of its own.
+    """
 
     def __init__(self, env: VectorEnv, noise: Camera | None = None) -> None:
         super().__init__(env, noise=noise)
@@ -114,6 +127,8 @@ class VectorPerceiveTerrain(VectorEnvWrapper):
         self.rows = Rows(env)
         self.at = base_joint(self.sim.nominal, type(env.unwrapped).__name__)
         self.map = terrain.PerceivedMap(camera_of(noise), env.num_envs)
+        self._stepping, self._ends = False, None
+        self.sim.on_reset.add(self._end)
         self.single_observation_space = with_map(env.single_observation_space)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
@@ -125,25 +140,41 @@ class VectorPerceiveTerrain(VectorEnvWrapper):
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Forget what the rows that are reset saw, and reset."""
         self.stream(seed)
+        self._stepping = False
         observation, info = self.env.reset(seed=seed, options=options)
         self._forget(self.rows.reset(options))
-        return self._look(observation), info
+        return _seen(observation, self._maps()), info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step and look."""
+        self._stepping, self._ends = self.rows.mode is AutoresetMode.SAME_STEP, None
         observation, reward, terminated, truncated, info = self.env.step(actions)
+        self._stepping = False
         first = self.rows.step(terminated, truncated)
         if first.any():
             self._forget(first)
-        return self._look(observation), reward, terminated, truncated, info
+        maps = self._ends
+        if maps is None:
+            maps = self._maps()
+        else:
+            ends = maps.copy()
+            info = with_last(info, lambda row, last: _seen(last, ends[row]))
+            maps[first] = self._maps(first)
+        return _seen(observation, maps), reward, terminated, truncated, info
+
+    def _end(self, ids: NDArray[np.intp]) -> None:
+        """Rows of a step are about to begin another episode: what all see at its end, which soon cannot be seen."""
+        if self._stepping:
+            self._ends = self._maps()
 
     def _forget(self, rows: NDArray[np.bool_]) -> None:
         new = iter(self.stream(None).spawn(int(rows.sum())))
         self.map.reset([next(new) if row else None for row in rows], rows)  # type: ignore[misc]
 
-    def _look(self, observation: Any) -> dict[str, Any]:
+    def _maps(self, rows: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """(k, 128, 128) what robots see now, all or those of some rows."""
         base, at = self.env.unwrapped, self.at
         self.sim.look_again()
         qpos, time = self.sim.qpos, self.sim.bind("time")
         quat = qpos[:, at + 3 : at + 7]
-        return _seen(observation, self.map.update(base.perceived, qpos[:, at : at + 3], quat, yaw(quat), time))
+        return self.map.update(base.perceived, qpos[:, at : at + 3], quat, yaw(quat), time, rows)

@@ -195,9 +195,10 @@ class RandomizePsi(EnvWrapper):
 
 
 class VectorRandomizePsi(VectorEnvWrapper):
-    """The same around a vector environment on `mujoco.batch`: psi of its own for each episode of each simulation.
+    """`RandomizePsi` around a vector environment on `mujoco.batch`; `env` and `distribution` as there.
 
-    `reset(options={"psi": ...})` overrides the draws of the rows that it resets.
+    Each episode of each simulation has a psi of its own. `reset(options={"psi": ...})` overrides the draws of the
+    rows that it resets.
     """
 
     def __init__(self, env: VectorEnv, distribution: Distribution = 1.0) -> None:

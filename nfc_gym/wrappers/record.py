@@ -124,10 +124,10 @@ class RecordLog(_Recording, EnvWrapper):
 
 
 class VectorRecordLog(_Recording, VectorEnvWrapper):
-    """The same around a vector environment on `mujoco.batch`, a file for each episode of each simulation.
+    """`RecordLog` around a vector environment on `mujoco.batch`; arguments as there.
 
-    Made for tens of simulations: samples are taken row by row. On rough ground, whose pool holds many maps, no one
-    model is that of all logs: it is refused.
+    It writes a file for each episode of each simulation. Made for tens of simulations: samples are taken row by
+    row. On rough ground, whose pool holds many maps, no one model is that of all logs: it is refused.
     """
 
     def __init__(self, env: VectorEnv, path: Path, model_file: Path | None = None) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.whole import require_whole
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
-from nfc_gym.wrappers.rows import Rows
+from nfc_gym.wrappers.rows import Rows, with_last
 
 ACTION, OBSERVATION = "action", "observation"
 _LIKE = 'such as {"action": {"sd": 0.02, "delay": 1}}'
@@ -93,9 +93,19 @@ class Channel:
         values = np.asarray(values)
         if self.fault.delay:
             values = self._late(values, again)
-        out = values + self.total
+        return self._faulty(values, self.total, rng)
+
+    def last(self, value: Any, row: int, rng: np.random.Generator) -> NDArray:
+        """What comes out of the last value (*shape) of a row's episode, while that of the next is about to go in."""
+        value = np.asarray(value)
+        if self.fault.delay:
+            value = np.asarray(self.past[1][row])  # the oldest, once this one were appended
+        return self._faulty(value, self.total[row], rng)
+
+    def _faulty(self, values: NDArray, bias: NDArray, rng: np.random.Generator) -> NDArray:
+        out = values + bias
         if self.noisy:
-            out = out + self.sd * rng.standard_normal(self.shape)
+            out = out + self.sd * rng.standard_normal(bias.shape)
         if self.bounded:
             out = np.minimum(np.maximum(out, self.low), self.high)
         return out.astype(values.dtype if values.dtype.kind == "f" else self.dtype)
@@ -160,6 +170,13 @@ class _Perturbing:
         changed = {k: c(observation[k], self.rng, again) for k, c in self.channels.items() if k != ACTION}
         return {**observation, **changed}
 
+    def _see_last(self, row: int, observation: Any, rng: np.random.Generator) -> Any:
+        if not isinstance(observation, dict):
+            channel = self.channels.get(OBSERVATION)
+            return observation if channel is None else channel.last(observation, row, rng)
+        changed = {k: c.last(observation[k], row, rng) for k, c in self.channels.items() if k != ACTION}
+        return {**observation, **changed}
+
 
 class PerturbSignals(_Perturbing, EnvWrapper):
     """Perturbs actions and observations of any environment, MuJoCo or not.
@@ -190,7 +207,10 @@ class PerturbSignals(_Perturbing, EnvWrapper):
 
 
 class VectorPerturbSignals(_Perturbing, VectorEnvWrapper):
-    """The same around any vector environment; `final_obs` of same-step autoreset is handed on as it is."""
+    """`PerturbSignals` around any vector environment; arguments as there.
+
+    `final_obs` of same-step autoreset is perturbed too.
+    """
 
     def __init__(self, env: VectorEnv, noise: Noise) -> None:
         super().__init__(env, noise=noise)
@@ -210,5 +230,7 @@ class VectorPerturbSignals(_Perturbing, VectorEnvWrapper):
         observation, reward, terminated, truncated, info = self.env.step(self._act(actions))
         first = self.rows.step(terminated, truncated)
         if first.any():
+            noise = self.rng.spawn(1)[0]  # type: ignore[union-attr]  # a stream aside: other rows draw what they drew
+            info = with_last(info, lambda row, last: self._see_last(row, last, noise))
             self._begin(first)
         return self._see(observation), reward, terminated, truncated, info

@@ -31,7 +31,7 @@ class Draws:
 
     def __init__(self, source: Source, part: str, who: str) -> None:
         self.part, self.who = part, who
-        self.sampler = _sampler(source, part, who)
+        self.sampler = sampler_of(source, part, who)
         # One draw of its own generator shows what the source gives before any episode depends on it.
         self.shape = self.draw(1, np.random.default_rng(0)).shape[1:]
 
@@ -60,7 +60,8 @@ class Draws:
             raise InputError(f"{self.who}: the source's {self.part} has shape {self.shape}; want {want}, {meaning}")
 
 
-def _sampler(source: Any, part: str, who: str) -> Sampler:
+def sampler_of(source: Any, part: str, who: str) -> Sampler:
+    """What to draw from; an array is samples of `part`. Raises `InputError` where `source` is nothing of the kind."""
     if isinstance(source, str | os.PathLike):
         return load_source(os.fspath(source))
     if isinstance(source, Sampler) and not isinstance(source, np.ndarray):

@@ -144,11 +144,11 @@ class ResidualTerrain(EnvWrapper):
 
 
 class VectorResidualTerrain(VectorEnvWrapper):
-    """The same around a vector environment on `mujoco.batch`, whose simulations choose from a pool of maps.
+    """`ResidualTerrain` around a vector environment on `mujoco.batch`; arguments as there.
 
-    Each map of the pool gets a residual of its own at every `reset` of all environments, for which the batch is built
-    anew (tens of ms for 1000 simulations); with a single sample, only at the first. Autoresets choose among the maps
-    as before.
+    Its simulations choose from a pool of maps. Each map of the pool gets a residual of its own at every `reset` of
+    all environments, for which the batch is built anew (tens of ms for 1000 simulations); with a single sample,
+    only at the first. Autoresets choose among the maps as before.
     """
 
     def __init__(self, env: VectorEnv, source: Source) -> None:

@@ -13,7 +13,8 @@ import torch
 from rich.console import Console
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+from torch.distributions import Categorical
+from torchrl.modules import NormalParamExtractor, OneHotCategorical, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 
 from nfc_gym import InputError
@@ -250,6 +251,12 @@ def test_what_does_not_fit_is_named(jackal: Path, tmp_path: Path) -> None:
         adapt(agent, world(), belief(), object())
     with pytest.raises(InputError, match="not of delta_e"):
         adapt(agent, world(), belief(), Alarm(5), config=AdaptConfig(parts=("delta_e",)), threads=1)
+    with pytest.raises(InputError, match="psi has 3 entries, the world's 17: base_mass, "):
+        adapt(agent, world(), Fidelity(np.ones((4, 3))), Alarm(None))
+    with pytest.raises(InputError, match="must return a Fidelity"):
+        adapt(agent, world(), SimpleNamespace(sample=lambda n, rng: np.ones((n, 17))), Alarm(None))
+    with pytest.raises(InputError, match="folder /proc/none cannot be written"):
+        adapt(agent, world(), belief(), Alarm(None), folder="/proc/none")
     wide = Agent(agent.actor, agent.loss, agent.sight)
     narrow = gym.wrappers.RescaleAction(world(), -1.0, 1.0)
     narrow.action_space = gym.spaces.Box(-1, 1, (3,))
@@ -265,3 +272,69 @@ def test_policy_opt_takes_any_vector_environment(jackal: Path) -> None:
     envs = gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=4, context=["psi"], autoreset_mode="Disabled", nthread=1)
     optimise(agent, envs, 256)
     assert not same(before, agent.actor.state_dict())
+
+
+class Says(Alarm):
+    """A detector that always says the same."""
+
+    def __init__(self, score: Any, threshold: float = 1.0) -> None:
+        self.score, self.threshold = score, threshold
+
+    def update(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        return self.score
+
+
+@pytest.mark.parametrize("score", [float("nan"), "x", None, np.ones(2)])
+def test_what_is_no_score_is_no_healthy_one(jackal: Path, score: Any) -> None:
+    with pytest.raises(InputError, match="the detector's score"):
+        adapt(ppo_agent(load_policy(jackal)), world(), belief(), Says(score), config=CONFIG)
+
+
+@pytest.mark.parametrize("reward", [float("nan"), "x", np.ones(2)])
+def test_a_reward_that_is_no_number_is_told(jackal: Path, reward: Any) -> None:
+    class Odd(gym.Wrapper):
+        def step(self, action: Any) -> Any:
+            observation, given, *rest = self.env.step(action)
+            self.count = getattr(self, "count", 0) + 1
+            return observation, reward if self.count == 4 else given, *rest
+
+    with pytest.raises(InputError, match=r"reward at step 3 is .*, want a finite number"):
+        adapt(ppo_agent(load_policy(jackal)), Odd(world()), belief(), Alarm(None), config=CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("score", "threshold", "told", "anomalous"),
+    [(1.0, 4.0, 0.25, False), (-0.5, 0.0, -0.5, False), (-3.0, -2.0, -3.0, False), (2.0, -2.0, 2.0, True)],
+)
+def test_any_finite_threshold_will_do(
+    jackal: Path, monkeypatch: pytest.MonkeyPatch, score: float, threshold: float, told: float, anomalous: bool
+) -> None:
+    """Where none is above 0 there is no share of it, and the score itself is written down."""
+    monkeypatch.setattr("nfc_gym.adaptation.algorithm.optimise", lambda *_, **__: {})
+    config = replace(CONFIG, missions=1)
+    done = adapt(ppo_agent(load_policy(jackal)), world(), belief(), Says(score, threshold), config=config, threads=1)
+    assert done.history[0]["score"] == told
+    assert done.history[0]["anomalous"] is anomalous
+
+
+def _acting(head: type, size: int, keys: tuple[str, ...] = ("observation",)) -> ProbabilisticActor:
+    class Body(nn.Linear):
+        def forward(self, observation: Any, *_: Any) -> Any:
+            return super().forward(observation)
+
+    body = TensorDictModule(Body(17, size), list(keys), ["logits"])
+    return ProbabilisticActor(body, in_keys=["logits"], distribution_class=head, return_log_prob=True)
+
+
+@pytest.mark.parametrize("head", [OneHotCategorical, torch.distributions.OneHotCategorical, Categorical])
+def test_actors_that_choose_are_refused(head: type) -> None:
+    agent = Agent(_acting(head, 2), lambda *_: None, Sight.of(world()))  # type: ignore[arg-type,return-value]
+    with pytest.raises(InputError, match=f"actions must be a continuous vector.*{head.__name__}"):
+        adapt(agent, world(), belief(), Alarm(None))
+
+
+def test_actors_that_want_more_than_an_observation_are_refused_by_name() -> None:
+    recurrent = _acting(TanhNormal, 2, ("observation", "h", "is_init"))
+    agent = Agent(recurrent, lambda *_: None, Sight.of(world()))  # type: ignore[arg-type,return-value]
+    with pytest.raises(InputError, match=r"the actor wants 'h', 'is_init', .*recurrent"):
+        adapt(agent, world(), belief(), Alarm(None))

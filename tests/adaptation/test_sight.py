@@ -8,7 +8,8 @@ import pytest
 
 from nfc_gym import InputError
 from nfc_gym.adaptation.sight import CELLS, Sight, VectorSight
-from nfc_gym.adaptation.worlds import VectorStaggered, full_id, vector_env
+from nfc_gym.adaptation.worlds import VectorStaggered, vector_env
+from nfc_gym.simulate.machine import full_id
 from nfc_gym.terrain.egocentric import SIZE, Cells
 
 

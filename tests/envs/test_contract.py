@@ -1,5 +1,7 @@
 """What every environment promises, over all ids that are registered: spaces, info, resets, determinism, bad input."""
 
+import pickle
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -103,6 +105,9 @@ def test_psi_may_leave_the_prior_but_not_physics() -> None:
         ({"difficulty": 2}, "from 0 to 1"),
         ({"terrain_kind": "lava"}, "want one of: "),
         ({"reward_type": "rich"}, "sparse, dense"),
+        ({"reward_type": "dense"}, "reward_type is 'dense', which wants goal_conditioned=True"),
+        ({"camera": "front"}, "no camera is called 'front'; the scene has track"),
+        ({"camera": -1}, "camera is -1, want the name of one, or a free one's lookat"),
     ],
 )
 def test_bad_arguments_say_what_is_valid(kwargs: dict[str, Any], message: str) -> None:
@@ -160,3 +165,40 @@ def test_rendering_without_a_mode_warns() -> None:
 
 def test_input_errors_are_value_errors() -> None:
     assert issubclass(InputError, ValueError)
+
+
+@pytest.mark.parametrize("action", [["a", "b"], {}, [1j, 0], [[1], [1, 2]]])
+def test_actions_that_are_no_numbers_are_told(action: Any) -> None:
+    for env in (made("nfc_gym/JackalFlat-v0").unwrapped, gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=1)):
+        env.reset(seed=0)
+        with pytest.raises(InputError, match=r"action is .*, want numbers"):
+            env.step(action)
+
+
+@pytest.mark.parametrize("wrong", ["20", True, [20.0, "x"]])
+def test_psi_that_only_looks_like_numbers_is_told(wrong: Any) -> None:
+    for env in (made("nfc_gym/JackalFlat-v0"), gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=2)):
+        with pytest.raises(InputError, match=r"psi\['base_mass'\] is .*, want a number"):
+            env.reset(options={"psi": {"base_mass": wrong}})
+
+
+def test_a_simulation_that_comes_apart_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """No log in the user's folder, no word on the terminal; what the user listens with is left alone."""
+    monkeypatch.chdir(tmp_path)
+    single, many = made("nfc_gym/AntFlat-v0"), gymnasium.make_vec("nfc_gym/AntFlat-v0", num_envs=2, nthread=1)
+    kept = pickle.loads(pickle.dumps(single.unwrapped))
+    kept.reset(seed=0)
+    kept = pickle.loads(pickle.dumps(kept))
+    single.reset(seed=0)
+    many.reset(seed=0)
+    for poison in (np.nan, 1e9):
+        single.unwrapped.data.qvel[0] = kept.data.qvel[0] = many.unwrapped.batch.bind("qvel")[1, 0] = poison
+        for env in (single, kept):
+            assert env.step(np.zeros(8))[4]["unstable"]
+            env.reset()
+        assert many.step(np.zeros((2, 8)))[4]["unstable"].tolist() == [False, True]
+        many.step(np.zeros((2, 8)))
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr() == ("", "")

@@ -87,6 +87,9 @@ def test_the_command_trains_and_the_other_tells(windows: Path, motion: Path, tmp
     found = run.invoke(app, ["infer", str(file), str(motion), "--samples", "50"])
     assert found.exit_code == 0, found.output
     assert "base_mass" in found.output
+    for out, what in ((tmp_path / "psi.npz", "50 draws of psi"), (tmp_path / "p.safetensors", "the posterior given")):
+        kept = run.invoke(app, ["infer", str(file), str(motion), "--samples", "50", "--out", str(out)])
+        assert f"{out}: {what}" in kept.stdout
 
 
 @pytest.mark.parametrize(

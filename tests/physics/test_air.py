@@ -107,6 +107,15 @@ def test_wind_is_told_in_metres_per_second() -> None:
     assert "2.24 m/s" in Wind(("b",)).say(np.array([3.0, -1.5, 0.0, 1.5]))
 
 
+def test_a_push_on_next_to_no_drag_has_no_speed() -> None:
+    """The ratio of two numbers, one of which may be none, is no speed of the air."""
+    said = Wind(("b",)).say(np.array([0.0, 0.0, 0.19, 5e-16]), np.array([0.01, 0.01, 0.01, 3e-3]))
+    assert "m/s along" not in said
+    assert "push z 0.19" in said
+    assert "m/s along" not in Wind(("b",)).say(np.array([0.0, 0.0, 0.19, 5e-16]))
+    assert "m/s along" in Wind(("b",)).say(np.array([3.0, 0.0, 0.0, 1.5]), np.full(4, 0.1))
+
+
 def test_external_force_on_a_body_and_along_a_joint() -> None:
     effect, theta = make("external_force", "b", {"x": 1.0, "y": 2.0, "z": -3.0})
     v = run(FLYER % 0, effect, theta, 100).qvel[0, 0, -1]

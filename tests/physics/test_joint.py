@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from machines import make, run
 
-from nfc_gym.physics.effects import Scales
+from nfc_gym.physics.effects import Scales, build, propose
 from nfc_gym.physics.effects.joint import Cogging
 
 DT, MASS = 0.001, 2.0
@@ -105,3 +105,41 @@ def test_cogging_is_looked_for_where_a_joint_travels_as_far_as_it_repeats(
     assert order.low == pytest.approx(least, abs=0.1)
     assert all(order.low < p <= order.high for p in order.probes)
     assert order.probes[-1] == (12.0 if least < 12 else pytest.approx(1.5 * order.low))
+
+
+BOTH = mujoco.MjModel.from_xml_string("""
+<mujoco><worldbody><body><joint name="rail" type="slide"/><geom size=".1"/>
+<body><joint name="pivot"/><geom size=".1" pos=".2 0 0"/></body></body></worldbody></mujoco>""")
+
+
+@pytest.mark.parametrize(
+    ("family", "parameters", "units"),
+    [
+        ("generic_memory", {f"c{k}": 0.1 for k in range(6)}, ["N"] * 6),
+        ("coulomb", {"level": 0.2}, ["N"]),
+        ("damping_poly", {"linear": 0.1, "quadratic": 0.0, "cubic": 0.0}, ["N s/m", "N s^2/m^2", "N s^3/m^3"]),
+        ("armature", {"inertia": 0.1}, ["kg"]),
+        ("external_force", {"force": 1.0}, ["N"]),
+    ],
+)
+def test_units_are_those_of_the_joint(family: str, parameters: dict[str, float], units: list[str]) -> None:
+    for joint, wanted in (("rail", units), ("pivot", [p.unit for p in build(family, "pivot", parameters)[0].params])):
+        effect, _ = build(family, joint, parameters)
+        effect.bind(BOTH)
+        assert [p.unit for p in effect.params] == wanted
+
+
+def test_generic_alternatives_are_proposed_with_the_units_of_the_joint() -> None:
+    ones = np.ones(BOTH.nv)
+    scales = Scales(force=ones, speed=ones, command=np.ones(0), actuation=np.ones(0), interval=0.01)
+    found = {
+        e.where[0]: e.params[0].unit for e in propose(BOTH, scales, only=("none",)) if e.family == "generic_memory"
+    }
+    assert found == {"rail": "N", "pivot": "N m"}
+
+
+def test_less_damping_than_the_model_has_is_within_the_bounds() -> None:
+    """A draw over an interval is kept within them (`nfc-gym adapt --vary`)."""
+    effect, theta = build("damping_poly", "pivot", {"linear": -0.01, "quadratic": 0.0, "cubic": 0.0})
+    effect.require_possible(theta)
+    assert (effect.low <= theta).all()

@@ -170,3 +170,8 @@ def test_a_machine_that_always_falls_is_said_so() -> None:
     made = replace(plan("nfc_gym/QuadcopterFlat-v0", 2, effects=0.0), policy=roll_over, policy_share=1.0)
     with pytest.raises(InputError, match="ended early"):
         make_shard(made, 0)
+
+
+@pytest.mark.parametrize("name", ["JackalFlat", "JackalFlat-v0", "nfc_gym/JackalFlat", "nfc_gym:nfc_gym/JackalFlat-v0"])
+def test_an_environment_goes_by_its_short_name_too(name: str) -> None:
+    assert Machine(name).environment == "nfc_gym/JackalFlat-v0"

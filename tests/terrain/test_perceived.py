@@ -286,3 +286,14 @@ def test_misuse_is_refused() -> None:
         batch.reset(np.random.default_rng(0))
     with pytest.raises(InputError, match="num 0"):
         PerceivedMap(num=0)
+
+
+def test_some_robots_of_a_batch_look_while_the_others_wait() -> None:
+    both, one = PerceivedMap(num=2), PerceivedMap(num=2)
+    for each in (both, one):
+        each.reset([np.random.default_rng(k) for k in range(2)])
+    pose = (np.tile([0.0, 0.0, 0.5], (2, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.zeros(2))
+    for time in (0.0, 0.1):
+        whole, part = both.update(FLAT, *pose, time), one.update(FLAT, *pose, time, np.array([False, True]))
+        np.testing.assert_array_equal(part, whole[1:])
+    np.testing.assert_array_equal(one.valid.any((1, 2)), [False, True])

@@ -128,3 +128,48 @@ def test_a_score_that_is_no_number_is_no_healthy_one() -> None:
         envs.step(np.zeros((2, 1)))
     with pytest.raises(InputError, match=r"threshold of the score must be a number, .* got 'a'"):
         MonitorAnomaly(Plain(), Jump(), threshold="a")  # type: ignore[arg-type]
+
+
+class Leap(Jump):
+    """Leaps are NaN; so is what lies between two episodes."""
+
+    def update(self, obs, action, next_obs):
+        score = super().update(obs, action, next_obs)
+        return np.where(next_obs[..., 0] < obs[..., 0], np.nan, score)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_an_episodes_last_transition_counts_and_the_gap_to_the_next_does_not(mode: str) -> None:
+    mode = gym.vector.AutoresetMode(mode)
+    makes = [lambda: Leaping(7), lambda: Leaping(2)]  # the first one's leap ends its episode
+    ours = VectorMonitorAnomaly(gym.vector.SyncVectorEnv(makes, autoreset_mode=mode), Leap())
+    alone = [lambda make=make: MonitorAnomaly(make(), Leap()) for make in makes]
+    theirs = gym.vector.SyncVectorEnv(alone, autoreset_mode=mode)
+    ours.reset()
+    theirs.reset()
+    ends = 0
+    for _ in range(8):
+        actions = np.zeros((2, 1))
+        info, wanted = ours.step(actions)[4], theirs.step(actions)[4]
+        np.testing.assert_array_equal(info["anomaly"], wanted["anomaly"].astype(bool))
+        np.testing.assert_array_equal(info["anomaly_score"], wanted["anomaly_score"])
+        assert ("final_info" in info) == ("final_info" in wanted)
+        for key in ("anomaly", "anomaly_score") if "final_info" in info else ():
+            last, expected = info["final_info"], wanted["final_info"]
+            rows = last[f"_{key}"]
+            np.testing.assert_array_equal(rows, expected[f"_{key}"])
+            np.testing.assert_array_equal(last[key][rows], expected[key][rows].astype(last[key].dtype))
+            ends += bool(last["anomaly"][0])
+    assert (ends > 0) == (mode is gym.vector.AutoresetMode.SAME_STEP)
+
+
+@pytest.mark.parametrize("score", ["x", None, np.ones(2)])
+def test_what_is_no_score_is_told(score) -> None:
+    class Odd(Jump):
+        def update(self, obs, action, next_obs):
+            return score
+
+    env = MonitorAnomaly(Plain(), Odd())
+    env.reset()
+    with pytest.raises(InputError, match=r"MonitorAnomaly: the detector's score is .*, want a number"):
+        env.step(np.zeros(1))

@@ -132,6 +132,13 @@ def test_named_components_go_where_they_belong() -> None:
     np.testing.assert_array_equal(components.tangent(np.stack([q, q]), np.stack([delta, 2 * delta]))[0], out)
 
 
+def test_a_width_that_the_observation_has_not_is_told() -> None:
+    env = gym.wrappers.FlattenObservation(gym.make("nfc_gym/JackalFlat-v0", context=["psi"]))
+    nested = gym.wrappers.TransformObservation(env, lambda o: {"flat": o}, gym.spaces.Dict(flat=env.observation_space))
+    with pytest.raises(InputError, match=r"wants a key of the observation with shape \(15,\).*'flat' \(34,\)"):
+        ResidualDynamics(nested, np.zeros(15))
+
+
 def test_entries_that_are_no_state_perturb_what_is_observed() -> None:
     names = ["obs"] * 15
     names[8:11] = [f"body:cube:linvel.{a}" for a in "xyz"]

@@ -173,7 +173,7 @@ def test_bad_input_is_refused_by_name() -> None:
     with pytest.raises(InputError, match="MuJoCo"):
         Hallucinate(NoModel(), _samples())
     with pytest.raises(InputError, match="sample"):
-        Hallucinate(FakeEnv(), np.zeros(3))  # type: ignore[arg-type]
+        Hallucinate(FakeEnv(), object())  # type: ignore[arg-type]
     with pytest.raises(InputError, match="psi_space"):
         Hallucinate(FakeEnv(), _samples())
     with pytest.raises(InputError, match="2 entries; want cube"):
@@ -194,3 +194,13 @@ def test_orders_that_cannot_work_are_refused_by_name() -> None:
     Hallucinate(RandomizePsi(FakeEnv(), space=["cube"]), Fidelity(delta_s=np.zeros(7)))
     with pytest.raises(InputError, match="put Hallucinate around PerturbSignals"):
         PerturbSignals(_env(), {"action": {"sd": 0.1}})
+
+
+def test_an_array_is_draws_of_psi() -> None:
+    draws = _samples(50).psi
+    assert draws is not None
+    env, other = (Hallucinate(FakeEnv(), source, space=SPACE) for source in (draws, Fidelity(draws)))
+    np.testing.assert_array_equal(env.belief.mean, other.belief.mean)
+    assert env.action_space.shape == (3,)
+    with pytest.raises(InputError, match=r"3 entries; want cube, pole"):
+        Hallucinate(FakeEnv(), np.ones((50, 3)), space=SPACE)

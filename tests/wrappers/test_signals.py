@@ -166,3 +166,18 @@ def test_a_wrong_action_does_not_become_a_right_one(action, fault) -> None:
 def test_a_step_before_the_first_reset_is_refused() -> None:
     with pytest.raises(gym.error.ResetNeeded, match="before the first reset"):
         PerturbSignals(Plain(), {"observation": {"sd": 1.0}}).step(np.zeros(1))
+
+
+def test_a_last_observation_takes_nothing_from_the_other_rows() -> None:
+    """Whose noise is what it would be, had no episode ended."""
+    mode, noise = gym.vector.AutoresetMode.SAME_STEP, {"observation": {"sd": 0.1}}
+    ends = VectorPerturbSignals(gym.vector.SyncVectorEnv([lambda: Plain(2), Plain], autoreset_mode=mode), noise)
+    runs = VectorPerturbSignals(gym.vector.SyncVectorEnv([Plain, Plain], autoreset_mode=mode), noise)
+    same(ends.reset(seed=1)[0], runs.reset(seed=1)[0])
+    for k in range(5):
+        (seen, *_, info), (expected, *_) = ends.step(np.zeros((2, 1))), runs.step(np.zeros((2, 1)))
+        same(seen[1], expected[1])
+        if k % 2:
+            error = info["final_obs"][0] - [2.0, 20.0]
+            assert (abs(error) > 0).all()
+            assert (abs(error) < 0.6).all()

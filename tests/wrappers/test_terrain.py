@@ -159,3 +159,11 @@ def test_a_camera_needs_a_floating_base() -> None:
     with pytest.raises(InputError, match="free joint"):
         PerceiveTerrain(FakeEnv(xml))
     assert mujoco.MjModel.from_xml_string(xml).nv == 1
+
+
+def test_a_stack_of_maps_is_not_taken_for_one() -> None:
+    stacked = gym.wrappers.FrameStackObservation(gym.make("nfc_gym/JackalRough-v0", **ROUGH), 2)
+    with pytest.raises(InputError, match=r"'elevation'.* shape \(2, 128, 128\), want \(128, 128\).*inside"):
+        PerceiveTerrain(stacked)
+    inside = gym.wrappers.FrameStackObservation(PerceiveTerrain(gym.make("nfc_gym/JackalRough-v0", **ROUGH)), 2)
+    assert inside.reset(seed=0)[0]["elevation"].shape == (2, 128, 128)

@@ -10,6 +10,7 @@ from fakes import same
 
 import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym.core import Fidelity, InputError
+from nfc_gym.terrain.perceived import PerceivedMap
 from nfc_gym.wrappers import (
     ApplyEffects,
     Hallucinate,
@@ -283,3 +284,61 @@ def test_vector_environments_of_others_are_refused(vector: Any, tmp_path) -> Non
     arguments = {VectorRandomizePsi: 0.5, VectorResidualDynamics: np.zeros(14), VectorApplyEffects: []}
     with pytest.raises(InputError, match=r"mujoco\.batch.*SyncVectorEnv.*wrappers="):
         vector(gym.make_vec("Ant-v5", 1), arguments.get(vector, tmp_path))
+
+
+ROUGH_ID = "nfc_gym/JackalRough-v0"
+SEEN = np.linspace(0.1, 0.9, 15)  # of `proprio`: velocities, and entries that are no physical state
+LAST: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "camera": (lambda e: PerceiveTerrain(e), lambda e: VectorPerceiveTerrain(e)),
+    "force": (lambda e: ResidualDynamics(e, SEEN), lambda e: VectorResidualDynamics(e, SEEN)),
+    "state": (
+        lambda e: ResidualDynamics(e, 0.01 * SEEN, mode="state"),
+        lambda e: VectorResidualDynamics(e, 0.01 * SEEN, mode="state"),
+    ),
+    "signals": (
+        lambda e: PerturbSignals(e, {"proprio": {"bias": 5.0, "delay": 2}, "action": {"delay": 1}}),
+        lambda e: VectorPerturbSignals(e, {"proprio": {"bias": 5.0, "delay": 2}, "action": {"delay": 1}}),
+    ),
+    "ground": (
+        lambda e: ResidualTerrain(e, np.full((256, 256), 0.1)),
+        lambda e: VectorResidualTerrain(e, np.full((256, 256), 0.1)),
+    ),
+    "together": (
+        lambda e: PerturbSignals(PerceiveTerrain(ResidualDynamics(e, SEEN)), {"elevation": {"bias": 1.0}}),
+        lambda e: VectorPerturbSignals(
+            VectorPerceiveTerrain(VectorResidualDynamics(e, SEEN)), {"elevation": {"bias": 1.0}}
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("stack", "context"), [*((name, context) for name in LAST for context in (["psi"], ["elevation"])), ("camera", [])]
+)
+def test_an_episodes_last_observation_is_what_the_wrapper_makes_of_it(
+    stack: str, context: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of same-step autoreset it is in `final_obs`, while the one returned is the next episode's."""
+    begin = PerceivedMap.reset
+
+    def alike(self: PerceivedMap, rng: Any, mask: Any = None) -> None:  # cameras draw the same, single or many
+        begin(
+            self, [np.random.default_rng(0) for _ in rng] if isinstance(rng, list) else np.random.default_rng(0), mask
+        )
+
+    monkeypatch.setattr(PerceivedMap, "reset", alike)
+    mode, arguments = gym.vector.AutoresetMode.SAME_STEP, {"terrain_pool": 2, "max_episode_steps": 3}
+    wrap, twin = LAST[stack]
+    made = lambda: gym.make(ROUGH_ID, context=context, **arguments)  # noqa: E731
+    ours = twin(gym.make_vec(ROUGH_ID, num_envs=2, context=context, autoreset_mode=mode, **arguments))
+    theirs = gym.vector.SyncVectorEnv([lambda: wrap(made())] * 2, autoreset_mode=mode)
+    same(ours.reset(seed=3)[0], theirs.reset(seed=3)[0])
+    rng = np.random.default_rng(0)
+    for k in range(8):
+        actions = rng.uniform(-1, 1, (2, 2)).astype(np.float32)
+        (seen, *_, info), (expected, *_, wanted) = ours.step(actions), theirs.step(actions)
+        same(seen, expected)
+        assert ("final_obs" in info) == (k % 3 == 2) == ("final_obs" in wanted)
+        if "final_obs" in info:
+            assert all(last in ours.single_observation_space for last in info["final_obs"])
+            same(list(info["final_obs"]), list(wanted["final_obs"]))

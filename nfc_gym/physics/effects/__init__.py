@@ -12,6 +12,7 @@ from nfc_gym.physics.effects.backlash import Backlash
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
 from nfc_gym.physics.effects.command import DeadZone, Offset, Saturation, SupplySag
 from nfc_gym.physics.effects.drive import Gain, Loss, TorqueSpeed
+from nfc_gym.physics.effects.everywhere import ALL, everywhere
 from nfc_gym.physics.effects.friction import Coulomb, DirectionalFriction, LoadFriction, Stribeck
 from nfc_gym.physics.effects.generic import GenericMemory, GenericPosition, GenericTime, GenericVelocity
 from nfc_gym.physics.effects.generic_ground import GenericGrip
@@ -75,14 +76,17 @@ def build(family: str, where: Sequence[str] | str, parameters: Mapping[str, obje
 
     Args:
       family: one of `FAMILIES`.
-      where: a name of the model, several, or several joined by `+`.
+      where: a name of the model, several, several joined by `+`, or `all` (see `everywhere`).
       parameters: by name, a number or a mapping with `value` and perhaps `unit`.
 
     Raises:
-      InputError: an unknown family, or names of parameters that the family does not have.
+      InputError: an unknown family, names of parameters that the family does not have, or several places of a family
+        that sits at one alone.
     """
     kind = _family(family)
     places = tuple(where.split("+")) if isinstance(where, str) else tuple(where)
+    if kind.lone and len(places) > 1:
+        raise InputError(f"{family} sits at one place alone, got: {', '.join(places)}; give an effect for each")
     declared = kind.declare(tuple(parameters))
     values, params = [], []
     for p in declared:
@@ -90,7 +94,8 @@ def build(family: str, where: Sequence[str] | str, parameters: Mapping[str, obje
         unit = str(entry.get("unit", p.unit)) if isinstance(entry, Mapping) else p.unit
         params.append(replace(p, unit=unit))
         values.append(float(entry["value"] if isinstance(entry, Mapping) else entry))  # type: ignore[arg-type]
-    return kind(places, params), np.array(values)
+    placed = everywhere(kind) if places == (ALL,) else kind
+    return placed(places, params), np.array(values)
 
 
 def _family(name: str) -> type[Effect]:

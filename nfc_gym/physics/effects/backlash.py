@@ -23,7 +23,7 @@ from nfc_gym.physics.effects.base import (
 )
 from nfc_gym.physics.effects.drive import on_scalar, plain
 from nfc_gym.physics.effects.hysteresis import excursion
-from nfc_gym.physics.effects.places import angle_unit, joint_places, sized, with_units
+from nfc_gym.physics.effects.places import angle_unit, joint_places, sized, with_joint_units, with_units
 
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
 _LIGHT = 0.1  # share of the joint's inertia that a rotor has where the model states no armature
@@ -100,13 +100,15 @@ class Backlash(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         known = drives(model)
-        for name, _ in zip(self.where, joint_dofs(model, self.where), strict=True):
+        dofs = joint_dofs(model, self.where)
+        for name in self.where:
             if name not in known:
                 raise InputError(
                     f"backlash: no single motor or servo moves {name!r}; joints with one: {', '.join(known)}"
                 )
         actuators = np.array([known[n] for n in self.where], np.intp)
         self.drive, self.rows = Drive(model, actuators), index(actuators)
+        self.params = with_joint_units(self.params, model, dofs)
 
     def rest(self, ctx: Context, theta: Array) -> Any:
         """The rotor lies against the flank that the drive pushes."""

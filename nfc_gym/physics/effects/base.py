@@ -171,6 +171,8 @@ class Effect(ABC):
 
     family: ClassVar[str]
     summary: ClassVar[str]
+    # What a reader of the library should know besides: numbers of the law that no parameter sets.
+    remark: ClassVar[str] = ""
     # A member of the generic alternatives takes part in every contest but is never claimed by name.
     generic: ClassVar[bool] = False
     # Whether it acts in some places of the world alone, so that medians over all of a log hide what it leaves.
@@ -183,6 +185,8 @@ class Effect(ABC):
     kin: ClassVar[tuple[str, ...]] = ()
     # Whether values of its own at each of several places make sense.
     divisible: ClassVar[bool] = True
+    # Whether it sits at one place alone, and not with the same values at several.
+    lone: ClassVar[bool] = False
     # Model fields that `modulate` writes to.
     MODULATES: ClassVar[tuple[str, ...]] = ()
     # Whether the hidden state of `action` outlives the history before a segment: it then begins where the log does.

@@ -22,6 +22,7 @@ from nfc_gym.physics.effects.places import (
     joint_scales,
     largest_push,
     sized,
+    with_joint_units,
     with_units,
 )
 from nfc_gym.physics.fields import ModelFields
@@ -45,7 +46,7 @@ class _JointFriction(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.dofs = joint_dofs(model, self.where)
-        self.at = index(self.dofs)
+        self.at, self.params = index(self.dofs), with_joint_units(self.params, model, self.dofs)
 
     def model(self, fields: ModelFields, theta: Array) -> None:
         sharpen(fields, self.dofs)

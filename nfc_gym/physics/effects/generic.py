@@ -15,7 +15,7 @@ import numpy as np
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Forces, Param, Scales
 from nfc_gym.physics.effects.hysteresis import dahl, excursion
-from nfc_gym.physics.effects.places import joint_scales, sized
+from nfc_gym.physics.effects.places import joint_scales, sized, with_joint_units
 from nfc_gym.physics.fields import names_of, object_id
 
 _COUNT = 6
@@ -49,6 +49,7 @@ class _Generic(Effect):
             object_id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
             raise InputError(f"{self.family}: {self.where[0]!r} is no degree of freedom; there are: {', '.join(found)}")
         self.dof, self.coordinate = found[self.where[0]]
+        self.params = with_joint_units(self.params, model, [self.dof])
 
     def variable(self, ctx: Context) -> Array:
         """(...,) what the force is a function of."""
@@ -67,10 +68,11 @@ class _Generic(Effect):
         out.qfrc[..., self.dof] += (theta * self.basis(self.variable(ctx))).sum(-1)
 
     @classmethod
-    def _on(cls, place: str, dof: int, scales: Scales, low: float, high: float) -> "_Generic":
+    def _on(cls, model: mujoco.MjModel, place: str, dof: int, scales: Scales, low: float, high: float) -> "_Generic":
         force = max(float(scales.force[dof]), 1e-3)
         size = {"probes": (0.1 * force,), "low": -3 * force, "high": 3 * force}
-        effect = cls((place,), sized(cls.PARAMS, **{p.name: size for p in cls.PARAMS}))
+        params = with_joint_units(cls.PARAMS, model, [dof])
+        effect = cls((place,), sized(params, **{p.name: size for p in params}))
         effect.low_end, effect.high_end = low, high
         return effect
 
@@ -97,7 +99,7 @@ class GenericPosition(_Generic):
             else:
                 middle, reach = float(model.qpos0[q]), max(2.5 * spread, 1.0)
                 low, high = middle - reach, middle + reach
-            effect = cls._on(place, dof, scales, low, high)
+            effect = cls._on(model, place, dof, scales, low, high)
             effect.turning = int(model.jnt_type[joint]) == _HINGE and not model.jnt_limited[joint]
             out.append(effect)
         return out
@@ -117,7 +119,7 @@ class GenericVelocity(_Generic):
         out: list[Effect] = []
         for place, dof, _ in coordinates(model):
             top = 2 * max(float(scales.speed[dof]), 1e-2)
-            out.append(cls._on(place, dof, scales, -top, top))
+            out.append(cls._on(model, place, dof, scales, -top, top))
         return out
 
 
@@ -141,7 +143,7 @@ class GenericTime(_Generic):
         if TIME not in scales.exogenous:
             return []
         end = max(2 * float(scales.exogenous[TIME]), 1e-3)  # the signal's median lies half-way through the log
-        return [cls._on(place, dof, scales, 0.0, end) for place, dof, _ in coordinates(model)]
+        return [cls._on(model, place, dof, scales, 0.0, end) for place, dof, _ in coordinates(model)]
 
 
 class GenericMemory(_Generic):
@@ -176,7 +178,7 @@ class GenericMemory(_Generic):
         for place, dof, _ in coordinates(model):
             if "[" in place:
                 continue
-            effect = cls._on(place, dof, scales, -1.0, 1.0)
+            effect = cls._on(model, place, dof, scales, -1.0, 1.0)
             effect.reach, effect.top = excursion(model, scales, place), joint_scales(model, scales, (place,))[1]
             out.append(effect)
         return out

@@ -28,6 +28,7 @@ from nfc_gym.physics.effects.places import (
     joint_scales,
     largest_push,
     sized,
+    with_joint_units,
     with_units,
 )
 
@@ -58,6 +59,7 @@ class Hysteresis(Effect):
     def bind(self, model: mujoco.MjModel) -> None:
         dofs = joint_dofs(model, self.where)
         self.dofs, self.mobility = index(dofs), model.dof_invweight0[dofs]
+        self.params = with_joint_units(self.params, model, dofs)
 
     def rest(self, ctx: Context, theta: Array) -> Any:
         return np.zeros_like(ctx.v[..., self.dofs])

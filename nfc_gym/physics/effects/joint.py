@@ -13,6 +13,7 @@ from nfc_gym.physics.effects.places import (
     joint_scales,
     sized,
     typical,
+    with_joint_units,
     with_units,
 )
 from nfc_gym.physics.fields import ModelFields, rows_of
@@ -22,7 +23,8 @@ class _OnJoint(Effect):
     """What the laws share: scalar joints resolved to dofs."""
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.dofs = index(joint_dofs(model, self.where))
+        dofs = joint_dofs(model, self.where)
+        self.dofs, self.params = index(dofs), with_joint_units(self.params, model, dofs)
 
 
 class DampingPoly(_OnJoint):
@@ -31,7 +33,7 @@ class DampingPoly(_OnJoint):
     family = "damping_poly"
     summary = "Joint damping"
     PARAMS = (
-        Param("linear", "N m s/rad", 0.0, 1e3, probes=(0.01,), floor=-np.inf),  # less damping than the model's
+        Param("linear", "N m s/rad", -1e3, 1e3, probes=(0.01,)),  # it may be less than the model's own
         Param("quadratic", "N m s^2/rad^2", -1e3, 1e3, probes=(0.01,)),
         Param("cubic", "N m s^3/rad^3", -1e3, 1e3, probes=(0.01,)),
     )

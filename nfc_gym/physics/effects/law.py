@@ -21,9 +21,10 @@ import numpy as np
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
 from nfc_gym.physics.effects.generic import TIME, coordinates
+from nfc_gym.physics.effects.places import turns
 from nfc_gym.physics.state import rotate
 
-_FREE, _HINGE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_HINGE)
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _AXES = np.eye(3)
 
 
@@ -32,13 +33,6 @@ def degrees(model: mujoco.MjModel) -> dict[str, tuple[int, int | None]]:
     out = {place: (dof, q) for place, dof, q in coordinates(model)}
     out |= {f"{p}@body": (dof, None) for p, (dof, q) in list(out.items()) if "[" in p and q is not None}
     return out
-
-
-def turns(model: mujoco.MjModel, dof: int) -> bool:
-    """Whether a degree of freedom is an angle: a hinge, or a free joint's rotation."""
-    joint = int(model.dof_jntid[dof])
-    kind = int(model.jnt_type[joint])
-    return kind == _HINGE or (kind == _FREE and dof - int(model.jnt_dofadr[joint]) >= 3)
 
 
 def kind_of(model: mujoco.MjModel, dof: int) -> int:

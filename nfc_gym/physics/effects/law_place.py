@@ -18,6 +18,7 @@ _EDGE = 0.05  # of a patch's length: how soft its edges are
 class _Patch(OfVariable):
     """A law that acts between two ends of a coordinate of the world, which its second name says."""
 
+    remark = f"its edges are soft over {100 * _EDGE:g} % of its length"
     PARAMS = (
         Param("level", "N", -1e6, 1e6, probes=(0.1,)),
         Param("start", "m", -1e4, 1e4, probes=(0.0, 1.0), shape=True),
@@ -82,6 +83,7 @@ class LawFrictionByPlace(_Patch):
 
     family = "law_friction"
     summary = "A friction that differs in one place"
+    remark = f"{_Patch.remark}, and it turns over within {_STICK:g} m/s or rad/s"
 
     def basis(self, ctx: Context, shape: Array) -> Array:
         return (-np.tanh(ctx.v[..., self.dof] / _STICK) * self.window(ctx, shape))[..., None]

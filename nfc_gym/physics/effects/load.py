@@ -16,6 +16,7 @@ from nfc_gym.physics.effects.places import (
     joint_scales,
     moving_bodies,
     sized,
+    with_joint_units,
     with_units,
 )
 from nfc_gym.physics.fields import ModelFields
@@ -40,7 +41,9 @@ class ExternalForce(Effect):
         return self.params[0].name == "force"
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.dofs = index(joint_dofs(model, self.where)) if self.on_joint else slice(0)
+        dofs = joint_dofs(model, self.where if self.on_joint else ())
+        self.dofs = index(dofs) if self.on_joint else slice(0)
+        self.params = with_joint_units(self.params, model, dofs) if self.on_joint else self.params
         self.motions = [] if self.on_joint else [BodyMotion(model, b) for b in body_ids(model, self.where).tolist()]
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
@@ -74,6 +77,9 @@ def _ends(model: mujoco.MjModel) -> list[str]:
     return [n for n, b in zip(moving, ids, strict=True) if int(b) not in parents]
 
 
+_GALE = 100.0  # m/s; no air near the ground is faster (the strongest gust measured: 113 m/s, WMO)
+
+
 class Wind(Effect):
     """Steady wind on a body: F = push - drag v, in the world, on the hull.
 
@@ -84,6 +90,7 @@ class Wind(Effect):
     family = "wind"
     covers = ("external_force", "drag_linear")  # a gale on hardly any drag; still air (one drag for all axes)
     summary = "Steady wind"
+    lone = True
     PARAMS = (
         *(Param(f"push_{axis}", "N", -1e5, 1e5, probes=(0.1,), ambient=True) for axis in "xyz"),
         Param("drag", "N s/m", 0.0, 1e4, probes=(0.1,)),
@@ -98,10 +105,11 @@ class Wind(Effect):
         self.motion.push(ctx, joined([p - drag * v for p, v in zip(push, velocity, strict=True)]), out)
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
-        if theta[3] <= 0:
-            return super().say(theta, sd)
-        wind = theta[:3] / theta[3]
+        wind = theta[:3] / max(theta[3], 1e-300)
         speed = float(np.linalg.norm(wind))
+        # Of a push without a drag that is surely there the speed of the air is not known.
+        if theta[3] <= (0 if sd is None else 2 * sd[3]) or speed > _GALE:
+            return super().say(theta, sd)
         heading = ", ".join(f"{w:.2g}" for w in wind / max(speed, 1e-300))
         return f"{self.summary} at {self.place}: {speed:.3g} m/s along ({heading}), drag {theta[3]:.3g} N s/m."
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import mujoco
 import numpy as np
@@ -68,6 +69,21 @@ def _floating(model: mujoco.MjModel) -> set[int]:
         if grounded and slides > 1 and not driven & set(joints):
             out |= set(joints)
     return out
+
+
+def turns(model: mujoco.MjModel, dof: int) -> bool:
+    """Whether a degree of freedom is an angle: a hinge, or a free joint's rotation."""
+    joint = int(model.dof_jntid[dof])
+    kind = int(model.jnt_type[joint])
+    return kind == _HINGE or (kind == _FREE and dof - int(model.jnt_dofadr[joint]) >= 3)
+
+
+def with_joint_units(params: Iterable[Param], model: mujoco.MjModel, dofs: Iterable[int]) -> tuple[Param, ...]:
+    """The same parameters with units that fit what they act on: families declare those of a hinge."""
+    if any(turns(model, int(d)) for d in dofs):
+        return tuple(params)
+    slid = (("kg m^2", "kg"), ("N m", "N"), ("rad", "m"))
+    return tuple(replace(p, unit=reduce(lambda unit, pair: unit.replace(*pair), slid, p.unit)) for p in params)
 
 
 def force_unit(model: mujoco.MjModel, joint: str) -> str:

@@ -41,6 +41,8 @@ def thrusters(model: mujoco.MjModel, body: int) -> tuple[list[int], Array]:
 class _Rotor(Effect):
     """What both share: the total thrust along its common axis, from the actuators' forces one substep before."""
 
+    lone = True
+
     def bind(self, model: mujoco.MjModel) -> None:
         self.motion = BodyMotion(model, int(body_ids(model, self.where)[0]))
         actuators, pushes = thrusters(model, self.motion.body)

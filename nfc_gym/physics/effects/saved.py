@@ -92,7 +92,7 @@ def _keys(row: Any) -> tuple[str, str | list[str], Mapping[str, Any]]:
     names = [where] if isinstance(where, str) else where
     if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):
         raise InputError(
-            f"effect {family!r}: `where` is a name of the model or a list of names, and not {_short(where)}"
+            f"effect {family!r}: `where` is a name of the model, a list of names, or `all`, and not {_short(where)}"
         )
     if not isinstance(parameters, Mapping) or not all(isinstance(k, str) for k in parameters):
         raise InputError(

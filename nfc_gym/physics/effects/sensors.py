@@ -1,4 +1,4 @@
-"""Sensors that report something else than the truth: bias, gain, delay, misalignment. `where` is a channel name.
+"""Sensors that report something else than the truth: bias, gain, delay, misalignment. `where` names channels.
 
 A channel that the start state is read from carries its fault into that state: `unsense` takes it out again.
 """
@@ -68,10 +68,19 @@ def unit_of(model: mujoco.MjModel, channel: str) -> str:
 
 
 class _OnChannel(Effect):
-    """What the faults share: one channel, resolved."""
+    """What the faults share: channels, resolved; each has the fault."""
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.at = resolve_channel(model, self.where[0])
+        self.at = {channel: resolve_channel(model, channel) for channel in self.where}
+
+    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        for channel in self.where:
+            q, v = self.undo(channel, q, v, theta)
+        return q, v
+
+    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        """`unsense` for one channel."""
+        raise NotImplementedError
 
     @staticmethod
     def _channels(model: mujoco.MjModel, scales: Scales) -> list[tuple[str, Place, float, float]]:
@@ -97,19 +106,20 @@ class SensorBias(_OnChannel):
         return cls.ON_VECTOR if set(names) == set("xyz") else super().declare(names)
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
-        return values + theta[..., None, :] if channel == self.where[0] else values
+        return values + theta[..., None, :] if channel in self.where else values
 
-    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        if self.at.kind == "joint" and self.at.quantity in ("pos", "vel"):
+    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        at = self.at[channel]
+        if at.kind == "joint" and at.quantity in ("pos", "vel"):
             q, v = np.array(q), np.array(v)
-            target, at = (q, self.at.q) if self.at.quantity == "pos" else (v, self.at.v)
-            target[..., at] -= theta[..., 0]
-        elif self.at.kind == "body" and self.at.quantity == "linvel" and self.at.v is not None:
+            target, column = (q, at.q) if at.quantity == "pos" else (v, at.v)
+            target[..., column] -= theta[..., 0]
+        elif at.kind == "body" and at.quantity == "linvel" and at.v is not None:
             v = np.array(v)
-            v[..., self.at.v : self.at.v + 3] -= theta
-        elif self.at.kind == "body" and self.at.quantity == "angvel@body" and self.at.v is not None:
+            v[..., at.v : at.v + 3] -= theta
+        elif at.kind == "body" and at.quantity == "angvel@body" and at.v is not None:
             v = np.array(v)
-            v[..., self.at.v + 3 : self.at.v + 6] -= theta
+            v[..., at.v + 3 : at.v + 6] -= theta
         return q, v
 
     @classmethod
@@ -139,20 +149,20 @@ class SensorGain(_OnChannel):
     with_speed = True
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
-        return values * theta[..., None, :] if channel == self.where[0] else values
+        return values * theta[..., None, :] if channel in self.where else values
 
-    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        if self.at.kind == "joint" and self.at.quantity in ("pos", "vel"):
+    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        at = self.at[channel]
+        if at.kind == "joint" and at.quantity in ("pos", "vel"):
             q, v = np.array(q), np.array(v)
-            if self.at.quantity == "pos":
-                q[..., self.at.q] /= theta[..., 0]
-            if self.at.quantity == "vel" or self.with_speed:
-                v[..., self.at.v] /= theta[..., 0]
-        elif (
-            self.at.kind == "body" and self.at.quantity in ("linvel", "angvel@body", "angvel") and self.at.v is not None
-        ):
+            if at.quantity == "pos":
+                q[..., at.q] /= theta[..., 0]
+            alone = f"{channel.removesuffix(':pos')}:vel" not in self.where
+            if at.quantity == "vel" or (self.with_speed and alone):
+                v[..., at.v] /= theta[..., 0]
+        elif at.kind == "body" and at.quantity in ("linvel", "angvel@body", "angvel") and at.v is not None:
             v = np.array(v)
-            first = self.at.v + (0 if self.at.quantity == "linvel" else 3)
+            first = at.v + (0 if at.quantity == "linvel" else 3)
             v[..., first : first + 3] /= theta
         return q, v
 
@@ -175,7 +185,7 @@ class SensorDelay(_OnChannel):
     PARAMS = (Param("delay", "s", 0.0, 0.5, probes=(0.02,)),)
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
-        if channel != self.where[0]:
+        if channel not in self.where:
             return values
         count = values.shape[-2]
         when = np.arange(count) - theta[..., :1] / dt
@@ -187,19 +197,20 @@ class SensorDelay(_OnChannel):
         there = np.take_along_axis(values, np.broadcast_to(after[..., None], values.shape), -2)
         return here + (when - before)[..., None] * (there - here)
 
-    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        if self.at.q is None or self.at.v is None or self.at.quantity not in ("pos", "quat"):
+    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        at = self.at[channel]
+        if at.q is None or at.v is None or at.quantity not in ("pos", "quat"):
             return q, v
         q = np.array(q)
         late = theta[..., :1]
-        if self.at.kind == "joint":
-            q[..., self.at.q : self.at.q + 1] += late * v[..., self.at.v : self.at.v + 1]
-        elif self.at.quantity == "pos":
-            q[..., self.at.q : self.at.q + 3] += late * v[..., self.at.v : self.at.v + 3]
+        if at.kind == "joint":
+            q[..., at.q : at.q + 1] += late * v[..., at.v : at.v + 1]
+        elif at.quantity == "pos":
+            q[..., at.q : at.q + 3] += late * v[..., at.v : at.v + 3]
         else:
-            turn = vector_to_quat(late * v[..., self.at.v + 3 : self.at.v + 6])
-            quat = q[..., self.at.q + 3 : self.at.q + 7]
-            q[..., self.at.q + 3 : self.at.q + 7] = quat_multiply(quat, turn)
+            turn = vector_to_quat(late * v[..., at.v + 3 : at.v + 6])
+            quat = q[..., at.q + 3 : at.q + 7]
+            q[..., at.q + 3 : at.q + 7] = quat_multiply(quat, turn)
         return q, v
 
     @classmethod
@@ -216,26 +227,25 @@ class Misalignment(_OnChannel):
     PARAMS = tuple(Param(axis, "rad", -0.3, 0.3, probes=(0.03,), resolution=5e-4) for axis in "xyz")
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
-        if channel != self.where[0]:
+        if channel not in self.where:
             return values
         mount = vector_to_quat(theta)[..., None, :]
-        if self.at.dim == 4:
+        if self.at[channel].dim == 4:
             return quat_multiply(values, np.broadcast_to(mount, values.shape))
         return rotate(np.broadcast_to(quat_conjugate(mount), (*values.shape[:-1], 4)), values)
 
-    def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        if self.at.kind != "body" or self.at.q is None or self.at.v is None:
+    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
+        at = self.at[channel]
+        if at.kind != "body" or at.q is None or at.v is None:
             return q, v
         mount = vector_to_quat(theta)
-        if self.at.quantity == "quat":
+        if at.quantity == "quat":
             q = np.array(q)
-            quat = q[..., self.at.q + 3 : self.at.q + 7]
-            q[..., self.at.q + 3 : self.at.q + 7] = quat_multiply(
-                quat, np.broadcast_to(quat_conjugate(mount), quat.shape)
-            )
-        elif self.at.quantity in ("linvel", "angvel@body"):
+            quat = q[..., at.q + 3 : at.q + 7]
+            q[..., at.q + 3 : at.q + 7] = quat_multiply(quat, np.broadcast_to(quat_conjugate(mount), quat.shape))
+        elif at.quantity in ("linvel", "angvel@body"):
             v = np.array(v)
-            first = self.at.v + (0 if self.at.quantity == "linvel" else 3)
+            first = at.v + (0 if at.quantity == "linvel" else 3)
             part = v[..., first : first + 3]
             v[..., first : first + 3] = rotate(np.broadcast_to(mount, (*part.shape[:-1], 4)), part)
         return q, v
