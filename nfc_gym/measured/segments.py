@@ -61,7 +61,7 @@ class Cut:
     step: Array
 
 
-def stepped(log: Log) -> NDArray[np.bool_]:
+def _stepped(log: Log) -> NDArray[np.bool_]:
     """(T,) rows at which a command steps: changes by much more than it usually does from one row to the next."""
     out = np.zeros(len(log), bool)
     for values in log.controls.values():
@@ -76,12 +76,17 @@ def _calm(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     Where a command steps so does the acceleration, and a smooth curve through the rows on both sides has a wrong slope
     there: always to the side of the command, as if a gain, an inertia or an offset were off.
     """
-    rows, settled = np.flatnonzero(stepped(log)), round(_SETTLED / log.interval)
-    out = np.ones((2, len(log)), bool)
-    for k, before in enumerate((0, settled)):
-        for row in rows:
-            out[k, max(row - _AROUND + 1, 0) : row + _AROUND + before] = False
-    return out[0], out[1]
+    rows, settled = np.flatnonzero(_stepped(log)), round(_SETTLED / log.interval)
+    near, late = (_between(len(log), rows - _AROUND + 1, rows + _AROUND + more) for more in (0, settled))
+    return ~near, ~late
+
+
+def _between(size: int, first: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """(size,) which rows lie in any of the stretches that begin at `first` and end before `end`."""
+    edges = np.zeros(size + 1, int)
+    np.add.at(edges, np.clip(first, 0, size), 1)
+    np.add.at(edges, np.clip(end, 0, size), -1)
+    return np.cumsum(edges[:-1]) > 0
 
 
 def _put_off(log: Log, row: int, calm: tuple[NDArray[np.bool_], NDArray[np.bool_]], until: float) -> int:
