@@ -205,8 +205,8 @@ def test_whatever_a_reader_trips_over_is_the_files_fault(tmp_path: Path) -> None
         (3, "an effect is a mapping with the keys family, where, parameters, and not 3"),
         ({"family": "gain", "where": "m"}, "'parameters' is missing"),
         ({"family": ["gain"], "where": "m", "parameters": {}}, "family is a name"),
-        ({"family": "gain", "where": [None], "parameters": {}}, r"`where` is a name of the model or a list"),
-        ({"family": "gain", "where": [], "parameters": {}}, r"`where` is a name of the model or a list"),
+        ({"family": "gain", "where": [None], "parameters": {}}, r"`where` is a name of the model, a list of names"),
+        ({"family": "gain", "where": [], "parameters": {}}, r"`where` is a name of the model, a list of names"),
         ({"family": "gain", "where": "m", "parameters": [1]}, "`parameters` is a mapping"),
         (
             {"family": "coulomb", "where": "m", "parameters": {"level": float("nan")}},
