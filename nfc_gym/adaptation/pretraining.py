@@ -31,6 +31,7 @@ from nfc_gym.adaptation.record import Episodes, Record, in_words
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.threads import limit_threads
 from nfc_gym.adaptation.worlds import robot_of, training_env, vector_env
+from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError, NfcError
 from nfc_gym.core.files import require_writable
 from nfc_gym.inference.jobs import device_of
@@ -153,13 +154,15 @@ def pretrain(
       The policy, its return over `EPISODES` whole episodes in the nominal world in `about`.
 
     Raises:
-      InputError: arguments that cannot be, or the state of another run beside `out`.
+      InputError: arguments that cannot be, something else than a policy at `out`, or the state of another run beside
+        it.
       MissingExtra: a cluster is asked for, and Ray is not installed.
       Diverged: the loss came apart; `out` then holds the last good weights.
       NfcError: the cluster failed; the state beside `out` is that of the last batch.
     """
     path = Path(out)
     check_suffix(path)
+    kinds.require_kind(path, kinds.POLICY)
     require_writable(path.absolute().parent)
     training = Training(
         environment=full_id(environment), seed=seed, envs=envs, horizon=horizon, net=net, spread=spread, task=task

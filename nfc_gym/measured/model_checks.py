@@ -14,11 +14,12 @@ from nfc_gym.measured.observe import observer
 from nfc_gym.measured.stiffness import stiffness_findings
 from nfc_gym.measured.units import si_unit
 from nfc_gym.measured.yaml_marks import suggest
+from nfc_gym.physics.effects.drive import command_unit
 from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.parameters import COMPOUND, ParameterSpace, resolve, split_field
 
 _OBJ = mujoco.mjtObj
-_EFFORTS = ("N m", "N", "A", "V", "K", "Pa")  # what drives that are no servos are commanded by
+_GOALS = ("rad", "m", "rad/s", "m/s")  # units that servos are commanded in, and nothing else
 MOST_STEPS = 100_000  # of a segment with its history; usual are a hundred
 
 
@@ -96,22 +97,12 @@ def _command_units(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]
         unit = si_unit(control.unit or "1")
         if a < 0 or control.servo is not None or unit == "1":
             continue
-        if int(model.actuator_trntype[a]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-            continue
-        slides = int(model.jnt_type[model.actuator_trnid[a, 0]]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
-        _, stiff, damped = model.actuator_biasprm[a, :3]
-        way = "m" if slides else "rad"
-        if stiff:
-            kind, wanted = "a position servo", (way,)
-        elif damped:
-            kind, wanted = "a velocity servo", (f"{way}/s",)
-        else:
-            kind, wanted = "no servo", _EFFORTS
-        if unit not in wanted:
-            message = f"the actuator is {kind} of a joint that {'slides' if slides else 'turns'}, but the unit is"
-            yield Finding(
-                "warning", f"controls.{name}", f"{message} {unit!r}", f"want {', '.join(wanted)}; or 1 for none"
-            )
+        wanted = command_unit(model, a)
+        fits = unit == wanted if wanted in _GOALS else unit not in _GOALS
+        if not fits:
+            want = wanted if wanted in _GOALS else "a force, a torque or what stands for one, such as N m, A or V"
+            message = f"the actuator is commanded in {wanted}, but the unit is {unit!r}"
+            yield Finding("warning", f"controls.{name}", message, f"want {want}; or 1 for none")
 
 
 def _absent(where: str, kind: str, name: str, names: dict[str, list[str]]) -> Finding | None:

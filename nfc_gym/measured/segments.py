@@ -1,8 +1,9 @@
 """Cutting logs into segments: starts, commands on the grid of physics steps, and where the samples fall on it."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -161,8 +162,10 @@ def commanded(time: Array, values: Array, at: Array, dt: float, linear: bool) ->
     changed = np.flatnonzero(last > first) if not linear else first[:0]
     if not len(changed):
         return held
+    rows = slice(max(int(first[changed].min()) - 1, 0), int(last[changed].max()) + 1)  # a log may be far longer
     out, begin = held.astype(float), at[changed]
-    out[changed] = (_integral(time, values, begin + dt) - _integral(time, values, begin)) / dt
+    to, since = _integral(time[rows], values[rows], np.stack([begin + dt, begin]))
+    out[changed] = (to - since) / dt
     return out
 
 
@@ -203,41 +206,22 @@ def lay(
     offsets = np.arange(-before, after) * layout.dt
     starts = [logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)]
 
-    def lane(pick: str, key: str, straight: bool = False) -> Array:
-        return np.stack(
-            [
-                resample(logs[i].time, getattr(logs[i], pick)[key], t + offsets, straight)
-                for i, t in zip(where.log, starts, strict=True)
-            ]
-        )
+    def lane(series: Callable[[Log], Array], law: Callable[[Array, Array, Array], Array]) -> Array:
+        along = zip(where.log, starts, strict=True)
+        return np.stack([law(logs[i].time, series(logs[i]), t + offsets) for i, t in along])
 
-    def given(key: str) -> Array:
-        return np.stack(
-            [
-                commanded(logs[i].time, logs[i].controls[key], t + offsets, layout.dt, key in linear)
-                for i, t in zip(where.log, starts, strict=True)
-            ]
-        )
-
+    held, straight = partial(resample, linear=False), partial(resample, linear=True)
     ctrl = np.zeros((len(where.log), len(offsets), model.nu))
     for key in logs[0].controls:
         a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, key.removeprefix("ctrl:"))
-        ctrl[:, :, a] = given(key)
+        ctrl[:, :, a] = lane(lambda log, k=key: log.controls[k], partial(commanded, dt=layout.dt, linear=key in linear))
     known = {}
     for key in logs[0].known:
         name, _, of = key.rpartition(":")
-        known[(name, tuple(of.split("+")) if of else ())] = lane("known", key)
+        known[(name, tuple(of.split("+")) if of else ())] = lane(lambda log, k=key: log.known[k], held)
     servo = []
     for key, law in laws.items():
-        terms = {
-            n: np.stack(
-                [
-                    resample(logs[i].time, logs[i].servo[key][n], t + offsets, False)
-                    for i, t in zip(where.log, starts, strict=True)
-                ]
-            )
-            for n in ("gain", "supply", "damping")
-        }
+        terms = {n: lane(lambda log, k=key, n=n: log.servo[k][n], held) for n in ("gain", "supply", "damping")}
         servo.append((law, terms))
     return Segments(
         dt=layout.dt,
@@ -245,7 +229,9 @@ def lay(
         qpos=np.stack([states[i].qpos[s] for i, s in zip(where.log, where.start, strict=True)]),
         qvel=np.stack([states[i].qvel[s] for i, s in zip(where.log, where.start, strict=True)]),
         ctrl=ctrl,
-        exogenous={k: lane("exogenous", k, k == TIME) for k in logs[0].exogenous},
+        exogenous={
+            k: lane(lambda log, k=k: log.exogenous[k], straight if k == TIME else held) for k in logs[0].exogenous
+        },
         known=known,
         servo=servo,
         condition=np.array([logs[i].condition for i in where.log]),

@@ -12,7 +12,8 @@ from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
-from nfc_gym.measured.speed_checks import DEGREES, TURN, compare_rates, follows, ratio, strangers, too_fast
+from nfc_gym.measured.speed_checks import DEGREES, TURN, explained, rate_ratio, ratio, strangers, too_fast
+from nfc_gym.physics.effects.drive import command_unit
 
 Array = NDArray[np.float64]
 
@@ -154,9 +155,9 @@ def _angle(name: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Suspic
         return
     speed = log.channels.get(f"joint:{joint}:vel")
     if speed is not None and speed.values.shape == values.shape:
-        found = list(compare_rates(where, log, values, speed.values))
-        yield from found
-        if found or follows(log, values, speed.values):
+        found = rate_ratio(log, values, speed.values)
+        if found is not None:  # its own speed is the best witness
+            yield from explained(where, found)
             return
     for command in _position_commands(joint, log, model):
         farther = ratio(command, values)
@@ -185,21 +186,20 @@ def _too_far(where: str, joint: str, values: Array, model: mujoco.MjModel | None
             return
     if (
         far > MANY_TURNS
-        and not _turns(joint, model)
+        and not _driven_by_speed(joint, model)
         and np.abs(values[-1] - values[0]) < 0.5 * np.abs(np.diff(values)).sum()
     ):
         message = f"reaches {far:.4g} rad, {far / (2 * np.pi):.0f} turns, and comes back: degrees for radians?"
         yield Suspicion("warning", where, "degrees", message, "say `unit: deg` if so")
 
 
-def _turns(joint: str, model: mujoco.MjModel | None) -> bool:
+def _driven_by_speed(joint: str, model: mujoco.MjModel | None) -> bool:
     """Whether a servo commands the joint's speed, as it does a wheel's."""
     if model is None:
         return False
-    servo = (model.actuator_biasprm[:, 1] == 0) & (model.actuator_biasprm[:, 2] != 0)
     j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
     moved = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)) & (model.actuator_trnid[:, 0] == j)
-    return j >= 0 and bool((servo & moved).any())
+    return j >= 0 and any(command_unit(model, int(a)) == "rad/s" for a in np.flatnonzero(moved))
 
 
 def _position_commands(joint: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Array]:

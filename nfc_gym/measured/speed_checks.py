@@ -25,7 +25,6 @@ _RATIOS = {
     np.pi / 30: "the speed is in rpm where rad/s is declared",
     -1.0: "position and speed have opposite signs",
 }
-_SAME = 0.7, 1.4  # derivative over measured speed, between which nothing is to be explained
 _NEAR = 0.25  # a ratio's logarithm may differ so much from that of what explains it
 _CLOCKS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # units of time -> s
 
@@ -101,23 +100,16 @@ def ratio(x: Array, y: Array) -> float | None:
     return float(np.linalg.norm(y) / np.linalg.norm(x)) * float(np.sign(x @ y))
 
 
-def _rate_ratio(log: Log, position: Array, speed: Array) -> float | None:
+def rate_ratio(log: Log, position: Array, speed: Array) -> float | None:
     """Derivative over measured speed, both (T,) and smoothed over nine samples, where the two follow each other."""
     n = min(9, max(len(log) // 10, 1))
     derived = np.gradient(position, log.time)
     return ratio(moving_average(speed, n)[n:-n], moving_average(derived, n)[n:-n])
 
 
-def follows(log: Log, position: Array, speed: Array) -> bool:
-    """Whether a position, (T,), moves as its measured speed says, in unit and sign."""
-    found = _rate_ratio(log, position, speed)
-    return found is not None and _SAME[0] < found < _SAME[1]
-
-
-def compare_rates(where: str, log: Log, position: Array, speed: Array) -> Iterator[Suspicion]:
-    """A position's derivative against the measured speed, (T,) in rad and rad/s."""
-    found = _rate_ratio(log, position, speed)
-    if found is None or _SAME[0] < found < _SAME[1]:
+def explained(where: str, found: float) -> Iterator[Suspicion]:
+    """What makes an angle's derivative `found` times its measured speed (see `rate_ratio`)."""
+    if 0.7 < found < 1.4:
         return
     for factor, what in _RATIOS.items():
         if found * factor > 0 and abs(np.log(found / factor)) < _NEAR:
@@ -138,7 +130,7 @@ def clock_unit(log: Log, entry: TimeColumn) -> str:
       log: as read with `entry`.
       entry: the mapping's `time`.
     """
-    found = [_rate_ratio(log, m.position, m.speed) for m in _motions(log)]
+    found = [rate_ratio(log, m.position, m.speed) for m in _motions(log)]
     ratios = [r for r in found if r is not None and r > 0]
     if not ratios:
         return ""

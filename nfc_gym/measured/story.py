@@ -284,13 +284,13 @@ def rivals_of(effect: dict[str, Any], effects: Sequence[dict[str, Any]]) -> list
     return [i for i in effect.get("equivalents") or [] if i not in claimed]
 
 
-def undecided(rivals: Sequence[str], effect: dict[str, Any], report: dict[str, Any]) -> str:
+def _undecided(rivals: Sequence[str], effect: dict[str, Any], report: dict[str, Any]) -> str:
     """That the contest left an effect's rivals standing; and where they lie far enough apart to be told, that too."""
     text = f"explains these logs no better than {listed(list(rivals), 4)}"
     for row in report.get("identifiability") or []:
         sigma, rival = finite(row.get("sigma")), row.get("worst_mimic")
         if row.get("id") == effect.get("id") and rival in rivals and row.get("distinguishable") and sigma:
-            text += f", though {rival} should lie {number(sigma, 2)} sigma away: a longer record would tell"
+            text += f", though {rival} should lie {number(sigma, 2)} sigma away"
     return text
 
 
@@ -301,7 +301,7 @@ def _on_effects(report: dict[str, Any]) -> list[str]:
     out = []
     for e in effects:
         if rivals := rivals_of(e, effects):
-            out.append(f"{e.get('id')} {undecided(rivals, e, report)}.")
+            out.append(f"{e.get('id')} {_undecided(rivals, e, report)}.")
         share = finite(e.get("share_of_excess"))
         if share is not None and share < _SLIGHT:
             part = f"takes away {percent(share)} of the excess error on the verification logs"
