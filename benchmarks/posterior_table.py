@@ -3,7 +3,7 @@
     python benchmarks/posterior_table.py --out DIR [--robots Jackal Ant ...] [--terrain Flat Rough] [--windows 100000]
         [--methods mdn-rff mdn-tcn sde-nn sde-rff sde-fks sde-tcn flow-tcn sbi-npe sbi-npse]
         [--inputs window summaries] [--effects 0] [--seeds 0] [--epochs 100] [--budget SECONDS]
-        [--extras ceiling residuals axle rounds plots]
+        [--extras ceiling residuals motion axle rounds plots]
     python benchmarks/posterior_table.py --quick
 
 Windows are simulated once into DIR and used by every method; a cell (robot, ground, method, inputs, seed) that is
@@ -15,7 +15,8 @@ at the same time, as `posterior_queue.py` has them do. `--quick` is a toy in a t
 nothing.
 
 The windows are of the simulator as it is, as the ceiling's are; `--effects 0.5` gives half of them an effect that the
-model lacks. The residual heads learn from windows of their own, of which half have one.
+model lacks. The residual heads learn from windows of their own, of which half have one: `residuals` all of them from
+motion and maps, `motion` those of delta_s and of structure from motion alone.
 
 Gain is the mean log density of the true parameters on windows not trained on, in nats a parameter, the prior having 0.
 """
@@ -45,7 +46,7 @@ from posteriors.sets import Sets, environment, prior_of
 from nfc_gym.core.errors import InputError, MissingExtra
 from nfc_gym.inference.progress import Spoken
 
-EXTRAS = ("ceiling", "residuals", "axle", "rounds", "plots")
+EXTRAS = ("ceiling", "residuals", "motion", "axle", "rounds", "plots")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,9 +28,10 @@ if TYPE_CHECKING:
 ROOM = 10 * 2**30  # of a GPU's memory that densities of one second round's proposals take
 
 
-def _residuals(run: Run, robot: str, terrain: str, sets: Sets) -> None:
-    name, env, args = f"{robot}{terrain}_residuals", environment(robot, terrain), run.args
-    struck = Sets(args.data, env, args.residual_windows, args.judges, HALF, True, args.jobs, run.device)
+def _residuals(run: Run, robot: str, terrain: str, sets: Sets, what: str = "residuals") -> None:
+    name, env, args = f"{robot}{terrain}_{what}", environment(robot, terrain), run.args
+    maps = what == "residuals"
+    struck = Sets(args.data, env, args.residual_windows, args.judges, HALF, maps, args.jobs, run.device)
     run.kept.once(name, lambda: residuals.heads(
         env, struck, prior_of(env), run.plan, run.folder(name), run.device, args.samples, args.few,
         Spoken())[1], trained_on=args.residual_windows)  # fmt: skip
@@ -91,5 +93,9 @@ def _opened(file: Path, run: Run) -> Network:
 
 
 EXTRAS: dict[str, Callable[..., None]] = {
-    "residuals": _residuals, "axle": _axle, "rounds": _rounds, "plots": _plots,
-}  # fmt: skip
+    "residuals": _residuals,
+    "motion": partial(_residuals, what="motion"),
+    "axle": _axle,
+    "rounds": _rounds,
+    "plots": _plots,
+}

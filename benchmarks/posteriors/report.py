@@ -184,6 +184,6 @@ def _others(results: Results) -> list[str]:
     """What is no method's cell, as it is: one line a figure."""
     rows = []
     for name, found in results.items():
-        if name.split("_")[-1] in ("residuals", "axle", "rounds"):
+        if name.split("_")[-1] in ("residuals", "motion", "axle", "rounds"):
             rows += [[name, k, shown(v) if isinstance(v, list) and len(v) == 2 else str(v)] for k, v in found.items()]
     return ["## More\n", lines(["", "figure", "value"], rows)] if rows else []

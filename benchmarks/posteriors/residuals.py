@@ -30,28 +30,30 @@ def heads(
     env: str, sets: Sets, prior: PriorBox, plan: Plan, folder: Path, device: torch.device, samples: int, few: int,
     report: Report,
 ) -> tuple[Network, dict[str, Any]]:  # fmt: skip
-    """Train SDE + TCN with all heads, and what is measured of them.
+    """Train SDE + TCN with all heads, or without delta_e where the windows have no maps, and what is measured of them.
 
     Args:
       env: its id.
-      sets: windows with maps, part of them with effects; on flat ground too, where delta_e is the camera's error.
+      sets: windows, part of them with effects; on flat ground delta_e is the camera's error.
       prior, plan, folder, device, report: see `fit`.
       samples: draws a window.
       few: windows that are replayed, or whose maps are drawn.
     """
     judged, batch = sets.judged, sets.judges.noisy()
     config = replace(
-        network_config(METHODS[OURS], "map", plan.small),
-        delta_s=True, delta_e=True, families=tuple(judged.manifest.families), draws=1 if plan.small else 4,
+        network_config(METHODS[OURS], "map" if sets.maps else "window", plan.small),
+        delta_s=True, delta_e=sets.maps, families=tuple(judged.manifest.families), draws=1 if plan.small else 4,
     )  # fmt: skip
     done = fit_network(config, sets.windows, prior, plan, 0, folder, device, report)
     network = done.fitted.network
-    out: dict[str, Any] = {"seconds": done.outcome.seconds, "epochs": len(done.outcome.held_out)}
+    trained = done.outcome
+    out: dict[str, Any] = {"seconds": trained.seconds, "epochs": len(trained.held_out), "best": trained.best}
     out |= dynamics(network, batch, samples)
     sizes = strengths(env, judged, batch, len(judged) if few >= len(judged) else 4 * few)
     out |= structure(network, batch, sizes)
     out |= replays(env, network, judged, batch, few)
-    out |= terrain(network, batch, min(samples, 64), few)
+    if sets.maps:
+        out |= terrain(network, batch, min(samples, 64), few)
     return network, out
 
 
@@ -142,7 +144,7 @@ def replays(env: str, network: Network, judged: Windows, batch: dict[str, torch.
     family = batch["family"].cpu().numpy()
     rng = np.random.default_rng(0)
     given = NeuralPosterior(network)
-    pairs, apart = [], 0
+    pairs, means, scores, apart = [], [], [], 0
     for i in np.flatnonzero(family > 0)[:few]:
         part = {k: batch[k][i].cpu().numpy() for k in ("states", "actions", "map") if k in batch}
         of = given.given(Window(part["states"], part["actions"], part.get("map"))).of("psi", "delta_s")
@@ -155,21 +157,27 @@ def replays(env: str, network: Network, judged: Windows, batch: dict[str, torch.
             made = [replayed(machine, one, u, jitter, 1, d) for d in (None, np.asarray(drawn.delta_s))]
         truth = one["states"][0].astype(float)
         truth[:, machine.angles] = np.unwrap(truth[:, machine.angles], axis=0)
-        wrong = [
-            ((m.reshape(_REPLAYS, h, -1) - truth[1:])[..., told] / machine.noise[told]) ** 2 for m in made
-        ]  # fmt: skip
-        fine = np.isfinite(wrong[0]).all((1, 2)) & np.isfinite(wrong[1]).all((1, 2))
-        if not fine.any():
+        off = [((m.reshape(_REPLAYS, h, -1) - truth[1:])[..., told] / machine.noise[told]) for m in made]
+        fine = np.isfinite(off[0]).all((1, 2)) & np.isfinite(off[1]).all((1, 2))
+        if fine.sum() < 2:
             apart += 1
             continue
-        pairs.append([np.sqrt(w[fine].mean()) for w in wrong])
+        held = [o[fine] for o in off]
+        pairs.append([np.sqrt((o**2).mean()) for o in held])
+        means.append([np.sqrt((o.mean(0) ** 2).mean()) for o in held])
+        flat = [o.reshape(1, len(o), -1) for o in held]
+        scores.append([metrics.energy_score(f, np.zeros((1, f.shape[-1])))[0] for f in flat])
     if not pairs:
         raise InputError(f"{env}: no window with an effect can be replayed")
     without, with_ = np.array(pairs).T
+    mean_without, mean_with = np.array(means).T
+    score_without, score_with = np.array(scores).T
     return {
         "replay: error without delta_s [sd]": metrics.mean(without),
         "replay: error with sampled delta_s [sd]": metrics.mean(with_),
         "replay: log of with over without": metrics.mean(np.log(with_ / without)),
+        "replay: log of with over without, of the draws' mean": metrics.mean(np.log(mean_with / mean_without)),
+        "replay: log of with over without, energy score": metrics.mean(np.log(score_with / score_without)),
         "replay: windows left out": apart,
     }
 
