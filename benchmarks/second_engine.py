@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def states(place: str, scenario: str, engine: str, command: Callable[[int], Array], steps: int) -> tuple[Array, Array]:
     """Poses (T + 1, 7) and velocities (T + 1, 6) of one robot in one engine."""
-    env = World(place, scenario, 0, noisy=False, engine=engine).make(1, context=["psi"], max_episode_steps=None)
+    env = World(place, scenario, 0, noisy=False, engine=engine).make(1, context=["psi"], max_episode_steps=-1)
     env.reset(seed=3)
     rows = [state_of(env)[:2]]
     for k in range(steps):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.saved import from_row
-from nfc_gym.wrappers.effects_file import read_effects
+from nfc_gym.wrappers.effects_file import psi_said, read_effects
 
 Array = NDArray[np.float64]
 REPORT, EFFECTS, MODEL = "report.json", "effects.yaml", "model.xml"
@@ -130,7 +130,7 @@ def _folder(source: Path, there: Mapping[str, Path]) -> Found:
         return Found(source, effects, _parameters(there[REPORT], report), verdict=report.get("verdict"))
     file, data = there[EFFECTS], read_effects(there[EFFECTS])
     rows, carried = list(data["effects"]), [str(i) for i in data.get("carried_by_model") or []]
-    psi = _psi(file, data.get("psi") or {})
+    psi = psi_said(file, data)
     if report is None:
         if carried and MODEL not in there:
             raise InputError(
@@ -162,12 +162,6 @@ def _report(file: Path) -> dict[str, Any]:
     if not isinstance(report, dict) or not {"effects", "parameters"} <= set(report):
         raise InputError(f"{file}: is no report of `nfc-gym close-loop`: it has no `effects` and `parameters`")
     return report
-
-
-def _psi(file: Path, given: Any) -> dict[str, float]:
-    if not isinstance(given, Mapping):
-        raise InputError(f"{file}: psi is a mapping of names to numbers, and not {given!r}")
-    return {str(k): _finite(file, f"psi {k}", v) for k, v in given.items()}
 
 
 def _parameters(file: Path, report: Mapping[str, Any]) -> tuple[Calibrated, ...]:

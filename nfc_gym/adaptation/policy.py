@@ -177,7 +177,11 @@ def load_policy(source: str | Path, device: str | torch.device = "cpu") -> Polic
     Raises:
       InputError: no such file, no pretrained policy of that id, a damaged file or one of another format.
     """
-    path = _pretrained(str(source)) if Path(source).suffix.lower() != SUFFIX else Path(source)
+    path = Path(source)
+    if path.suffix.lower() != SUFFIX:
+        if path.exists():
+            raise InputError(f"policy {path}: want a {SUFFIX} file that `nfc-gym pretrain` or `adapt` wrote")
+        path = _pretrained(str(source))
     if not path.is_file():
         raise InputError(f"policy {path}: no such file; want one that `nfc-gym pretrain` wrote, or an environment's id")
     tensors, metadata = read(path)

@@ -90,7 +90,9 @@ class Sight:
         parts = []
         for key, size in (("proprio", self.proprio), ("goal", self.goal)):
             if size:
-                part = np.asarray(observation.get(key, np.zeros(0)), np.float32)
+                if key not in observation:
+                    raise InputError(f"an observation of {', '.join(observation)}, without {key!r}, for {self.says()}")
+                part = np.asarray(observation[key], np.float32)
                 if part.shape[-1:] != (size,):
                     raise InputError(f"an observation whose {key!r} has shape {part.shape} for {self.says()}")
                 parts.append(part)

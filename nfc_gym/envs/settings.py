@@ -65,6 +65,8 @@ class Settings:
             raise InputError(f"reward_type is {self.reward_type!r}, want one of: {', '.join(GOAL_REWARDS)}")
         if self.reward_type != GOAL_REWARDS[0] and not self.goal_conditioned:
             raise InputError(f"reward_type is {self.reward_type!r}, which wants goal_conditioned=True beside it")
+        if not isinstance(self.goal_conditioned, bool):
+            raise InputError(f"goal_conditioned is {self.goal_conditioned!r}, want True or False")
         if self.goal_conditioned and not kind.place_size:
             raise InputError(f"goal_conditioned: the {kind.name} has no goals to reach")
         parts = () if isinstance(self.context, str) or not isinstance(self.context, Iterable) else self.context

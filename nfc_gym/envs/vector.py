@@ -32,6 +32,7 @@ from nfc_gym.envs.contract import (
 )
 from nfc_gym.envs.forking import require_threads
 from nfc_gym.envs.look import HeldMaps
+from nfc_gym.envs.registry import EPISODE
 from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.screen import Screen, warn_without_mode
 from nfc_gym.envs.settings import Settings
@@ -47,7 +48,8 @@ class RobotVectorEnv(VectorEnv):
     Args:
       robot, rough: as `RobotEnv`.
       num_envs: n.
-      max_episode_steps: control steps after which an episode is truncated; None is never.
+      max_episode_steps: control steps after which an episode is truncated; as in `gymnasium.make` None is 1000, and
+        -1 never.
       autoreset_mode: `AutoresetMode` or its value.
       nthread: threads of the batch; 0 takes every core.
       render_mode: None or `rgb_array`.
@@ -72,7 +74,7 @@ class RobotVectorEnv(VectorEnv):
         rough: bool = False,
         *,
         num_envs: int = 1,
-        max_episode_steps: int | None = 1000,
+        max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         nthread: int = 0,
         render_mode: str | None = None,
@@ -87,8 +89,9 @@ class RobotVectorEnv(VectorEnv):
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.after_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
-        endless = max_episode_steps is None or max_episode_steps == -1  # which is how Gymnasium's `make` says it
-        self._horizon = np.iinfo(np.int64).max if endless else require_whole("max_episode_steps", max_episode_steps, 1)
+        steps = EPISODE if max_episode_steps is None else max_episode_steps
+        endless = steps == -1
+        self._horizon = np.iinfo(np.int64).max if endless else require_whole("max_episode_steps", steps, 1)
 
         pool = self._given.pool
         self._build([pool.map(k) for k in range(pool.size)] if rough else [])

@@ -84,7 +84,10 @@ class _Common(RecordConstructorArgs):
             seed = self.env.unwrapped.np_random_seed
         if isinstance(seed, list | tuple):  # one a row: the first that is given counts
             seed = next((s for s in seed if s is not None), None)
-        entropy = None if seed is None or seed < 0 else [int(seed), crc32(kind(self).encode()), self._depth]
+        if not isinstance(seed, int | np.integer) or seed < 0:  # the environment refuses what is no seed
+            entropy = None
+        else:
+            entropy = [int(seed), crc32(kind(self).encode()), self._depth]
         self.rng = np.random.default_rng(entropy)
         return self.rng
 

@@ -22,7 +22,7 @@ class Belief:
     Args:
       samples: (n,) of the posterior.
       space: psi's, where the samples hold psi.
-      modes: how many modes of delta_e at most.
+      modes: how many modes of delta_e at most, one or more where the samples hold it.
 
     Attributes:
       size: of h: psi's, then the modes', then delta_s's entries.

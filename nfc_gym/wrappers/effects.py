@@ -23,7 +23,9 @@ from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
-from nfc_gym.wrappers.effects_file import check_model, read_effects
+from nfc_gym.wrappers.effects_file import check_model, psi_said, read_effects
+from nfc_gym.wrappers.order import beneath
+from nfc_gym.wrappers.psi import RandomizePsi, VectorRandomizePsi
 from nfc_gym.wrappers.simulation import Simulation, simulation_of
 
 Array = NDArray[np.float64]
@@ -125,6 +127,18 @@ def own_values(effects: Sequence[Effect], each: Sequence[ArrayLike], shape: tupl
     return found
 
 
+def with_psi(env: Any, effects: Given, randomize: type[RandomizePsi] | type[VectorRandomizePsi]) -> Any:
+    """The environment with the psi that an `effects.yaml` says beside its effects, in every episode.
+
+    A wrapper that writes it is put around the environment; that of an earlier turn, as of a spec, will do.
+    """
+    if not isinstance(effects, str | os.PathLike):
+        return env
+    bounds = {name: (value, value) for name, value in psi_said(effects, read_effects(effects)).items()}
+    there = (w.arguments["distribution"] for w in beneath(env) if isinstance(w, RandomizePsi | VectorRandomizePsi))
+    return env if not bounds or any(d == bounds for d in there) else randomize(env, bounds)
+
+
 class Application:
     """Effects wired into a simulation, one or a batch.
 
@@ -200,7 +214,7 @@ class ApplyEffects(EnvWrapper):
     Args:
       env: any MuJoCo environment.
       effects: (effect, values) pairs, rows `{"family": ..., "where": ..., "parameters": {name: value}}`, or the path
-        of an `effects.yaml`. They act in this order.
+        of an `effects.yaml`. They act in this order. The `psi` that such a file may have holds in every episode.
       exogenous: signals that effects read: name -> a number, or a function of the episode's time in s (`exo:time` is
         given).
       condition: which condition's values effects that differ between conditions have.
@@ -221,6 +235,8 @@ class ApplyEffects(EnvWrapper):
         exogenous: Mapping[str, Signal] | None = None,
         condition: str | None = None,
     ) -> None:
+        self.require(env)
+        env = with_psi(env, effects, RandomizePsi)
         super().__init__(env, effects=effects, exogenous=exogenous, condition=condition)
         self.sim = simulation_of(env, "ApplyEffects")
         self.application = Application(self.sim, effects, exogenous, condition)
@@ -289,6 +305,8 @@ class VectorApplyEffects(VectorEnvWrapper):
         condition: str | None = None,
         values: Sequence[ArrayLike] | None = None,
     ) -> None:
+        self.require(env)
+        env = with_psi(env, effects, VectorRandomizePsi)
         super().__init__(env, effects=effects, exogenous=exogenous, condition=condition, values=values)
         self.sim = batch_simulation_of(env, "ApplyEffects")
         self.application = Application(self.sim, effects, exogenous, condition, values)

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ _TELLING = (
 
 
 def read_effects(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """An `effects.yaml`: the keys `version`, `model_sha256` and `effects`, a list of rows.
+    """An `effects.yaml`: `version`, which is 1, `effects`, a list of rows, and perhaps `model_sha256` and `psi`.
 
     Raises:
       InputError: no such file, no YAML, another version, or keys that are missing.
@@ -37,10 +38,31 @@ def read_effects(path: str | os.PathLike[str]) -> dict[str, Any]:
     except (yaml.YAMLError, ValueError, RecursionError) as e:
         raise InputError(f"{path}: is no YAML ({str(e).splitlines()[0]})") from None
     if not isinstance(data, dict) or not isinstance(data.get("effects"), list):
-        raise InputError(f"{path}: an effects.yaml has the keys version, model_sha256 and effects (a list)")
-    if data.get("version") != 1:
-        raise InputError(f"{path}: version {data.get('version')!r} of effects.yaml; this package reads version 1")
+        raise InputError(f"{path}: an effects.yaml has `version: 1` and `effects`, a list; this has {_keys(data)}")
+    if "version" not in data:
+        raise InputError(f"{path}: does not say its version; add the line `version: 1`")
+    if data["version"] != 1:
+        raise InputError(f"{path}: version {data['version']!r} of effects.yaml; this package reads version 1")
     return data
+
+
+def _keys(data: Any) -> str:
+    return ", ".join(map(str, data)) or "nothing" if isinstance(data, dict) else f"no keys but {data!r:.60}"
+
+
+def psi_said(path: str | os.PathLike[str], data: Mapping[str, Any]) -> dict[str, float]:
+    """What an `effects.yaml` that was written by hand says of psi, by name; {} where it says nothing.
+
+    Raises:
+      InputError: `psi` is no mapping of names to finite numbers.
+    """
+    given = data.get("psi") or {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"{path}: psi is a mapping of names to numbers, and not {given!r}")
+    for name, value in given.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise InputError(f"{path}: psi {name} is {value!r}, want a finite number")
+    return {str(k): float(v) for k, v in given.items()}
 
 
 def check_model(env: Any, path: str | os.PathLike[str]) -> None:

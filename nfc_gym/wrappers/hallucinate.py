@@ -8,6 +8,7 @@ told of psi (`psi_belief`) throughout: it is trained to believe the mean, as it 
 
 import copy
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import gymnasium as gym
@@ -31,6 +32,17 @@ from nfc_gym.wrappers.source import Source, sampler_of
 from nfc_gym.wrappers.terrain import Ground
 
 Array = NDArray[np.float64]
+
+
+def checked_beta(beta: Any) -> float:
+    """A number of standard deviations.
+
+    Raises:
+      InputError: it is none, or below zero.
+    """
+    if isinstance(beta, bool) or not isinstance(beta, Real) or not 0 <= float(beta) < np.inf:
+        raise InputError(f"Hallucinate: beta is {beta!r}; want a number of standard deviations, 0 or more")
+    return float(beta)
 
 
 def drawn(posterior: Source, samples: int) -> Fidelity:
@@ -101,7 +113,8 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         sampled = drawn(posterior, samples)
         sim = simulation_of(env, "Hallucinate")
         psi = None if sampled.psi is None else space_of(env, sim.nominal, space, ())
-        self.belief, self.beta = Belief(sampled, psi, modes), float(beta)
+        self.beta = checked_beta(beta)
+        self.belief = Belief(sampled, psi, modes)
         super().__init__(
             env,
             posterior=posterior,
@@ -115,6 +128,7 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         self.sim = sim
         self.own = int(np.prod(env.action_space.shape or (0,)))
         self.action_space = wider(env.action_space, self.belief.size)
+        self._wanted = self.action_space.shape
         self.psi = None if psi is None else Psi(env, psi, sim)
         self.ground = Ground(env, sim, "Hallucinate") if self.belief.mode_count else None
         if self.ground is not None and self.belief.shape != self.ground.shape:
@@ -145,19 +159,20 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         self._made = self.belief.held_part(self._h[: self.belief.held], self.beta)
         if self.psi is not None and world.psi is not None:
             mean = self.belief.at(np.zeros(self.belief.size), self.beta).psi
-            if self.psi.own:
-                options = {"psi_belief": mean, **(options or {})}
-            options = self.psi.options(world.psi, options)
+            options = self.psi.options(world.psi, options, {"psi_belief": mean} if self.psi.own else None)
         if self.ground is not None and world.delta_e is not None:
             options = self.ground.options(world.delta_e, options)
         if self.injection is not None and world.delta_s is not None:
             self.injection.bias = self.injection.delta = world.delta_s
         self.sim.begin_episode()
-        return self.env.reset(seed=seed, options=options)
+        result = self.env.reset(seed=seed, options=options)
+        if self.psi is not None:
+            self.psi.settle()
+        return result
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step in the world that the action asks for."""
-        action = finite(action)
+        action = finite(action, self._wanted)
         if not self._chosen:
             self._h, self._chosen = np.array(action[self.own :], float), True
             self._enter()
@@ -208,12 +223,15 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
             )
         sim = batch_simulation_of(env, "Hallucinate")
         self.psi_space = None if sampled.psi is None else space_of(env, sim.nominal, None, ())
-        self.belief, self.beta = Belief(sampled, self.psi_space, 0), float(beta)
+        self.beta = checked_beta(beta)
+        self.belief = Belief(sampled, self.psi_space, 0)
         super().__init__(env, posterior=posterior, beta=beta, samples=samples, mode=mode, components=components)
         self.sim = sim
         self.own = int(np.prod(env.single_action_space.shape or (0,)))
         self.single_action_space = wider(env.single_action_space, self.belief.size)
         self.action_space = batch_space(self.single_action_space, env.num_envs)
+        self._wanted = self.action_space.shape
+        sim.attach("Hallucinate", substeps=False)  # what tells when an episode's first step is over
         self.injection = injection_of(env, sim, self.belief, mode, components)
         self._held = np.zeros((env.num_envs, self.belief.held))
         self.fidelity = self.belief.at(np.zeros((env.num_envs, self.belief.size)), self.beta)
@@ -232,7 +250,7 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step in the worlds that the actions ask for."""
-        actions = finite(actions)
+        actions = finite(actions, self._wanted)
         h = actions[:, self.own :].astype(float)
         first = self.sim.beginning
         if first.any():

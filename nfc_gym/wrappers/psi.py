@@ -9,7 +9,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium.vector import VectorEnv
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.fields import ModelFields, names_of
@@ -122,6 +122,22 @@ def _bodies(model: mujoco.MjModel) -> str:
     return ", ".join(n for n in names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)[1:] if n)
 
 
+def told(belief: ArrayLike | Mapping[str, float] | None, space: ParameterSpace, own: bool) -> dict[str, Any]:
+    """The reset options that show a belief of psi in place of the truth.
+
+    Raises:
+      InputError: the environment observes no psi, or the belief is none of its space.
+    """
+    if belief is None:
+        return {}
+    if not own:
+        raise InputError("RandomizePsi: belief is what `obs['psi']` shows, and this environment observes no psi")
+    value = space.vector(dict(belief) if isinstance(belief, Mapping) else belief)
+    if value.shape != space.nominal.shape or not np.isfinite(value).all():
+        raise InputError(f"RandomizePsi: belief is {belief!r}; want finite numbers: {', '.join(space.names)}")
+    return {"psi_belief": value}
+
+
 class Psi:
     """Psi of one environment, written through its `reset` options where it has psi of its own, else into its model."""
 
@@ -135,30 +151,37 @@ class Psi:
     def _edit(self, fields: ModelFields) -> None:
         self.space.write(fields, self.value)
 
-    def options(self, value: Array, options: dict[str, Any] | None) -> dict[str, Any] | None:
-        """Reset options under which the coming episode runs with `value` (d,), unless the caller's own name a psi."""
-        options = dict(options or {})
+    def options(
+        self, value: Array, options: Mapping[str, Any] | None, more: Mapping[str, Any] | None = None
+    ) -> dict[str, Any] | None:
+        """Reset options under which the coming episode runs with `value` (d,), and with `more`, but for what the
+        caller's own say.
+
+        Raises:
+          InputError: the caller's are no mapping, or name a psi that nature does not allow.
+        """
+        if not isinstance(options, Mapping | None):
+            raise InputError(f"reset: options is {options!r}, want a dict")
+        options = {"psi": value, **(more or {}), **(options or {})}
+        psi = self.space.vector(options["psi"])
+        if psi.shape == self.space.nominal.shape:  # another one is refused where it is written
+            self.space.require_possible(psi)
+        self.value = psi
         if self.own:
-            options.setdefault("psi", value)
-            self.value = self.space.vector(options["psi"])
             return options
-        self.value = self.space.vector(options.pop("psi", value))
-        if self.value.shape == self.space.nominal.shape:  # another one is refused where it is written
-            self.space.require_possible(self.value)
+        del options["psi"]
         self.sim.edit()
         return options or None
+
+    def settle(self) -> None:
+        """After a reset: psi that the environment has not written itself."""
+        if not self.own:
+            self.sim.edit_after()
 
     def write(self, value: Array) -> None:
         """Psi of an episode that has begun but not moved yet; derived quantities follow."""
         self.value = value
-        if self.own:
-            self.sim.fields.restore()
-            self.space.write(self.sim.fields, value)
-            self.sim.edit_after()
-            self.sim.fields.commit()
-        else:
-            self.sim.edit()
-        self.sim.forward()
+        self.sim.edit_again(self._edit if self.own else None)
 
 
 class RandomizePsi(EnvWrapper):
@@ -172,16 +195,25 @@ class RandomizePsi(EnvWrapper):
       space: psi of an environment that has none: a `ParameterSpace`, tables with the attributes of `Parameter`, or
         names of bodies, whose masses then have a prior of half to one and a half times their nominal value.
 
+      belief: (d,) what `obs["psi"]` shows in every episode, of an environment with psi of its own; default the truth.
+
     `reset(options={"psi": vector | {name: value}})` overrides the draw. `psi` and `psi_space` read back what holds.
     """
 
-    def __init__(self, env: gym.Env, distribution: Distribution = 1.0, space: Space | None = None) -> None:
-        super().__init__(env, distribution=distribution, space=space)
+    def __init__(
+        self,
+        env: gym.Env,
+        distribution: Distribution = 1.0,
+        space: Space | None = None,
+        belief: ArrayLike | Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(env, distribution=distribution, space=space, belief=belief)
         sim = simulation_of(env, "RandomizePsi")
         names = tuple(distribution) if isinstance(distribution, Mapping) else ()
         self.psi_space = space_of(env, sim.nominal, space, names)
         self.prior = Prior(self.psi_space, distribution)
         self._psi = Psi(env, self.psi_space, sim)
+        self._told = told(belief, self.psi_space, self._psi.own)
 
     @property
     def psi(self) -> Array:
@@ -191,25 +223,30 @@ class RandomizePsi(EnvWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw psi, then reset."""
         value = self.prior.draw(1, self.stream(seed))[0]
-        return self.env.reset(seed=seed, options=self._psi.options(value, options))
+        result = self.env.reset(seed=seed, options=self._psi.options(value, options, self._told))
+        self._psi.settle()
+        return result
 
 
 class VectorRandomizePsi(VectorEnvWrapper):
-    """`RandomizePsi` around a vector environment on `mujoco.batch`; `env` and `distribution` as there.
+    """`RandomizePsi` around a vector environment on `mujoco.batch`; `env`, `distribution` and `belief` as there.
 
     Each episode of each simulation has a psi of its own. `reset(options={"psi": ...})` overrides the draws of the
-    rows that it resets.
+    rows that it resets, for their coming episode; `psi_belief` likewise.
     """
 
-    def __init__(self, env: VectorEnv, distribution: Distribution = 1.0) -> None:
-        super().__init__(env, distribution=distribution)
+    def __init__(
+        self, env: VectorEnv, distribution: Distribution = 1.0, belief: ArrayLike | Mapping[str, float] | None = None
+    ) -> None:
+        super().__init__(env, distribution=distribution, belief=belief)
         self.sim = batch_simulation_of(env, "RandomizePsi")
         self.psi_space = space_of(env, self.sim.nominal, None, ())
         self.prior = Prior(self.psi_space, distribution)
+        self._told = told(belief, self.psi_space, own=True)
         self.sim.on_reset.add(self._draw)
 
     def _draw(self, ids: NDArray[np.intp]) -> dict[str, Any]:
-        return {"psi": self.prior.draw(len(ids), self.stream(None))}
+        return {"psi": self.prior.draw(len(ids), self.stream(None))} | self._told
 
     @property
     def psi(self) -> Array:

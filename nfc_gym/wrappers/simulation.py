@@ -161,7 +161,7 @@ class SingleSimulation(Simulation):
             self.fields.restore()
             self.fields.commit()
         self._steps: tuple[Any, str] | None = stepper_of(env)
-        self._inside = False
+        self._inside = self._unedited = False
         self._calls = self._written = 0
         self._time = np.inf
         self.started = True
@@ -196,14 +196,30 @@ class SingleSimulation(Simulation):
 
     def edit(self) -> None:
         """Before a reset: the nominal model with every wrapper's edits, psi's first; derived constants follow."""
+        self._unedited = True
         if not self.own_fields:
             self.fields.restore()
             self._write()
 
     def edit_after(self) -> None:
-        """After a reset: the edits that come on top of the psi that the environment itself has written."""
-        if self.own_fields:
+        """After a reset: the edits that come on top of the psi that the environment itself has written, once."""
+        if self.own_fields and self._unedited:
             self._write()
+        self._unedited = False
+
+    def edit_again(self, write: Callable[[ModelFields], None] | None = None) -> None:
+        """In an episode that has not moved yet: the nominal model with psi and every edit; derived quantities follow.
+
+        Args:
+          write: writes psi, by default as no wrapper but perhaps the environment itself has it.
+        """
+        self.fields.restore()
+        if write is not None:
+            write(self.fields)
+        elif self.own_fields:
+            self.env.psi_space.write(self.fields, self.env.psi)
+        self._write()
+        self.forward()
 
     def _write(self) -> None:
         edits = self.edits.live()

@@ -334,6 +334,11 @@ def test_the_length_of_episodes_is_a_whole_number() -> None:
     assert not endless.step(np.zeros((N, 2)))[3].any()
     with pytest.raises(InputError, match=r"seed is 1\.5, want a whole number"):
         endless.reset(seed=1.5)
+    # None is what the id was registered with, whatever the kind of vector environment.
+    assert (
+        vector("nfc_gym/JackalFlat-v0", max_episode_steps=None)._horizon
+        == gymnasium.spec("nfc_gym/JackalFlat-v0").max_episode_steps
+    )
 
 
 def test_maps_of_all_may_be_named_where_some_are_reset() -> None:

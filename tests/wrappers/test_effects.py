@@ -19,7 +19,7 @@ from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 from nfc_gym.physics.segments import Segments
-from nfc_gym.wrappers import ApplyEffects
+from nfc_gym.wrappers import ApplyEffects, RandomizePsi, VectorApplyEffects
 
 MODEL = mujoco.MjModel.from_xml_string(STATELESS)
 CANDIDATES = candidates(MODEL)
@@ -191,8 +191,12 @@ def test_from_file_without_a_model_file_compares_the_model_beside_it(tmp_path: P
     ("text", "message"),
     [
         ("effects: [", "no YAML"),
-        ("[]", "the keys"),
+        ("[]", r"`effects`, a list; this has no keys but \[\]"),
+        ("version: 1\npsi: {}", "a list; this has version, psi"),
+        ("effects: []", "add the line `version: 1`"),
         ("version: 2\neffects: []", "version 2"),
+        ("version: 1\neffects: []\npsi: [3]", r"psi is a mapping of names to numbers, and not \[3\]"),
+        ("version: 1\neffects: []\npsi: {cube: heavy}", "psi cube is 'heavy', want a finite number"),
         ("version: 1\neffects: [{family: gain}]", "where"),
     ],
 )
@@ -299,3 +303,21 @@ def test_psi_then_effects_is_what_the_calibrator_writes() -> None:
     fields.commit()
     for name in ("body_mass", "body_inertia", "body_ipos", "dof_invweight0", "body_subtreemass"):
         np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)
+
+
+def test_psi_beside_the_effects_of_a_file_holds_in_every_episode(tmp_path: Path) -> None:
+    file = tmp_path / "effects.yaml"
+    row = {"family": "payload", "where": "base", "parameters": {"mass": 2.0, "x": 0.0, "y": 0.0, "z": 0.0}}
+    file.write_text(yaml.safe_dump({"version": 1, "psi": {"base_mass": 18.0}, "effects": [row]}))
+    env = ApplyEffects(gym.make("nfc_gym/JackalFlat-v0"), file)
+    envs = VectorApplyEffects(gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=2), file)
+    base = env.unwrapped.model.body("base").id
+    for made in (env, gym.make(env.spec), pickle.loads(pickle.dumps(env))):
+        for seed in (0, None):
+            made.reset(seed=seed)
+            assert made.unwrapped.model.body_mass[base] == pytest.approx(20)
+            assert made.unwrapped.psi[0] == 18
+    envs.reset(seed=0)
+    np.testing.assert_allclose(envs.unwrapped.batch.expand("body_mass")[:, base], 20)
+    with pytest.raises(InputError, match="psi is written by"):
+        RandomizePsi(env)

@@ -184,6 +184,9 @@ def test_bad_input_is_refused_by_name() -> None:
         Hallucinate(FakeEnv(), Fidelity(delta_s=np.zeros(5)))
     with pytest.raises(InputError, match="force, state"):
         Hallucinate(FakeEnv(), Fidelity(delta_s=np.zeros(7)), mode="x")  # type: ignore[arg-type]
+    for beta in ("x", -1, np.nan):
+        with pytest.raises(InputError, match=f"beta is {beta!r}"):
+            Hallucinate(FakeEnv(), Fidelity(delta_s=np.zeros(7)), beta=beta)  # type: ignore[arg-type]
 
 
 def test_orders_that_cannot_work_are_refused_by_name() -> None:

@@ -9,7 +9,7 @@ import pytest
 from fakes import FakeEnv, Gaussian, NoModel, roll, same
 
 from nfc_gym.core import Fidelity, InputError
-from nfc_gym.wrappers import RandomizePsi, VectorRandomizePsi
+from nfc_gym.wrappers import ApplyEffects, Hallucinate, RandomizePsi, VectorRandomizePsi
 from nfc_gym.wrappers.source import Draws
 
 
@@ -74,6 +74,40 @@ def test_an_own_space_is_used_and_read_back() -> None:
     np.testing.assert_allclose(observation["psi"], expected, rtol=1e-6)
     env.reset(options={"psi": env.psi_space.nominal})
     np.testing.assert_array_equal(env.unwrapped.psi, env.psi_space.nominal)
+
+
+def test_another_space_than_the_environments_own_is_simulated_too() -> None:
+    """On top of the environment's own psi, once, whatever stands around."""
+    load = {"family": "payload", "where": "base", "parameters": {"mass": 2.0, "x": 0.0, "y": 0.0, "z": 0.0}}
+    gravity = {"name": "gravity", "field": "opt.gravity[2]", "unit": "m/s^2", "low": -12.0, "high": -8.0}
+    made = gym.make("nfc_gym/JackalFlat-v0")
+    heavy = made.unwrapped.psi_space.vector({"base_mass": 20.0})
+    env = RandomizePsi(made, space=["base"])
+    for seed in range(2):
+        env.reset(seed=seed, options=None)
+        assert env.unwrapped.model.body("base").mass[0] == env.psi[0] != made.unwrapped.psi_space.nominal[0]
+    env = ApplyEffects(RandomizePsi(gym.make("nfc_gym/JackalFlat-v0"), space=[gravity]), [load])
+    for seed in range(2):
+        env.reset(seed=seed)
+        assert env.unwrapped.model.opt.gravity[2] == env.get_wrapper_attr("psi")[0] != -9.81
+        assert env.unwrapped.model.body("base").mass[0] == pytest.approx(made.unwrapped.psi_space.nominal[0] + 2)
+    env = Hallucinate(gym.make("nfc_gym/JackalFlat-v0"), heavy[:1] * [[0.9], [1.0], [1.1]], space=["base"])
+    env.reset(seed=0)
+    env.step(np.ones(3, np.float32))
+    psi = env.fidelity.psi
+    assert psi is not None
+    assert env.unwrapped.model.body("base").mass[0] == psi[0] > 20
+
+
+def test_options_that_are_refused_change_nothing() -> None:
+    env = RandomizePsi(gym.make("nfc_gym/JackalFlat-v0"))
+    env.reset(seed=0)
+    before = env.psi
+    with pytest.raises(InputError, match="want a dict"):
+        env.reset(options=["psi"])  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="base_mass"):
+        env.reset(options={"psi": {"base_mass": -1}})
+    np.testing.assert_array_equal(env.psi, before)
 
 
 def test_nominal_is_no_wrapper_bit_for_bit() -> None:

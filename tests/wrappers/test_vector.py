@@ -252,6 +252,59 @@ def test_each_row_holds_what_its_own_first_action_said() -> None:
     assert single.unwrapped.model.body_mass[base] == pytest.approx(wanted.psi[2, 0], rel=1e-2)
 
 
+def test_psi_alone_holds_for_an_episode_whatever_later_actions_say() -> None:
+    """With nothing beneath that acts in the physics, and bit for bit as around a single environment."""
+    nominal = gym.make(ID).unwrapped.psi_space.nominal
+    psi = nominal * (1 + 0.1 * np.random.default_rng(0).uniform(-1, 1, (50, len(nominal))))
+    single, envs = Hallucinate(gym.make(ID, context=["psi"]), psi), VectorHallucinate(_vector(), psi)
+    base, mass = single.unwrapped.model.body("base").id, envs.unwrapped.batch.expand("body_mass")
+    single.reset(seed=0)
+    envs.reset(seed=0)
+    size = single.action_space.shape[0]
+    first = None
+    for h in (1, -1, 0):
+        action = np.r_[0.3, 0.2, np.full(size - 2, h)].astype(np.float32)
+        seen, *_ = single.step(action)
+        observed, *_ = envs.step(np.tile(action, (N, 1)))
+        first = mass[0, base] if first is None else first
+        assert mass[0, base] == first == single.unwrapped.model.body_mass[base]
+        np.testing.assert_array_equal(observed["proprio"][0], seen["proprio"])
+    assert first != nominal[0]
+
+
+@pytest.mark.parametrize("width", [1, 2, 20, 40])
+def test_an_action_of_another_width_is_refused_at_every_step(width: int) -> None:
+    psi = np.tile(gym.make(ID).unwrapped.psi_space.nominal, (3, 1)) * np.array([[0.9], [1], [1.1]])
+    single, envs = Hallucinate(gym.make(ID, context=["psi"]), psi), VectorHallucinate(_vector(), psi)
+    single.reset(seed=0)
+    envs.reset(seed=0)
+    for _ in range(2):
+        with pytest.raises(InputError, match=rf"shape \({width},\), want \(19,\)"):
+            single.step(np.zeros(width, np.float32))
+        with pytest.raises(InputError, match=rf"shape \({N}, {width}\), want \({N}, 19\)"):
+            envs.step(np.zeros((N, width), np.float32))
+        single.step(np.zeros(19, np.float32))
+        envs.step(np.zeros((N, 19), np.float32))
+
+
+def test_a_belief_is_shown_in_every_episode_in_place_of_the_truth() -> None:
+    space = gym.make(ID).unwrapped.psi_space
+    belief = {"base_mass": 16.0}
+    shown = np.clip(space.normalise(space.vector(belief)), -1, 1).astype(np.float32)
+    envs = VectorRandomizePsi(_vector(), 0.5, belief=belief)
+    observed, _ = envs.reset(seed=0)
+    for _ in range(END + 2):
+        np.testing.assert_allclose(observed["psi"], np.tile(shown, (N, 1)), rtol=1e-6)
+        observed, *_ = envs.step(envs.action_space.sample())
+    assert (envs.psi != space.vector(belief)).any(1).all()
+    observed, _ = RandomizePsi(gym.make(ID), 0.5, belief=belief).reset(seed=0)
+    np.testing.assert_allclose(observed["psi"], shown, rtol=1e-6)
+    with pytest.raises(InputError, match="finite numbers: base_mass"):
+        VectorRandomizePsi(_vector(), belief=[1.0])
+    with pytest.raises(InputError, match="observes no psi"):
+        RandomizePsi(gym.make("Ant-v5"), {"torso": (0.3, 0.4)}, belief=[0.3])
+
+
 def test_hallucinated_ground_is_refused() -> None:
     with pytest.raises(InputError, match="VectorResidualTerrain"):
         VectorHallucinate(_vector(), Fidelity(delta_e=np.zeros((3, 256, 256))))
