@@ -149,6 +149,9 @@ def adapt(
     with outcome(ctx, resumes=True):
         kinds.require_kind(out, kinds.ADAPTED)
         kinds.require_kind(out / "policy.safetensors", kinds.POLICY)
+        from nfc_gym.adaptation.extended import read_found
+
+        read_found(effects)  # what is wrong with a file is told before torchrl is loaded, which takes many seconds
         from nfc_gym.adaptation import FineTuneConfig, hand_over
 
         hand_over(

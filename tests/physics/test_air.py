@@ -221,3 +221,21 @@ def test_a_model_whose_centre_of_mass_was_moved_says_where_its_hull_is() -> None
     assert hull(nominal, 1) == pytest.approx([0.05, 0.0, 0.0])
     again, _ = corrected(mujoco.MjSpec.from_string(text), plant, theta)
     assert hull(mujoco.MjModel.from_xml_string(again), 1) == pytest.approx([0.05, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("family", "where", "theta", "said"),
+    [
+        ("slope", "b", {"roll": 0.1, "pitch": 0.0}, "slope: `where` is 'b', want 'world'"),
+        ("wind", "world", {"push_x": 1.0, "push_y": 0.0, "push_z": 0.0, "drag": 1.0}, "the world does not move; bodies: b"),
+        ("external_force", "world", {"x": 1.0, "y": 0.0, "z": 0.0}, "the world does not move; bodies: b"),
+        ("drag_linear", "world", {"x": 1.0, "y": 0.0, "z": 0.0}, "the world does not move; bodies: b"),
+        ("drag_linear", "c", {"x": 1.0, "y": 0.0, "z": 0.0}, "no body named 'c'; bodies: b"),
+    ],
+)
+def test_places_where_nothing_could_happen_are_refused(
+    family: str, where: str, theta: dict[str, float], said: str
+) -> None:
+    effect, _ = make(family, where, theta)
+    with pytest.raises(InputError, match=said):
+        effect.bind(mujoco.MjModel.from_xml_string(FLYER % 0))

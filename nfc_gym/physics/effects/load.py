@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index, joint_dofs
 from nfc_gym.physics.effects.places import (
@@ -137,6 +138,12 @@ class Slope(Effect):
         Param("roll", "rad", -0.6, 0.6, probes=(0.05,), resolution=1e-3, ambient=True),
         Param("pitch", "rad", -0.6, 0.6, probes=(0.05,), resolution=1e-3, ambient=True),
     )
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        """See `Effect`; it sits in the world and nowhere else."""
+        super().bind(model)
+        if self.where != ("world",):
+            raise InputError(f"slope: `where` is {'+'.join(self.where)!r}, want 'world'")
 
     def model(self, fields: ModelFields, theta: Array) -> None:
         gravity = fields["opt.gravity"]
