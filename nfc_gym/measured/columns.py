@@ -135,8 +135,8 @@ def finite(values: Array, what: str, needed: NDArray[np.bool_] | None = None) ->
         row = int(np.flatnonzero(bad)[0])
         raise InputError(
             f"{what}: {int(bad.sum())} of {len(bad)} rows {'are' if bad.sum() > 1 else 'is'} NaN or infinite, "
-            f"the first row {row}; cut the log there, or, if it is measured and no command, name a `mask` column that "
-            "is false in those rows"
+            f"the first row {row}; cut the log there, or, if it is measured and no command, say `rate` if its sensor "
+            "is slower than the log, or name a `mask` column that is false in those rows"
         )
     return plausible(values, what)
 

@@ -20,6 +20,8 @@ FAMILIES = (
 )
 # fmt: on
 _AXES = {"x": 0, "y": 1, "z": 2}
+_TIMES = ("s", "ms", "us", "ns")
+_TIMES_SAID = f"{', '.join(_TIMES[:-1])} or {_TIMES[-1]}"
 
 
 def _unit(value: object) -> str:
@@ -33,6 +35,12 @@ def _unit(value: object) -> str:
 
 def _one_or_more(value: object) -> object:
     return [value] if isinstance(value, str | int | float) and not isinstance(value, bool) else value
+
+
+def _time_unit(value: object) -> str:
+    if str(value) not in _TIMES:
+        raise PydanticCustomError("unit", "time is in {times}", {"times": _TIMES_SAID})
+    return str(value)
 
 
 Unit = Annotated[str, BeforeValidator(_unit)]
@@ -84,7 +92,7 @@ class _Signal(_Columns):
 class TimeColumn(_Columns):
     """Where the time is: a column; or, of logs that have no clock, the `interval` in s from one row to the next."""
 
-    unit: Unit = "s"
+    unit: Annotated[str, BeforeValidator(_time_unit)] = "s"
     interval: Positive | None = None
 
     @model_validator(mode="after")
@@ -93,9 +101,9 @@ class TimeColumn(_Columns):
             raise PydanticCustomError("both", "has both `column` and `interval`; keep one")
         if self.interval is not None and self.unit != "s":
             raise PydanticCustomError("time", "`interval` is in s; leave out `unit`")
-        if self.interval is None and (len(self.columns) != 1 or units.si_unit(self.unit) != "s"):
-            text = "time is one column, in s, ms, us or ns; or `interval`, the seconds from row to row"
-            raise PydanticCustomError("time", text)
+        if self.interval is None and len(self.columns) != 1:
+            text = "time is one column, in {times}; or `interval`, the seconds from row to row"
+            raise PydanticCustomError("time", text, {"times": _TIMES_SAID})
         return self
 
 

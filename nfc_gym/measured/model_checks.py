@@ -11,9 +11,11 @@ from nfc_gym.measured.channels import ChannelName, parse_channel
 from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.observe import observer
+from nfc_gym.measured.start_checks import unmeasured
 from nfc_gym.measured.stiffness import stiffness_findings
 from nfc_gym.measured.units import si_unit
 from nfc_gym.measured.yaml_marks import suggest
+from nfc_gym.physics.activations import integrators, on_servos
 from nfc_gym.physics.effects.drive import command_unit
 from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.parameters import COMPOUND, ParameterSpace, resolve, split_field
@@ -50,9 +52,11 @@ def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]
             size = int(model.sensor_dim[mujoco.mj_name2id(model, _OBJ.mjOBJ_SENSOR, parsed.object)])
             if channel.axes and max(channel.axis_indices or ()) >= size:
                 yield Finding("error", where, f"axes {list(channel.axes)} where the sensor has {size} components")
+    yield from unmeasured(mapping, model)
     yield from _fields(mapping, model)
     yield from _steps(mapping, model)
     yield from _unused(mapping)
+    yield from _integrating(mapping, model)
     if mapping.segments.mode == "rollout":
         yield from stiffness_findings(_nominal(mapping, model), float(mapping.segments.timestep or model.opt.timestep))
 
@@ -148,6 +152,25 @@ def _steps(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
         message = f"one step of {step:g} s is longer than the shortest horizon, {segments.horizons[0]:g} s"
         advice = "give a shorter segments.timestep, mend the model's, or lengthen segments.length"
         yield Finding("error", "segments", message, advice)
+
+
+def _integrating(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
+    """Actuators that integrate their commands, of which a log does not say what they had gathered before."""
+    names, rolled = names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nu), mapping.segments.mode == "rollout"
+    if mapping.segments.mode == "inverse":
+        return
+    shown = on_servos(model) if rolled else []
+    for a in integrators(model):
+        where = f"controls.ctrl:{names[a]}"
+        if a in shown:
+            message = "the servo integrates its command, and the log does not say what it had gathered before"
+            advice = "each roll-out begins with its target where it holds the joint against gravity and damping"
+            yield Finding("note", where, message, advice)
+        else:
+            begin = f"{mapping.segments.history:g} s before each start" if rolled else "where a log begins"
+            message = f"the actuator integrates its command: what it had gathered is taken to be 0 {begin}"
+            advice = "log what it has gathered, and make that the command of an actuator without dynamics"
+            yield Finding("warning", where, message, advice)
 
 
 def _unused(mapping: Mapping) -> Iterator[Finding]:

@@ -93,7 +93,9 @@ def _joint(model: mujoco.MjModel, name: str, joint: str, quantity: str) -> Obser
     kind = int(model.jnt_type[j])
     if kind < int(mujoco.mjtJoint.mjJNT_SLIDE):
         raise InputError(
-            f"channel {name!r}: joint {joint!r} is not a hinge or slide; use body:<name>:pos|quat|linvel|angvel"
+            f"channel {name!r}: joint {joint!r} is a ball joint, which no channel measures"
+            if kind == int(mujoco.mjtJoint.mjJNT_BALL)
+            else f"channel {name!r}: joint {joint!r} is a free joint; use body:<name>:pos|quat|linvel|angvel"
         )
     if quantity not in _JOINT:
         raise InputError(f"channel {name!r} cannot be compared: want joint:<name>:pos or joint:<name>:vel")

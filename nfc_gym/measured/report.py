@@ -213,7 +213,7 @@ def _outcome(candidate: Row, label: str, r: Row) -> str:
     taken = next((c for c in r.get("ranking") or [] if c.get("id") == label), None)
     if taken is not None and _total(candidate) >= _total(taken):
         return "gains no more than a plainer one would by chance: the accepted one is preferred"
-    return "gains, but significantly less than the best"
+    return "gains less than the accepted one"
 
 
 def _total(candidate: Row) -> float:

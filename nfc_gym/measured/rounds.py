@@ -202,7 +202,7 @@ class Contest:
         lines are too rough to show the likeness of laws that are kin.
         """
         arena, new = self.arena, self.arena.new(best)
-        asked = {arena.label(j) for j in judged} | {e.id for e in new}
+        asked = {arena.label(j) for j in judged} | {e.id for e in (*new, *arena.current.plant.effects)}
         added = len(best.fitted.plant.effects) > len(arena.current.plant.effects)
         if len(new) != 1 or new[0].id not in self._known or not added:
             return []

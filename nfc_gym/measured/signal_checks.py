@@ -13,11 +13,15 @@ from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
 from nfc_gym.measured.speed_checks import DEGREES, TURN, explained, rate_ratio, ratio, strangers, too_fast
+from nfc_gym.measured.start_checks import open_loops
 from nfc_gym.physics.effects.drive import command_unit
 
 Array = NDArray[np.float64]
 
 MANY_TURNS = 4 * np.pi  # rad; a joint that goes further may be in degrees, unless it is a wheel
+
+_RUNS = 20  # changes of a value from which on it is told whether they come at a beat
+_ALIKE = 0.8  # share of them that are as many rows apart: an encoder's steps are not
 
 
 def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iterator[Suspicion]:
@@ -27,6 +31,7 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
         yield from _command(name, values, None if name in log.servo else model)  # a servo's goal is no ctrl
     for name, channel in log.channels.items():
         yield from _any_channel(name, channel, mapping)
+        yield from _held(name, channel, log)
         parsed = parse_channel(name)
         if parsed.kind == "joint" and parsed.quantity == "pos" and channel.unit == "rad":
             yield from _angle(name, log, model)
@@ -40,6 +45,8 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
     yield from strangers(log)
     yield from too_fast(log)
     yield from _twins(log)
+    if model is not None:
+        yield from open_loops(model, log)
 
 
 def _sampling(log: Log) -> Iterator[Suspicion]:
@@ -103,6 +110,21 @@ def _components(name: str, sensor: str, channel: Channel, model: mujoco.MjModel)
         message = f"{width} column{'s' * (width > 1)} where the sensor has {size} component{'s' * (size > 1)}"
         advice = "name all in `columns`, or say in `axes` which components these are"
         yield Suspicion("error", f"channels.{name}", "components", message, advice)
+
+
+def _held(name: str, channel: Channel, log: Log) -> Iterator[Suspicion]:
+    """A sensor slower than the log whose values are repeated until it has a new one, without a word on it."""
+    if channel.rate is not None or channel.mask is not None or not np.isfinite(channel.values).all():
+        return
+    rows = channel.values.reshape(len(channel.values), -1)
+    runs = np.diff(np.flatnonzero((np.diff(rows, axis=0) != 0).any(1)))  # rows between two changes
+    if len(runs) < _RUNS:
+        return
+    often = int(np.median(runs))
+    if often > 1 and float((runs == often).mean()) > _ALIKE:
+        hertz = 1 / (often * float(np.median(np.diff(log.time))))
+        message = f"each value stands {often} rows long: it is held until the sensor, which is slower, has a new one"
+        yield Suspicion("warning", f"channels.{name}", "held", message, f"say `rate: {hertz:.4g}`")
 
 
 def _any_channel(name: str, channel: Channel, mapping: Mapping) -> Iterator[Suspicion]:

@@ -5,8 +5,8 @@ They are not: few replays taken as Gaussian, and blows of contact, give some hea
 a fault, and one limit for each fault, high enough for those, loses many faulty windows. How the evidences lie
 *together* tells most of these apart: a fault explains what nothing else explains, a blow nothing explains. The ratio of
 densities of all of them is what a classifier between both kinds of windows learns (Sugiyama, Suzuki and Kanamori
-2012), here logistic regression on logarithms and their products. A thousand
-windows of each kind teach it nearly all that four thousand do (docs/inference.md).
+2012), here logistic regression on logarithms and their products. A thousand windows of each kind teach it nearly all
+that four thousand do (docs/inference.md).
 """
 
 from dataclasses import dataclass
