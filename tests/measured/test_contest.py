@@ -318,6 +318,14 @@ def test_a_shifted_centre_of_mass_is_not_believed_before_a_load_was_asked() -> N
     assert asking(screened, [shift, load, elsewhere])._mimics(best, [best]) == ["payload:torso"]
     assert asking(screened, [shift, load, elsewhere])._mimics(best, [best, refitted(load)]) == []
     assert asking(screened, [shift, elsewhere])._mimics(best, [best]) == []
+    # Of a load that is in the model already there is nothing to ask.
+    contest: Any = asking(screened, [shift, load, elsewhere])
+    contest.arena.current.plant.effects = [load]
+    contest.arena.new = lambda j: [e for e in j.fitted.plant.effects if e is not load]
+    both: Any = SimpleNamespace(plant=SimpleNamespace(effects=[load, shift]))
+    best = Judged(both, np.zeros(1), np.zeros(1), 1.0, 1.0)
+    contest.arena.label = lambda j: "+".join(e.id for e in contest.arena.new(j))
+    assert contest._mimics(best, [best]) == []
 
 
 def test_the_leading_law_is_tried_where_like_places_share_it() -> None:
