@@ -21,6 +21,7 @@ from nfc_gym.measured.segments import Layout, servos
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, estimate_states
 from nfc_gym.measured.suspects import Witness
+from nfc_gym.physics.activations import Activations
 from nfc_gym.physics.effects import complete_inertia, propose
 from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrides
 from nfc_gym.physics.effects.conditions import conditioned
@@ -198,13 +199,15 @@ def _forces(model: mujoco.MjModel, motion: "_Motion") -> tuple[np.ndarray, np.nd
     data = mujoco.MjData(model)
     count = len(motion.qpos)
     needed, pushed, acting = np.zeros((count, model.nv)), np.zeros((count, model.nv)), np.zeros((count, model.nu))
-    driven = np.zeros(model.nv)
+    driven, activations = np.zeros(model.nv), Activations(model, model.opt.timestep)
     for k in range(count):
         data.qpos[:], data.qvel[:], data.ctrl[:] = motion.qpos[k], motion.qvel[k], motion.ctrl[k]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_mulM(model, data, driven, motion.qacc[k])
         needed[k] = driven + data.qfrc_bias
+        activations.advance(data.ctrl, data.act, settle=True)  # what came before a moment is not at hand
+        activations.hold(data, needed[k] - data.qfrc_passive, model.actuator_gainprm, model.actuator_biasprm)
         mujoco.mj_fwdActuation(model, data)
         pushed[k], acting[k] = data.qfrc_actuator, data.actuator_force
     return needed, pushed, acting

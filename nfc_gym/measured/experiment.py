@@ -118,6 +118,7 @@ class Stage:
             ctrl=ctrl,
             exogenous=exogenous,
             known=known,
+            channels=frozenset(log.channels),
             servo=[
                 (law, {n: hold(log.servo[k][n]) for n in ("gain", "supply", "damping")}) for k, law in bound.items()
             ],

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -9,17 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.measured import asset_files
 from nfc_gym.measured.fit import Fit
+from nfc_gym.measured.frozen import freeze
+from nfc_gym.measured.moments import mend
 from nfc_gym.physics.effects.air import hull, hull_mark
 from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.effects.inertial import Moved
 from nfc_gym.physics.effects.places import body_ids
 from nfc_gym.physics.effects.saved import from_row, to_row
+from nfc_gym.physics.effects.timing import command_limits
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-_HOOKS_OUTSIDE_MJCF = ("action", "friction", "force", "sense", "unsense")
+_HOOKS_BEYOND = ("spec", "friction", "follow", "modulate", "force", "sense", "unsense")
+READ_COMMANDS = ("backlash", "law_command")  # families whose laws of force read `Context.ctrl`
+_SOFTNESS = ("dof_solref", "dof_solimp")
 
 
 def pack(fitted: Fit) -> dict[str, Any]:
@@ -48,48 +56,123 @@ def unpack(data: dict[str, Any], plant: Plant) -> tuple[Plant, Array]:
     return whole, np.concatenate([plant.space.vector(psi), *(theta for _, theta in pairs)])
 
 
-def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array) -> tuple[str, list[Effect]]:
+def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None = None) -> tuple[str, list[Effect]]:
     """MJCF text with psi and every effect that MJCF can say, and the effects that it cannot.
 
-    Effects that only edit model fields are carried through those fields; effects with a structural edit of their own
-    (delay, lag, dry friction) are carried by it; all others stay outside.
+    Effects that only edit model fields are carried through those fields, in the order in which they act. Others are
+    carried by a structural edit of their own (a delay, a lag) where they have one; all the rest stays outside. The
+    commands of an actuator pass through effects of one kind alone: outside effects would act before all that the model
+    carries, and see another command than they were fitted with.
+
+    Args:
+      spec: the model as it was given; its objects have the names of the plant's, which may lack some of them.
+      plant: psi and effects.
+      x: (size,) full parameter vector.
+      folder: where the text will be written: files of meshes and textures are then named as seen from there, else by
+        their whole paths.
+
+    Returns:
+      The text, in whose comment stands which inertias are not as they were found, since no body can have them; and
+      those of the plant's effects that stay outside.
+
+    Raises:
+      ValueError: the spec does not compile.
     """
     spec = spec.copy()
-    model = spec.compile()
-    hulls = {
-        b: hull(model, b) for e in plant.effects if isinstance(e, Moved) for b in body_ids(model, e.where).tolist()
-    }
+    model = freeze(spec)
+    asset_files.absolute(spec, model)
+    keys = _activations(spec, model)
+    effects = [copy.deepcopy(e) for e in plant.effects]  # the plant's own are bound to its model
+    whole = Plant(model, ParameterSpace(model, plant.space.parameters), effects)
+    psi, thetas = whole.split(x)
+    hulls = {b: hull(model, b) for e in effects if isinstance(e, Moved) for b in body_ids(model, e.where).tolist()}
+    pairs = list(zip(effects, thetas, strict=True))
+    by_fields = [(e, t) for e, t in pairs if _edits_fields_alone(e) and not _moves_frame(e, spec)]
     fields = ModelFields(model, copy.copy(model))
-    psi, thetas = plant.split(x)
-    plant.space.write(fields, psi)
-    pairs = list(zip(plant.effects, thetas, strict=True))
-    for effect, theta in pairs:
-        if overrides(effect, "model") and not overrides(effect, "spec") and not _outside(effect):
-            effect.model(fields, theta)
+    whole.space.write(fields, psi)
+    for effect, theta in by_fields:
+        effect.model(fields, theta)
+    _soften(fields, whole, x)
     fields.commit()
     spec.copy_back(model)
-    outside = [e for e, theta in pairs if not _carried(e, theta, spec)]
+    carried = [e for e, _ in by_fields]
+    carried += [e for e, t in pairs if e not in carried and not e.on_command and e.spec(spec, t)]
+    outside = [e for e in effects if e not in carried and not e.on_command]
+    if not any(e.family in READ_COMMANDS for e in outside):
+        spec, on_commands = _on_commands(spec, [(e, t) for e, t in pairs if e.on_command])
+        carried += on_commands
     for body, at in hulls.items():  # what is not in the model finds them here, as it found them in the nominal one
         mark = hull_mark(model.body(body).name)
         numeric = next((n for n in spec.numerics if n.name == mark), None) or spec.add_numeric(name=mark, size=3)
         numeric.data = at
-    try:
-        spec.compile()
-    except ValueError:
-        # Motion about one axis does not show the other two: let MuJoCo make such an inertia physical.
-        spec.compiler.balanceinertia = 1
-        spec.compile()
-    return spec.to_xml(), outside
+    told = mend(spec, model)
+    _settle_keys(spec, spec.compile(), keys)
+    spec.compile()
+    if told:
+        spec.comment = "\n".join(filter(None, [spec.comment, *told]))
+    text = spec.to_xml() if folder is None else asset_files.relative(spec.to_xml(), folder)
+    return text, [own for own, e in zip(plant.effects, effects, strict=True) if e not in carried]
 
 
-def _outside(effect: Effect) -> bool:
-    return any(overrides(effect, hook) for hook in _HOOKS_OUTSIDE_MJCF)
+def _edits_fields_alone(effect: Effect) -> bool:
+    """Whether an effect edits the model through its fields, and does nothing else."""
+    beyond = effect.on_command or any(overrides(effect, hook) for hook in _HOOKS_BEYOND)
+    return overrides(effect, "model") and not beyond
 
 
-def _carried(effect: Effect, theta: Array, spec: mujoco.MjSpec) -> bool:
-    if overrides(effect, "spec"):
-        return effect.spec(spec, theta)
-    return overrides(effect, "model") and not _outside(effect)
+def _moves_frame(effect: Effect, spec: mujoco.MjSpec) -> bool:
+    """Whether an effect moves the centre of mass of a body whose frame MuJoCo would move with it."""
+    bodies = [spec.body(name) for name in effect.where] if isinstance(effect, Moved) else []
+    always, maybe = mujoco.mjtAlignFree.mjALIGNFREE_TRUE, mujoco.mjtAlignFree.mjALIGNFREE_AUTO
+    chosen = (always, maybe) if spec.compiler.alignfree else (always,)
+    return any(joint.align in chosen for body in bodies for joint in body.joints)
+
+
+def _soften(fields: ModelFields, whole: Plant, x: Array) -> None:
+    """Give dry friction the softness that it has with all effects, those outside too.
+
+    They decide by the nominal model's friction whether it becomes sharp, and would find psi's and others' in this one.
+    """
+    every = ModelFields(copy.copy(whole.model), fields.nominal_model)
+    whole.write(every, x)
+    for name in _SOFTNESS:
+        if name in every.touched:
+            fields[name][...] = every[name]
+
+
+def _on_commands(spec: mujoco.MjSpec, pairs: Sequence[tuple[Effect, Array]]) -> tuple[mujoco.MjSpec, list[Effect]]:
+    """The spec with effects on commands, and those of them that it carries: all of an actuator's, or none."""
+    kept = list(pairs)
+    while True:
+        tried = spec.copy()
+        # Each acts before what the spec says already.
+        lost = next((e for e, theta in reversed(kept) if not e.spec(tried, theta)), None)
+        if lost is None:
+            return tried, [e for e, _ in kept]
+        kept = [(e, t) for e, t in kept if not set(e.where) & set(lost.where)]
+
+
+def _activations(spec: mujoco.MjSpec, model: mujoco.MjModel) -> dict[str, Array]:
+    """(nkey, n) states of each actuator that has any, in the keyframes; these are taken out of the spec's."""
+    starts, counts = model.actuator_actadr, model.actuator_actnum
+    found = {a.name: model.key_act[:, starts[a.id] : starts[a.id] + counts[a.id]].copy() for a in spec.actuators}
+    for key in spec.keys:
+        key.act = []
+    return {name: act for name, act in found.items() if act.size}
+
+
+def _settle_keys(spec: mujoco.MjSpec, model: mujoco.MjModel, known: dict[str, Array]) -> None:
+    """Put the states of actuators back into keyframes; one that has its state from an effect is settled there."""
+    if not model.na:
+        return
+    acts = np.zeros((model.nkey, model.na))
+    for i in np.flatnonzero(model.actuator_actnum):
+        low, high = command_limits(model, np.array([i]))
+        settled = np.clip(model.key_ctrl[:, i : i + 1], low, high)
+        at = int(model.actuator_actadr[i])
+        acts[:, at : at + int(model.actuator_actnum[i])] = known.get(model.actuator(i).name, settled)
+    for key, act in zip(spec.keys, acts, strict=True):
+        key.act = act
 
 
 def effects_of(plant: Plant, x: Array, which: Sequence[Effect] | None = None) -> list[tuple[Effect, Array]]:

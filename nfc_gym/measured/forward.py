@@ -1,6 +1,8 @@
 """Forward problems: what sensors read at the measured states and commands."""
 
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import mujoco
@@ -12,10 +14,10 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.measured.observe import Observer, observer
-from nfc_gym.physics.activations import Activations
-from nfc_gym.physics.effects.base import Context, Forces, overrides
+from nfc_gym.physics.acting import Acting
+from nfc_gym.physics.activations import Activations, delayed, fill_delays, longest_delay
+from nfc_gym.physics.effects.base import overrides
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.physics.past import trace
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -42,14 +44,11 @@ class ForwardProblem(InstantProblem):
         """See `InstantProblem`."""
         commands = delivered(plant, x, tracks)
         parts = [
-            self._turn(plant, x[some], tracks, [(u[some], a[some]) for u, a in commands])
-            for some in self.turns(len(x), tracks)
+            self._turn(plant, x[some], tracks, [c.of(some) for c in commands]) for some in self.turns(len(x), tracks)
         ]
         return [np.concatenate([p[i] for p in parts]) for i in range(len(tracks))]
 
-    def _turn(
-        self, plant: Plant, x: Array, tracks: Sequence[Track], commands: Sequence[tuple[Array, Array]]
-    ) -> list[Array]:
+    def _turn(self, plant: Plant, x: Array, tracks: Sequence[Track], commands: Sequence["Delivered"]) -> list[Array]:
         count = len(x)
         lengths = [len(t.time) for t in tracks]
         samples = sum(lengths)
@@ -62,34 +61,20 @@ class ForwardProblem(InstantProblem):
         rows = np.repeat(x, len(kept), 0)
         join = lambda name: np.tile(np.concatenate([getattr(t, name) for t in tracks])[kept], (count, 1))  # noqa: E731
         batch.qpos[...], batch.qvel[...] = join("qpos"), join("qvel")
-        batch.ctrl[...] = np.concatenate([u for u, _ in commands], 1)[:, kept].reshape(len(rows), -1)
-        batch.act[...] = np.concatenate([a for _, a in commands], 1)[:, kept].reshape(len(rows), -1)
+        came = lambda name: np.concatenate([getattr(c, name) for c in commands], 1)[:, kept].reshape(len(rows), -1)  # noqa: E731
+        batch.ctrl[...], batch.act[...] = came("ctrl"), came("act")
+        if longest_delay(plant.model):  # a buffer that holds one command alone lets it through
+            fill_delays(plant.model, [came("passed")], batch.bind("history"))
         sensordata = batch.bind("sensordata")  # bound before the call that fills it
         exogenous = {
             k: np.tile(np.concatenate([t.exogenous[k] for t in tracks])[kept], count) for k in tracks[0].exogenous
         }
-        thetas = plant.split(rows)[1]
-        pushing = [(e, th) for e, th in zip(plant.effects, thetas, strict=True) if overrides(e, "force")]
-        if pushing:
-            filled = set()  # what the last call filled: a view that is bound later waits for the next one
-
-            def derived(name: str) -> Array:
-                values = batch.bind(name)
-                if name not in filled:
-                    batch.forward()
-                    filled.update(batch._bound)
-                return values
-
-            ctx = Context(
-                plant.model, tracks[0].dt, batch.qpos, batch.qvel, batch.ctrl, exogenous, derived, fields.__getitem__
-            )
-            out = Forces(np.zeros_like(batch.qfrc_applied), np.zeros_like(batch.xfrc_applied))
+        acting = Acting(plant.model, plant.effects, plant.split(rows)[1], fields, batch, tracks[0].dt)
+        if acting.acts:
             ends, side_by_side = np.cumsum([0, *lengths]), samples * np.arange(count)
-            order = [np.arange(a, b)[:, None] + side_by_side for a, b in pairwise(ends)]
-            for effect, theta in pushing:
-                ctx.memory = trace(effect, ctx, theta, order) if overrides(effect, "follow") else None
-                effect.force(ctx, theta, out)
-            batch.qfrc_applied[...], batch.xfrc_applied[...] = out.qfrc, out.xfrc
+            acting.push_along(
+                batch.ctrl, exogenous, [np.arange(a, b)[:, None] + side_by_side for a, b in pairwise(ends)]
+            )
         batch.forward()
         sensed = np.zeros((count, samples, sensordata.shape[-1]))
         sensed[:, kept] = sensordata.reshape(count, len(kept), -1)
@@ -126,32 +111,64 @@ def _written(batch: Batch, plant: Plant, x: Array) -> ModelFields:
     return ModelFields(batch, plant.model)
 
 
-def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[tuple[Array, Array]]:
-    """What reaches the actuators along each track: commands after the effects on them, and activations.
+@dataclass(frozen=True)
+class Delivered:
+    """What reaches the actuators at the samples of a track, for each of P parameter vectors.
 
-    Returns:
-      for each track, commands (P, T, nu) and activations (P, T, na).
+    Attributes:
+      ctrl: (P, T, nu) commands after the effects on them.
+      passed: (P, T, nu) what the actuators' own delays let through of them.
+      act: (P, T, na) activations when a sample's command comes, which they have not felt yet.
+    """
+
+    ctrl: Array
+    passed: Array
+    act: Array
+
+    def of(self, some: slice) -> "Delivered":
+        """The same for some of the parameter vectors."""
+        return Delivered(self.ctrl[some], self.passed[some], self.act[some])
+
+
+def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Delivered]:
+    """What reaches the actuators along each track at parameter vectors (P, size).
+
+    Commands are held from sample to sample; what remembers them goes on in steps of the physics in between.
     """
     commanding = [i for i, e in enumerate(plant.effects) if overrides(e, "action")]
     model, count, longest = plant.model, len(x), max(len(t.time) for t in tracks)
     pad = lambda a: np.concatenate([a, np.repeat(a[-1:], longest - len(a), 0)])  # noqa: E731
-    ctrl = np.stack([pad(t.ctrl) for t in tracks])
+    held = np.stack([pad(t.held) for t in tracks])
+    rows, dt = held.shape[2], tracks[0].dt
     exogenous = {k: np.stack([pad(t.exogenous[k]) for t in tracks]) for k in tracks[0].exogenous}
     thetas = [np.repeat(th, len(tracks), 0).reshape(count, len(tracks), -1) for th in plant.split(x)[1]]
-    out = np.broadcast_to(ctrl, (count, *ctrl.shape)).copy()
-    act = np.zeros((*out.shape[:-1], model.na))
-    if commanding or model.na:
-        dt = tracks[0].dt
-        activations = Activations(model, dt)
+    out = np.broadcast_to(held[:, :, 0], (count, *held[:, :, 0].shape)).copy()
+    passed, act = out, np.zeros((*out.shape[:-1], model.na))
+    late = longest_delay(model)
+    if commanding or model.na or late:
         start = out[:, :, 0].copy()
-        memories = {i: plant.effects[i].state0(start.shape[:-1], start, thetas[i], dt) for i in commanding}
-        state = np.zeros((*start.shape[:-1], model.na))
+        parts = max(
+            1, round(dt / rows / model.opt.timestep)
+        )  # steps of the physics from one row of the log to the next
+
+        step = dt / (rows * parts)
+        memories = {i: plant.effects[i].state0(start.shape[:-1], start, thetas[i], step) for i in commanding}
+        if not late and all(m is None for m in memories.values()):
+            parts, step = 1, dt / rows  # where activations get to under a command that is held is known at once
+        passed = out.copy() if late else out
+        activations, state = Activations(model, step), np.zeros((*start.shape[:-1], model.na))
+        recent = deque[Array](maxlen=late + 1)
         for k in range(longest):
-            u = out[:, :, k]
-            signals = {n: np.broadcast_to(s[:, k], u.shape[:-1]) for n, s in exogenous.items()}
-            for i in commanding:
-                u, memories[i] = plant.effects[i].action(u, thetas[i], memories[i], signals, dt)
-            out[:, :, k] = u
-            activations.advance(u, state, settle=k == 0)
-            act[:, :, k] = state
-    return [(out[:, i, : len(t.time)], act[:, i, : len(t.time)]) for i, t in enumerate(tracks)]
+            signals = {n: np.broadcast_to(s[:, k], start.shape[:-1]) for n, s in exogenous.items()}
+            for part in range(rows * parts):
+                u = np.broadcast_to(held[:, k, part // parts], start.shape)
+                for i in commanding:
+                    u, memories[i] = plant.effects[i].action(u, thetas[i], memories[i], signals, step)
+                recent.append(u)
+                through = delayed(model, recent, step)
+                if part == 0:
+                    if k == 0:
+                        activations.advance(through, state, settle=True)
+                    out[:, :, k], passed[:, :, k], act[:, :, k] = u, through, state
+                activations.advance(through, state)
+    return [Delivered(*(a[:, i, : len(t.time)] for a in (out, passed, act))) for i, t in enumerate(tracks)]

@@ -30,7 +30,8 @@ _AT_ONCE = 200_000  # samples of all tracks under all parameter vectors
 class Track:
     """One log thinned to every `stride`-th sample: what the model is evaluated at, and what it is compared with.
 
-    `wanted` (T,) says at which samples a prediction is asked for; None is all, and a problem may give more.
+    `wanted` (T,) says at which samples a prediction is asked for; None is all, and a problem may give more. `held`
+    (T, stride, nu) are the commands from each sample on until the next, those of the rows between them among these.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Track:
     qpos: Array
     qvel: Array
     qacc: Array
-    ctrl: Array
+    held: Array
     exogenous: dict[str, Array]
     known: dict[tuple[str, tuple[str, ...]], Array]
     measured: Array
@@ -48,13 +49,19 @@ class Track:
     condition: str = ""
     wanted: NDArray[np.bool_] | None = None
 
+    @property
+    def ctrl(self) -> Array:
+        """(T, nu) commands at the samples."""
+        return self.held[:, 0]
+
 
 def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[str], stride: int) -> Track:
     """Thin a log; measured columns of all channels are set side by side."""
     rows = slice(None, None, stride)
-    ctrl = np.zeros((len(log), model.nu))
+    ctrl = np.zeros((-(-len(log) // stride) * stride, model.nu))
     for key, values in log.controls.items():
-        ctrl[:, actuator_names(model).index(key.removeprefix("ctrl:"))] = values
+        a = actuator_names(model).index(key.removeprefix("ctrl:"))
+        ctrl[: len(log), a], ctrl[len(log) :, a] = values, values[-1]
     known = {}
     for key, values in log.known.items():
         name, _, of = key.rpartition(":")
@@ -68,7 +75,7 @@ def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[st
         noise += [channel_noise(log, name)] * values.shape[1]
     return Track(
         log.name, log.time[rows], log.interval * stride,
-        states.qpos[rows], states.qvel[rows], states.qacc[rows], ctrl[rows],
+        states.qpos[rows], states.qvel[rows], states.qacc[rows], ctrl.reshape(-1, stride, model.nu),
         {k: v[rows] for k, v in log.exogenous.items()}, known,
         np.concatenate(columns, 1)[rows], np.concatenate(masks, 1)[rows], np.array(noise), log.condition,
     )  # fmt: skip
@@ -102,7 +109,7 @@ class InstantProblem(Problem):
 
     @abstractmethod
     def evaluate(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
-        """Predictions (P, T, C) along each track for parameter vectors (P, size)."""
+        """Predictions (P, T, C) along each track, of one time step, for parameter vectors (P, size)."""
 
     @abstractmethod
     def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str]]:
@@ -142,13 +149,13 @@ class InstantProblem(Problem):
         return [slice(i, i + turn) for i in range(0, count, turn)]
 
     def along(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
-        """`evaluate`, each track in its own condition."""
-        if all(not isinstance(e, Conditioned) for e in plant.effects):
-            return self.evaluate(plant, x, tracks)
+        """`evaluate`, each track in its own condition, and together with those of its own time step only."""
+        apart = any(isinstance(e, Conditioned) for e in plant.effects)
+        kinds = [(t.condition if apart else "", f"{t.dt:.3g}") for t in tracks]
         out: list[Array] = [np.zeros(0)] * len(tracks)
-        for label in dict.fromkeys(t.condition for t in tracks):
-            of = [i for i, t in enumerate(tracks) if t.condition == label]
-            inside, own = plant.under(x, np.array([label]))
+        for kind in dict.fromkeys(kinds):
+            of = [i for i, own in enumerate(kinds) if own == kind]
+            inside, own = plant.under(x, np.array([kind[0]])) if apart else (plant, x[:, None])
             for i, values in zip(of, self.evaluate(inside, own[:, 0], [tracks[i] for i in of]), strict=True):
                 out[i] = values
         return out

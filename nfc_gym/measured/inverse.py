@@ -36,6 +36,7 @@ class InverseProblem(InstantProblem):
                 "segments.mode inverse compares actuator forces: map at least one channel force:<actuator>"
             )
         self.actuators = [actuator_names(model).index(c.removeprefix("force:")) for c in found]
+        _require_told_apart(model, self.actuators)
         return found
 
     @cached_property
@@ -45,32 +46,85 @@ class InverseProblem(InstantProblem):
 
     def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str]]:
         """One column an actuator."""
-        hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
-        kinds = [int(model.jnt_type[model.actuator_trnid[a, 0]]) for a in self.actuators]
-        return [
-            ("torque", "N m", f"actuator:{actuator_names(model)[a]}")
-            if k == hinge
-            else ("force", "N", f"actuator:{actuator_names(model)[a]}")
-            for a, k in zip(self.actuators, kinds, strict=True)
-        ]
+        moments, names = levers(model), actuator_names(model)
+        hinges = model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_HINGE)
+        turning = [bool(hinges[moments[a] != 0].all()) for a in self.actuators]
+        kinds = [("torque", "N m") if turns else ("force", "N") for turns in turning]
+        return [(*kind, f"actuator:{names[a]}") for kind, a in zip(kinds, self.actuators, strict=True)]
 
     def evaluate(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
         """See `InstantProblem`."""
-        out: list[Array] = [np.zeros(0)] * len(tracks)
-        for dt in dict.fromkeys(t.dt for t in tracks):
-            of = [i for i, t in enumerate(tracks) if t.dt == dt]
-            alike = [tracks[i] for i in of]
-            parts = [actuator_forces(plant, x[some], alike, self._walked) for some in self.turns(len(x), alike)]
-            for i, forces in zip(of, zip(*parts, strict=True), strict=True):
-                out[i] = np.concatenate(forces)[..., self.actuators]
-        return out
+        parts = [actuator_forces(plant, x[some], tracks, self._walked) for some in self.turns(len(x), tracks)]
+        return [np.concatenate(forces)[..., self.actuators] for forces in zip(*parts, strict=True)]
+
+
+def levers(model: mujoco.MjModel) -> Array:
+    """(nu, nv) generalised force of one unit of each actuator's force, of those on joints and on fixed tendons.
+
+    Zero for others, whose levers depend on the motion, and for what acts on more than one degree of freedom of a joint.
+    """
+    kinds = mujoco.mjtTrn
+    out = np.zeros((model.nu, model.nv))
+    for a, (kind, of) in enumerate(zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True)):
+        if int(kind) in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
+            pulled = [(int(of), 1.0)]
+        elif int(kind) == int(kinds.mjTRN_TENDON):
+            wraps = slice(int(model.tendon_adr[of]), int(model.tendon_adr[of] + model.tendon_num[of]))
+            if (model.wrap_type[wraps] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+                continue
+            pulled = list(zip(map(int, model.wrap_objid[wraps]), map(float, model.wrap_prm[wraps]), strict=True))
+        else:
+            continue
+        for joint, share in pulled:
+            if int(model.jnt_type[joint]) >= int(mujoco.mjtJoint.mjJNT_SLIDE):
+                out[a, model.jnt_dofadr[joint]] += share * model.actuator_gear[a, 0]
+    return out
+
+
+def _require_told_apart(model: mujoco.MjModel, actuators: Sequence[int]) -> None:
+    """Refuse actuators whose forces the motion does not tell: of a moving lever, or beside others at the same joints.
+
+    Raises:
+      InputError: naming the actuator, what stands in the way, and what to do.
+    """
+    moments, names = levers(model), actuator_names(model)
+    size = np.linalg.norm(moments, axis=1, keepdims=True)
+    alike = moments / np.where(size > 0, size, 1)
+    mixed = np.abs(alike @ np.linalg.pinv(alike)) > 1e-6  # (nu, nu): whose forces are taken for whose
+    still, reach = size[:, 0] > 0, _reach(model)
+    for a in actuators:
+        refused = f"force:{names[a]} cannot be compared with `segments.mode: inverse`"
+        if not still[a]:
+            raise InputError(
+                f"{refused}: it is read of actuators on hinges, on slides and on fixed tendons of these; leave the "
+                "channel out, or use `mode: rollout`"
+            )
+        beside = (mixed[a] & still) | (~still & (reach & (moments[a] != 0)).any(1))
+        others = ", ".join(str(names[b]) for b in np.flatnonzero(beside) if b != a)
+        if others:
+            raise InputError(
+                f"{refused}: {others} can move the same joint, and the motion tells only what they do together; give "
+                "each joint one actuator, or use `mode: rollout`"
+            )
+
+
+def _reach(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """(nu, nv) degrees of freedom that each actuator can push, at a pose without any symmetry."""
+    data = mujoco.MjData(model)
+    mujoco.mj_integratePos(model, data.qpos, np.random.default_rng(0).normal(size=model.nv), 1.0)
+    mujoco.mj_fwdPosition(model, data)
+    out = np.zeros((model.nu, model.nv), bool)
+    for a, (first, count) in enumerate(zip(data.moment_rowadr, data.moment_rownnz, strict=True)):
+        out[a, data.moment_colind[first : first + count]] = True
+    return out
 
 
 def actuator_forces(plant: Plant, x: Array, tracks: Sequence[Track], walked: Recent | None = None) -> list[Array]:
-    """Forces of joint actuators that measured motions need, at parameter vectors.
+    """Forces of actuators that measured motions need, at parameter vectors.
 
     Generalised forces come from `mj_inverse`, less what force effects add; dry friction that depends on the actuator's
-    own load is iterated to consistency. Each joint is taken to have one actuator.
+    own load is iterated to consistency. Those of the joints become those of the actuators by their `levers`, in the
+    sense of least squares where a tendon pulls at joints that need more than it can give.
 
     Args:
       plant: the machine.
@@ -162,8 +216,9 @@ class _Needed:
     def actuation(self) -> Array:
         """(T, nu) forces of the actuators, effects on these included."""
         model, t = self.motion.model, self.motion.track
-        out = self.force[:, model.jnt_dofadr[model.actuator_trnid[:, 0]]] / model.actuator_gear[:, 0]
-        for effect, theta in zip(self.plant.effects, self._thetas, strict=True):
+        out = self.force @ np.linalg.pinv(levers(model))
+        # From the force back to the command: what acts last on the way there is undone first.
+        for effect, theta in reversed(list(zip(self.plant.effects, self._thetas, strict=True))):
             if overrides(effect, "demand"):
                 out = effect.demand(out, theta, t.exogenous, t.dt)
         return out

@@ -19,6 +19,7 @@ from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.segments import Layout, servos
 from nfc_gym.measured.shooting import RolloutProblem, interpolate
+from nfc_gym.measured.splits import find_logs
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -40,7 +41,8 @@ def predict(
         channels).
       stage: nominal, calibrated or extended.
       out: npz file to write; what is there is replaced.
-      restart: rollout only: start anew from the measured state every so many seconds.
+      restart: rollout only: start anew from the measured state every so many seconds; a single row that would be left
+        at the end of a log belongs to the piece before it.
 
     Returns:
       The arrays by log name, as written.
@@ -67,7 +69,7 @@ def predict(
         if logs:
             plant, x = models[fold.name]
             results |= _predict(bench, plant, x, logs, mode, restart, of)
-    joined = _join(results)
+    joined = _join(results, frozenset(s.name for s in find_logs(dataset.mapping, dataset.folder)))
     out.parent.mkdir(parents=True, exist_ok=True)
     with replacing(out) as part, open(part, "wb") as handle:
         np.savez_compressed(handle, **joined)  # type: ignore[arg-type]
@@ -144,6 +146,7 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None,
         )
     length = min(restart, log.duration) if restart else log.duration
     starts = np.searchsorted(log.time, np.arange(0.0, log.duration, length) - 1e-9) if restart else np.array([0])
+    starts = np.unique(starts[starts < len(log) - 1])  # a last row alone is the end of the piece before it
     laws = servos(
         plant.model, {k: (c.servo.joint, c.servo.limit) for k, c in mapping.controls.items() if c.servo is not None}
     )
@@ -176,11 +179,11 @@ def _slice(states: Any, start: int, stop: int) -> Any:
     return replace(states, **{k: getattr(states, k)[start:stop] for k in keys})
 
 
-def _join(results: dict[str, Array]) -> dict[str, Array]:
-    """Parts of a log that was cut by time (`<log>@fit`, ...) become one array again, in the order of time."""
-    order = ["fit", "select", "verify"]
+def _join(results: dict[str, Array], files: frozenset[str]) -> dict[str, Array]:
+    """Parts of a log that was cut by time (`<log>@fit`, ...), in the order of time, become the log of a file again."""
     out: dict[str, Array] = {}
-    for name in sorted(results, key=lambda n: (n.split("@")[0], order.index(n.split("@")[1]) if "@" in n else 0)):
-        base = name.split("@")[0]
-        out[base] = np.concatenate([out[base], results[name]]) if base in out else results[name]
+    for name, values in results.items():
+        while name not in files:
+            name = name.rpartition("@")[0]
+        out[name] = np.concatenate([out[name], values]) if name in out else values
     return out

@@ -100,6 +100,12 @@ def _put_off(log: Log, row: int, calm: tuple[NDArray[np.bool_], NDArray[np.bool_
     return row
 
 
+def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
+    """(n,) rows whose time (T,), which increases, is nearest to other times (n,); of two as near the earlier."""
+    after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
+    return after - (at - time[after - 1] <= time[after] - at)
+
+
 def cut(logs: Sequence[Log], layout: Layout) -> Cut:
     """Place segments end to end in every log that is long enough; each holds a sample beside its start.
 
@@ -123,7 +129,7 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
             if layout.put_off:
                 later = _put_off(log, s, calm, min(log.time[s] + _PUT_OFF * layout.stride, last))
                 late, s = late + float(log.time[later] - log.time[s]), later
-            near = np.abs(log.time[:, None] - (log.time[s] + np.array(layout.horizons))).argmin(0)
+            near = _nearest(log.time, log.time[s] + np.array(layout.horizons))
             if near.max() <= s:  # no sample lies as far after the start as any horizon
                 continue
             which.append(i)
@@ -236,6 +242,7 @@ def lay(
         servo=servo,
         condition=np.array([logs[i].condition for i in where.log]),
         past=Past(_Backwards(model, tuple(logs), tuple(states), where, layout), np.arange(len(where.log))),
+        channels=frozenset(logs[0].channels),
     )
 
 

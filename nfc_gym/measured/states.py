@@ -10,6 +10,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Channel, Log
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.smoothing import Local, estimate_noise, fresh_samples, local_polynomial, moving_average
+from nfc_gym.physics.effects.sensors import RATES, SPEEDS
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back, vector_to_quat
 
 Array = NDArray[np.float64]
@@ -112,8 +113,8 @@ class _Builder:
 
     def free(self, body: str, q: int, v: int) -> None:
         """A free joint: position and world velocity, quaternion and body-frame rates."""
-        position, speed = self.get(f"body:{body}:pos"), self.get(f"body:{body}:linvel", f"body:{body}:linvel@body")
-        attitude, rates = self.get(f"body:{body}:quat"), self.get(f"body:{body}:angvel@body", f"body:{body}:angvel")
+        position, attitude = self.get(f"body:{body}:pos"), self.get(f"body:{body}:quat")
+        speed, rates = (self.get(*(f"body:{body}:{kind}" for kind in kinds)) for kinds in (SPEEDS, RATES))
         self.observed[v : v + 3] = position is not None or speed is not None
         self.observed[v + 3 : v + 6] = attitude is not None or rates is not None
         if attitude is not None:

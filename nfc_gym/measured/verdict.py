@@ -223,6 +223,7 @@ def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[st
                 "equivalents": equivalents.get(effect.id, []),
                 "own_values": isinstance(effect, Each),
                 **({"conditions": list(effect.conditions)} if isinstance(effect, Conditioned) else {}),
+                **({"settings": effect.settings} if effect.settings else {}),
                 "parameters": {
                     p.name: {
                         "value": float(t),

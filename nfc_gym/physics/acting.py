@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.physics.effects.base import Context, Effect, Forces, overrides
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.past import trace
 
 Array = NDArray[np.float64]
 _ANEW = object()  # in place of a hidden state that the next command settles
@@ -142,6 +143,22 @@ class Acting:
         ctx.ctrl, ctx.exogenous = ctrl, exogenous
         if self.tracking:
             self._follow(ctx, fresh)
+        self._apply(ctx, out)
+
+    def push_along(self, ctrl: Array, exogenous: Mapping[str, Array], tracks: Sequence[NDArray[np.intp]]) -> None:
+        """The same at N moments at once, of tracks that are known as a whole and that hidden states are led along.
+
+        Args:
+          ctrl: (N, nu).
+          exogenous: signals, (N,) each.
+          tracks: see `past.trace`.
+        """
+        ctx, out = self._show(ctrl, exogenous)
+        self.traces = {effect: trace(effect, ctx, theta, tracks) for effect, theta in self.tracking}
+        self._apply(ctx, out)
+
+    def _apply(self, ctx: Context, out: Forces) -> None:
+        """All that effects do to a step besides its command."""
         if self.rubbing:
             self.loss[...] = self.base_friction
             for effect, theta in self.rubbing:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from nfc_gym.physics.acting import Acting
 from nfc_gym.physics.activations import Activations, delayed, fill_delays, longest_delay
-from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.sensors import true_state
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import resolve, write_field
 from nfc_gym.physics.segments import Segments, Trajectory
@@ -68,9 +69,7 @@ class Run:
         self.varying = self._write_known()
         plant.write(self.fields, rows)
         self.fields.commit()
-        q, v = self._tile(segments.qpos), self._tile(segments.qvel)
-        for effect, theta in zip(plant.effects, self.thetas, strict=True):
-            q, v = effect.unsense(q, v, theta)
+        q, v = self._true(self._tile(segments.qpos), self._tile(segments.qvel))
         # Live views: asking the batch for them anew costs as much as stepping a small machine.
         self.qpos, self.qvel, self.ctrl, self.act = (self.batch.bind(n) for n in ("qpos", "qvel", "ctrl", "act"))
         self.qpos[...], self.qvel[...] = q, v
@@ -82,6 +81,10 @@ class Run:
     def _tile(self, array: Array) -> Array:
         """(P S, ...) copies of a segment's values (S, ...) for every parameter vector."""
         return array[self.copies]
+
+    def _true(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Measured states (P S, nq), (P S, nv) without the faults of the sensors that they were read from."""
+        return true_state(self.plant.effects, self.thetas, q, v, self.segments.channels)
 
     def _write_known(self) -> list[tuple[Any, Array]]:
         """Constant known fields are written once; those that vary through a segment are returned."""
@@ -118,11 +121,13 @@ class Run:
     def roll(self) -> Trajectory:
         """Step through all segments at once."""
         self._remember()
+        self.activations.begin(self.batch, self.fields)
         if self.segments.settle:
             start = self.qpos.copy()
             for k in range(self.segments.settle):
                 self._advance(0, first=k == 0)
             self.qpos[...] = start
+            self.activations.begin(self.batch, self.fields)
             self.batch.qacc_warmstart[...] = 0
             self.acting.derived.clear()
         return self._in_turns() if self._watched() else self._at_once()
@@ -196,10 +201,7 @@ class Run:
             recent.append(ctrl)
             self.activations.advance(delayed(model, recent, segments.dt), act, settle=k == -segments.history)
             if past is not None and tracking:
-                q, v = map(self._tile, past.motion(k + segments.history))
-                for effect, theta in zip(self.plant.effects, self.thetas, strict=True):
-                    if overrides(effect, "unsense"):
-                        q, v = effect.unsense(q, v, theta)
+                q, v = self._true(*map(self._tile, past.motion(k + segments.history)))
                 acting.recall(q, v, self._serve(k, ctrl, q, v), exogenous)
         if alike and segments.history:
             self.act[...] = self._tile(act)

@@ -38,6 +38,8 @@ class Segments:
       condition: (S,) label of the condition that each segment was recorded in.
       past: what was measured before the starts. Without it, or with no history, joints with a memory begin at rest,
         and slow states of the drives settled at the history's first command.
+      channels: names of all measured channels, which say what each start was read from (`true_state`); None where
+        nobody knows.
     """
 
     dt: float
@@ -51,6 +53,7 @@ class Segments:
     settle: int = 0
     condition: NDArray[np.str_] | None = None
     past: Past | None = None
+    channels: frozenset[str] | None = None
 
     def __len__(self) -> int:
         return len(self.qpos)

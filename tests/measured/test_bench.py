@@ -1,5 +1,6 @@
 """Sizes that candidates take from the logs."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,6 +34,29 @@ def test_the_largest_push_is_what_the_servo_made_of_the_error_it_saw(build: Buil
     assert found.push is not None
     assert found.push[0] == pytest.approx(PUSH, rel=0.03)
     assert not found.push[1:].any()  # nothing drives the base
+
+
+def test_a_limit_is_sized_alike_whether_or_not_the_motor_has_a_filter(build: Build, machine: str) -> None:
+    """Of a motor behind a fast filter the force is that of its command, and not of a state of zero."""
+    found = {}
+    for name, actuator in (("plain", ""), ("filtered", 'dyntype="filterexact" dynprm="0.001"')):
+        model = re.sub(r'<position name="servo"[^>]*/>', f'<general name="servo" joint="hinge" {actuator}/>', machine)
+        dataset = require(build(None, ("{column: goal, unit: rad}", "{column: goal, unit: N m}"), model=model))[0]
+        proposed = candidates(make_bench(dataset, 1), dataset.logs)
+        (effect,) = [e for e in proposed if e.family == "saturation"]
+        found[name] = [*effect.params[0].probes, effect.params[0].high]
+    np.testing.assert_allclose(found["filtered"], found["plain"], rtol=0.05)
+
+
+def test_an_integrating_servo_is_sized_by_what_its_joint_needs(build: Build, machine: str) -> None:
+    """Its target is not logged: the force that holds and moves the joint is what it must have made."""
+    model = re.sub(
+        r'<position name="servo"[^>]*/>', '<intvelocity name="servo" joint="hinge" kp="10" actrange="-9 9"/>', machine
+    )
+    dataset = require(build(None, ("{column: goal, unit: rad}", "{column: goal, unit: rad/s}"), model=model))[0]
+    found = scales(make_bench(dataset, 1), dataset.logs)
+    assert found.actuation[0] > 1e-3
+    assert found.actuation[0] == pytest.approx(found.force[0], rel=0.5)
 
 
 def test_noise_is_no_push(build: Build) -> None:

@@ -174,6 +174,34 @@ def test_a_command_in_a_unit_that_its_actuator_does_not_take(
     assert bool(told) == bool(wanted)
 
 
+SUMMING = 'intvelocity name="servo" joint="hinge" kp="10" actrange="-9 9"'
+
+
+@pytest.mark.parametrize(
+    ("actuator", "mode", "severity", "words"),
+    [
+        (SUMMING, "rollout", "note", "holds the joint"),
+        (
+            SUMMING,
+            "forward",
+            "warning",
+            "0 where a log begins",
+        ),
+        ('general name="servo" joint="hinge" dyntype="integrator"', "rollout", "warning", "s before each start"),
+        ('motor name="servo" joint="hinge"', "rollout", "", ""),
+    ],
+)
+def test_what_an_integrator_is_taken_to_have_gathered_is_told(
+    build: Build, machine: str, actuator: str, mode: str, severity: str, words: str
+) -> None:
+    model = re.sub(r'<position name="servo"[^>]*/>', f"<{actuator}/>", machine)
+    assert actuator in model
+    edits = () if mode == "rollout" else (("segments: {length: 0.4}", "segments: {mode: forward}"),)
+    found = [f for f in check(build(None, *edits, model=model)) if "integrates" in f.message]
+    assert [f.severity for f in found] == [severity] * bool(severity)
+    assert all(words in str(f) and f.where == "controls.ctrl:servo" for f in found)
+
+
 def test_a_models_step_longer_than_the_shortest_horizon(build: Build, machine: str) -> None:
     """As of one that is given in the mapping."""
     slow = re.sub(r"(<mujoco[^>]*>)", r'\1<option timestep="0.2"/>', machine, count=1)

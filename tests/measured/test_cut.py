@@ -1,5 +1,7 @@
 """Where segments begin and what they are compared at: within the log, at a sample beside the start."""
 
+import time
+
 import mujoco
 import numpy as np
 import pytest
@@ -99,3 +101,21 @@ def test_speeds_at_starts_do_not_lean_to_the_command() -> None:
     off = np.abs(states.qvel[:, 0] - v)
     assert off[40:361:40].min() > 0.05  # m/s, at the steps
     assert off[cut([one], LAYOUT).start[1:]].max() < 1e-6
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.9])
+def test_samples_are_those_nearest_to_the_horizons(jitter: float) -> None:
+    one = log(0.01, 400, jitter)
+    where = cut([one], LAYOUT)
+    for start, samples in zip(where.start, where.samples, strict=True):
+        wanted = np.abs(one.time[:, None] - (one.time[start] + np.array(LAYOUT.horizons))).argmin(0)
+        np.testing.assert_array_equal(samples, wanted)
+
+
+def test_long_logs_are_cut_in_a_time_that_grows_with_their_length() -> None:
+    def seconds(rows: int) -> float:
+        begin = time.process_time()
+        assert len(cut([log(0.001, rows)], LAYOUT).start) > rows / 500
+        return time.process_time() - begin
+
+    assert seconds(400_000) < 2  # looking at every row for each segment takes tens of seconds

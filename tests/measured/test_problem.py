@@ -15,7 +15,7 @@ from nfc_gym.measured.metric import metric
 from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem, finer, interpolate
 from nfc_gym.measured.states import estimate_states
-from nfc_gym.physics.effects import FAMILIES
+from nfc_gym.physics.effects import FAMILIES, build
 from nfc_gym.physics.effects.inertial import complete_inertia
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
@@ -379,3 +379,181 @@ def test_instant_problems_say_which_channel_they_need(plant: Plant, kind: Callab
     log = run(plant.model, 0)
     with pytest.raises(InputError, match=word):
         kind(plant.model, [log], [estimate_states(plant.model, log)], 0.25)
+
+
+STEP = 0.002
+
+
+def carriage(actuator: str, extra: str = "") -> mujoco.MjModel:
+    """1 kg on a slide, with an accelerometer: it shows the force that pushes."""
+    return mujoco.MjModel.from_xml_string(f"""
+<mujoco><option timestep="{STEP}" gravity="0 0 0"/>
+<worldbody><body>
+  <joint name="slide" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/><site name="s"/>
+</body></worldbody>
+{extra}<actuator>{actuator}</actuator><sensor><accelerometer name="acc" site="s"/></sensor></mujoco>""")
+
+
+def driven(model: mujoco.MjModel, every: int, rows: int = 120, effect: tuple | None = None) -> Log:
+    """What the accelerometer reads of a cart that a wave of commands, held from row to row, pushes about."""
+    data, table, memory = mujoco.MjData(model), [], None
+    u0 = np.zeros(1)
+    if effect is not None:
+        memory = effect[0].state0((), u0, effect[1], STEP)
+    for k in range(rows):
+        given = np.array([np.sin(6 * np.pi * k * every * STEP)])
+        for part in range(every):
+            u = given
+            if effect is not None:
+                u, memory = effect[0].action(given, effect[1], memory, {}, STEP)
+            data.ctrl[:] = u
+            if part == 0:
+                mujoco.mj_forward(model, data)
+                table.append((given[0], data.qpos[0], data.qvel[0], *data.sensordata))
+            mujoco.mj_step(model, data)
+    values = np.array(table)
+    channels = {
+        "sensor:acc": Channel(values[:, 3:], "m/s^2", 1e-2),
+        "joint:slide:pos": Channel(values[:, 1], "m", 1e-6),
+        "joint:slide:vel": Channel(values[:, 2], "m/s", 1e-6),
+    }
+    return Log("cart", every * STEP * np.arange(rows), {"ctrl:motor": values[:, 0]}, channels)
+
+
+def bare(model: mujoco.MjModel, *effects: tuple) -> tuple[Plant, np.ndarray]:
+    theta = np.concatenate([np.zeros(0), *(th for _, th in effects)])
+    return Plant(model, ParameterSpace(model, []), [e for e, _ in effects], nthread=1), theta[None]
+
+
+def forward(model: mujoco.MjModel, logs: list[Log], *effects: tuple, stride: int = 1) -> list[np.ndarray]:
+    """The accelerometer along each log, (T, 3)."""
+    problem = ForwardProblem(model, logs, [estimate_states(model, log) for log in logs], 0.2, stride)
+    return [values[0] for values in problem.along(*bare(model, *effects), problem.tracks)]
+
+
+FILTER = '<general name="motor" joint="slide" dyntype="filterexact" dynprm="0.05"/>'
+LATE = '<motor name="motor" joint="slide" delay="0.025" nsample="14" interp="linear"/>'
+
+
+@pytest.mark.parametrize("every", [1, 10])
+@pytest.mark.parametrize("actuator", [FILTER, FILTER.replace("/>", ' actearly="true"/>'), LATE])
+def test_forward_problems_pass_commands_on_as_the_machine_does(actuator: str, every: int) -> None:
+    """A command's own sample has not felt it yet, but for `actearly`; a native delay holds what came before it."""
+    model = carriage(actuator)
+    log = driven(model, every)
+    acc = log.channels["sensor:acc"].values
+    np.testing.assert_allclose(forward(model, [log])[0], acc, atol=1e-9)
+    assert acc[:, 0].std() > 0.3
+
+
+@pytest.mark.parametrize("every", [1, 10])
+@pytest.mark.parametrize(("family", "size"), [("lag", {"time_constant": 0.05}), ("delay", {"delay": 0.025})])
+def test_forward_problems_pass_commands_on_as_roll_outs_do(family: str, size: dict[str, float], every: int) -> None:
+    """What remembers commands goes on in steps of the physics, however far apart the rows of a log are."""
+    model = carriage('<motor name="motor" joint="slide"/>')
+    effect, theta = build(family, "motor", size)
+    effect.bind(model)
+    log = driven(model, every, effect=(effect, theta))
+    found = forward(model, [log], (effect, theta))[0]
+    np.testing.assert_allclose(found, log.channels["sensor:acc"].values, atol=1e-9)
+
+
+def test_forward_problems_of_thinned_logs_hold_every_command() -> None:
+    model = carriage(FILTER)
+    log = driven(model, 5)
+    np.testing.assert_allclose(forward(model, [log], stride=4)[0], forward(model, [log])[0][::4], atol=1e-12)
+
+
+def test_forward_problems_step_each_log_at_its_own_rate() -> None:
+    model = carriage(FILTER)
+    logs = [driven(model, 2), driven(model, 10)]
+    for log, values in zip(logs, forward(model, logs), strict=True):
+        np.testing.assert_allclose(values, log.channels["sensor:acc"].values, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("family", "size"),
+    [
+        ("coulomb", {"level": 2.0}),
+        ("stribeck", {"level": 1.5, "rise": 0.5 * np.e, "speed": 1.0}),
+        ("directional_friction", {"forward": 2.0, "backward": 5.0, "forward_viscous": 0.0, "backward_viscous": 0.0}),
+        ("load_friction", {"level": 1.7, "motor": 0.1, "external": 0.0, "square": 0.0}),
+    ],
+)
+def test_forward_problems_rub(family: str, size: dict[str, float]) -> None:
+    """1 kg that slides at 1 m/s under 2 N of friction, pushed by 3 N."""
+    model = carriage('<motor name="motor" joint="slide"/>')
+    t = 0.01 * np.arange(100)
+    channels = {
+        "sensor:acc": Channel(np.zeros((100, 3)), "m/s^2", 1e-2),
+        "joint:slide:pos": Channel(t, "m", 1e-6),
+        "joint:slide:vel": Channel(np.ones(100), "m/s", 1e-6),
+    }
+    log = Log("cart", t, {"ctrl:motor": np.full(100, 3.0)}, channels)
+    np.testing.assert_allclose(forward(model, [log], build(family, "slide", size))[0][:, 0], 1.0, atol=1e-6)
+
+
+def hauled(model: mujoco.MjModel, acceleration: float, *named: str) -> tuple[Log, InverseProblem]:
+    """The cart at a constant acceleration, with the forces of some actuators measured."""
+    t = 0.01 * np.arange(100)
+    channels = {f"force:{name}": Channel(np.ones(100), "N", 1e-2) for name in named}
+    channels["joint:slide:pos"] = Channel(acceleration * t**2 / 2, "m", 1e-6)
+    log = Log("cart", t, {}, channels, {"exo:supply": np.full(100, 6.0)})
+    return log, InverseProblem(model, [log], [estimate_states(model, log)], 0.2)
+
+
+def test_inverse_problems_pull_by_the_lever_of_a_tendon() -> None:
+    tendon = '<tendon><fixed name="t"><joint joint="slide" coef="2"/></fixed></tendon>'
+    model = carriage('<motor name="motor" tendon="t" gear="3"/>', tendon)
+    _, problem = hauled(model, 1.5, "motor")
+    np.testing.assert_allclose(problem.along(*bare(model), problem.tracks)[0][0, :, 0], 0.25, rtol=1e-6)
+    assert problem.columns.unit[0] == "N"
+
+
+def test_inverse_problems_tell_a_joint_from_a_tendon_that_pulls_at_it_too() -> None:
+    """m1 on one slide, and a tendon over it and another: two joints tell the forces of two actuators."""
+    model = mujoco.MjModel.from_xml_string("""
+<mujoco><option gravity="0 0 0"/><worldbody>
+  <body><joint name="slide" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>
+  <body pos="0 1 0"><joint name="other" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>
+</worldbody><tendon><fixed name="t"><joint joint="slide" coef="0.5"/><joint joint="other" coef="-1"/></fixed></tendon>
+<actuator><motor name="m1" joint="slide"/><motor name="m2" tendon="t"/></actuator></mujoco>""")
+    t = 0.01 * np.arange(100)
+    channels = {f"force:{m}": Channel(np.ones(100), "N", 1e-2) for m in ("m1", "m2")}
+    channels |= {"joint:slide:pos": Channel(t**2, "m", 1e-6), "joint:other:pos": Channel(-1.5 * t**2, "m", 1e-6)}
+    log = Log("carts", t, {}, channels)
+    problem = InverseProblem(model, [log], [estimate_states(model, log)], 0.2)
+    # m2 pulls with 3 N at the other, of which half comes to the first, whose motor adds the rest of its 2 N.
+    np.testing.assert_allclose(problem.along(*bare(model), problem.tracks)[0][0], np.tile([0.5, 3.0], (100, 1)), 1e-6)
+
+
+MOTORS = '<motor name="m1" joint="slide"/>'
+
+
+@pytest.mark.parametrize(
+    ("actuators", "named", "words"),
+    [
+        (MOTORS + '<motor name="m2" joint="slide" gear="0.01"/>', ["m1"], r"m2 can move the same joint"),
+        (MOTORS + '<motor name="m2" joint="slide"/>', ["m1", "m2"], r"m2 can move the same joint"),
+        (MOTORS + '<motor name="m2" site="s" gear="1 0 0 0 0 0"/>', ["m1"], r"m2 can move the same joint"),
+        ('<motor name="m2" site="s" gear="1 0 0 0 0 0"/>', ["m2"], r"hinges, on slides and on fixed tendons"),
+    ],
+)
+def test_inverse_problems_refuse_forces_that_the_motion_does_not_tell(
+    actuators: str, named: list[str], words: str
+) -> None:
+    with pytest.raises(InputError, match=rf"force:{named[0]} cannot be compared .*{words}"):
+        hauled(carriage(actuators), 1.0, *named)
+
+
+def test_inverse_problems_undo_the_last_effect_on_a_command_first() -> None:
+    model = carriage('<motor name="motor" joint="slide"/>')
+    effects = [
+        build("offset", "motor", {"offset": 0.5}),
+        build("supply_sag", "motor", {"exponent": 1.0, "reference": 12.0}),
+        build("gain", "motor", {"gain": 0.8}),
+    ]
+    for order, force in ((effects, 0.8 * (1 + 0.5) * 0.5), ([effects[1], effects[0], effects[2]], 0.8 * (0.5 + 0.5))):
+        _, problem = hauled(model, force, "motor")
+        found = problem.along(*bare(model, *order), problem.tracks)[0]
+        np.testing.assert_allclose(found[0, :, 0], 1.0, rtol=1e-6)

@@ -1,12 +1,14 @@
 """Effects on commands and on what actuators make of them, against closed forms."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 import pytest
 from machines import make, plant_of, run
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects import Effect, Scales, build, propose
 from nfc_gym.physics.effects.each import each
 from nfc_gym.physics.segments import Segments
 
@@ -22,6 +24,28 @@ def _made(family: str, parameters: dict[str, float], ctrl: np.ndarray, history: 
     """Force that the motor makes at every step."""
     effect, theta = make(family, "push", parameters)
     t = run(RAIL, effect, theta, len(ctrl) - history, ctrl=ctrl[:, None], history=history, **more)  # type: ignore[arg-type]
+    assert t.sensordata is not None
+    return t.sensordata[0, 0, :-1, 0]
+
+
+def _bound(family: str, parameters: dict[str, float], text: str = RAIL) -> tuple[Effect, np.ndarray]:
+    """The effect at the motor of a rail, bound to it."""
+    effect, theta = build(family, "push", parameters)
+    effect.bind(mujoco.MjModel.from_xml_string(text))
+    return effect, theta
+
+
+def _with(actuator: str) -> str:
+    """The rail with another actuator."""
+    return RAIL.replace('<motor name="push" joint="rail" gear="2" ctrlrange="-5 5"/>', actuator)
+
+
+def _pushed(text: str, rows: Sequence[tuple[str, dict[str, float]]], ctrl: np.ndarray) -> np.ndarray:
+    """Force that the actuator of a rail makes at every step under effects, in their order."""
+    effects, thetas = zip(*(build(family, "push", given) for family, given in rows), strict=True)
+    model = mujoco.MjModel.from_xml_string(text)
+    segments = Segments(DT, 0, np.zeros((1, 1)), np.zeros((1, 1)), ctrl[None, :, None])
+    t = plant_of(model, *effects).shoot(np.concatenate(thetas)[None], segments, sensors=True)
     assert t.sensordata is not None
     return t.sensordata[0, 0, :-1, 0]
 
@@ -98,7 +122,7 @@ def test_lag_starts_in_the_state_that_history_left() -> None:
 def test_lag_is_the_native_filter() -> None:
     """The same commands through MuJoCo's own exact filter: same force at every step."""
     spec = mujoco.MjSpec.from_string(RAIL)
-    effect, theta = make("lag", "push", {"time_constant": 0.05})
+    effect, theta = _bound("lag", {"time_constant": 0.05})
     assert effect.spec(spec, theta)
     native = run(spec.compile(), None, [], 60, ctrl=10 * NOISE[:, None]).sensordata  # beyond the command range, too
     assert native is not None
@@ -120,7 +144,7 @@ def test_delay_is_the_native_one(delay: float) -> None:
     """From rest at zero command MuJoCo's own buffer gives the same, also between two steps."""
     ctrl = np.r_[np.zeros(10), NOISE]
     spec = mujoco.MjSpec.from_string(RAIL)
-    effect, theta = make("delay", "push", {"delay": delay * DT})
+    effect, theta = _bound("delay", {"delay": delay * DT})
     assert effect.spec(spec, theta)
     native = run(spec.compile(), None, [], len(ctrl), ctrl=ctrl[:, None]).sensordata
     assert native is not None
@@ -128,7 +152,7 @@ def test_delay_is_the_native_one(delay: float) -> None:
 
 
 def test_delay_shorter_than_a_step_is_not_native() -> None:
-    effect, theta = make("delay", "push", {"delay": DT / 2})
+    effect, theta = _bound("delay", {"delay": DT / 2})
     assert not effect.spec(mujoco.MjSpec.from_string(RAIL), theta)
 
 
@@ -203,7 +227,147 @@ def test_of_delays_that_differ_the_model_carries_all_or_none() -> None:
     two = RAIL.replace("</actuator>", '<motor name="pull" joint="rail"/></actuator>')
     spec = mujoco.MjSpec.from_string(two)
     both = each([build("delay", name, {"delay": 0.0})[0] for name in ("push", "pull")])
+    both.bind(mujoco.MjModel.from_xml_string(two))
     assert not both.spec(spec, np.array([DT / 2, 0.03]))
     assert [a.delay for a in spec.actuators] == [0, 0]
     assert both.spec(spec, np.array([0.02, 0.03]))
     assert [a.delay for a in spec.actuators] == [0.02, 0.03]
+
+
+def test_wires_that_are_swapped_turn_the_force_and_its_limits_round() -> None:
+    """A force range of -1 to 3 N becomes one of -3 to 1 N."""
+    text = _with('<motor name="push" joint="rail" forcerange="-1 3"/>')
+    expected = -np.clip(NOISE, -1, 3)
+    np.testing.assert_allclose(_pushed(text, [("gain", {"gain": -1.0})], NOISE), expected)
+    effect, theta = _bound("gain", {"gain": -1.0}, text)
+    spec = mujoco.MjSpec.from_string(text)
+    assert effect.spec(spec, theta)
+    np.testing.assert_allclose(
+        run(spec.compile(), None, [], 60, ctrl=NOISE[:, None]).sensordata[0, 0, :-1, 0], expected
+    )
+    np.testing.assert_allclose(effect.demand(expected[:, None], theta, {}, DT)[:, 0], -expected)
+
+
+def test_a_dead_motor_with_a_limit_is_native() -> None:
+    """MJCF has no force range of zero width."""
+    text = _with('<motor name="push" joint="rail" forcerange="-2 2" forcelimited="true"/>')
+    effect, theta = _bound("loss", {"fraction": 1.0}, text)
+    spec = mujoco.MjSpec.from_string(text)
+    assert effect.spec(spec, theta)
+    made = run(spec.compile(), None, [], 60, ctrl=NOISE[:, None]).sensordata
+    assert made is not None
+    np.testing.assert_array_equal(made, 0)
+
+
+SATURATIONS = [{"inverse_limit": 1 / 0.5}, {"inverse_limit": 1 / 100.0}]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("given", ["", 'forcerange="-9 9"', 'forcerange="-.1 .1" forcelimited="false"'])
+def test_of_two_limits_on_a_force_the_stricter_counts(given: str, order: int) -> None:
+    text = _with(f'<motor name="push" joint="rail" {given}/>')
+    rows = [("saturation", limit) for limit in SATURATIONS[::order]]
+    np.testing.assert_allclose(_pushed(text, rows, NOISE), np.clip(NOISE, -0.5, 0.5))
+    spec = mujoco.MjSpec.from_string(text)
+    for family, limit in rows:
+        effect, theta = _bound(family, limit, text)
+        assert effect.spec(spec, theta)
+    np.testing.assert_allclose(spec.compile().actuator_forcerange[0], [-0.5, 0.5])
+
+
+def test_what_is_cut_and_then_shifted_is_so_in_the_model_too() -> None:
+    """The effect that acts first goes into the spec last; clip(u, -3, 3) + 2.5 is itself clipped at 5."""
+    rows = [("saturation", {"removed": 0.4}), ("offset", {"offset": 2.5})]
+    spec = mujoco.MjSpec.from_string(RAIL)
+    for family, given in reversed(rows):
+        effect, theta = _bound(family, given)
+        assert effect.spec(spec, theta)
+    expected = np.minimum(np.clip(NOISE, -3, 3) + 2.5, 5)
+    np.testing.assert_allclose(_pushed(RAIL, rows, NOISE), expected)
+    native = run(spec.compile(), None, [], 60, ctrl=NOISE[:, None]).sensordata
+    assert native is not None
+    np.testing.assert_allclose(native[0, 0, :-1, 0], expected)
+
+
+def test_a_range_without_width_is_not_native() -> None:
+    effect, theta = _bound("saturation", {"removed": 1.0})
+    spec = mujoco.MjSpec.from_string(RAIL)
+    assert not effect.spec(spec, theta)
+    assert list(spec.actuator("push").ctrlrange) == [-5, 5]
+
+
+@pytest.mark.parametrize(
+    ("actuator", "native"),
+    [
+        ('<general name="push" joint="rail" gaintype="affine" gainprm="1 .8 .1" ctrlrange="-2 2"/>', True),
+        ('<general name="push" joint="rail" dyntype="filterexact" dynprm=".1" actrange="-2 1.5"/>', True),
+        ('<position name="push" joint="rail" kp="9" kv="1" ctrlrange="-3 3"/>', True),
+        ('<intvelocity name="push" joint="rail" kp="10" actrange="-2 2"/>', False),
+        ('<general name="push" joint="rail" dyntype="integrator"/>', False),
+    ],
+)
+def test_an_offset_is_native_where_mjcf_can_say_it(actuator: str, native: bool) -> None:
+    text = _with(actuator)
+    effect, theta = _bound("offset", {"offset": 0.7}, text)
+    spec = mujoco.MjSpec.from_string(text)
+    before = spec.to_xml()
+    assert effect.spec(spec, theta) == native
+    if not native:
+        assert spec.to_xml() == before
+        return
+    runs = [
+        run(model, own, values, 60, ctrl=NOISE[:, None])
+        for model, own, values in ((spec.compile(), None, []), (mujoco.MjModel.from_xml_string(text), effect, theta))
+    ]
+    np.testing.assert_allclose(runs[0].qpos, runs[1].qpos, atol=1e-12)
+    assert np.abs(runs[0].qpos).max() > 1e-3
+
+
+def test_a_lag_or_delay_is_not_native_in_a_step_of_stages() -> None:
+    staged = RAIL.replace('gravity="0 0 0"', 'gravity="0 0 0" integrator="RK4"')
+    for family, given in (("lag", {"time_constant": 0.05}), ("delay", {"delay": 0.05})):
+        effect, theta = _bound(family, given, staged)
+        assert not effect.spec(mujoco.MjSpec.from_string(staged), theta)
+
+
+def test_a_lag_before_a_tighter_limit_is_not_native() -> None:
+    """MuJoCo clips what it filters, and not what the filter gives."""
+    spec = mujoco.MjSpec.from_string(RAIL)
+    cut, share = _bound("saturation", {"removed": 0.4})
+    lag, tau = _bound("lag", {"time_constant": 0.05})
+    assert cut.spec(spec, share)
+    assert not lag.spec(spec, tau)
+
+
+TWO = """
+<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody>
+<body><joint name="first" axis="0 1 0"/><geom size=".1" mass="1" pos=".2 0 0"/></body>
+<body pos="1 0 0"><joint name="second" axis="0 1 0"/><geom size=".1" mass="1" pos=".2 0 0"/></body></worldbody>
+<tendon><fixed name="belt"><joint joint="second" coef="2"/></fixed></tendon>
+<actuator><motor name="drive" {0} ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+def test_the_torque_speed_line_of_a_belt_is_that_of_the_joint_it_moves() -> None:
+    """A fixed tendon that goes twice as fast as its joint is a gear of two, and no-load speed is that of the belt."""
+    ends = {}
+    for name, wiring, fall in (("belt", 'tendon="belt"', 0.3), ("gear", 'joint="second" gear="2"', 0.6)):
+        effect, theta = build("torque_speed", "drive", {"fall": fall})
+        t = run(TWO.format(wiring), effect, theta, 1500, qvel=[1.0, 0.0], ctrl=1.0)
+        ends[name] = t.qvel[0, 0, -1]
+    np.testing.assert_allclose(ends["belt"], ends["gear"], atol=1e-9)
+    np.testing.assert_allclose(ends["belt"], [1.0, 1 / 0.6], rtol=1e-3)
+
+
+def test_a_torque_speed_line_wants_a_speed() -> None:
+    text = TWO.replace("</body></worldbody>", '<site name="tip"/></body></worldbody>').format('site="tip" gear="0 0 1"')
+    effect, _ = build("torque_speed", "drive", {"fall": 0.3})
+    with pytest.raises(InputError, match="moves no hinge"):
+        effect.bind(mujoco.MjModel.from_xml_string(text))
+
+
+def test_a_limit_is_not_looked_for_where_nothing_pushes() -> None:
+    model = mujoco.MjModel.from_xml_string(_with('<position name="push" joint="rail" kp="30"/>'))
+    one = np.ones(1)
+    for push, found in ((0.0, 0), (2.0, 1)):
+        proposed = propose(model, Scales(one, one, one, push * one, 0.01), only=("saturation",), generic=False)
+        assert len(proposed) == found

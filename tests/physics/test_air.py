@@ -227,7 +227,12 @@ def test_a_model_whose_centre_of_mass_was_moved_says_where_its_hull_is() -> None
     ("family", "where", "theta", "said"),
     [
         ("slope", "b", {"roll": 0.1, "pitch": 0.0}, "slope: `where` is 'b', want 'world'"),
-        ("wind", "world", {"push_x": 1.0, "push_y": 0.0, "push_z": 0.0, "drag": 1.0}, "the world does not move; bodies: b"),
+        (
+            "wind",
+            "world",
+            {"push_x": 1.0, "push_y": 0.0, "push_z": 0.0, "drag": 1.0},
+            "the world does not move; bodies: b",
+        ),
         ("external_force", "world", {"x": 1.0, "y": 0.0, "z": 0.0}, "the world does not move; bodies: b"),
         ("drag_linear", "world", {"x": 1.0, "y": 0.0, "z": 0.0}, "the world does not move; bodies: b"),
         ("drag_linear", "c", {"x": 1.0, "y": 0.0, "z": 0.0}, "no body named 'c'; bodies: b"),

@@ -3,9 +3,11 @@
 import mujoco
 import numpy as np
 import pytest
-from machines import make, run
+from machines import make, plant_of, run
 
-from nfc_gym.physics.effects import Scales, build, propose
+from nfc_gym.core.errors import InputError
+from nfc_gym.measured.export import corrected
+from nfc_gym.physics.effects import FAMILIES, Scales, build, propose
 from nfc_gym.physics.effects.joint import Cogging
 
 DT, MASS = 0.001, 2.0
@@ -143,3 +145,78 @@ def test_less_damping_than_the_model_has_is_within_the_bounds() -> None:
     effect, theta = build("damping_poly", "pivot", {"linear": -0.01, "quadratic": 0.0, "cubic": 0.0})
     effect.require_possible(theta)
     assert (effect.low <= theta).all()
+
+
+@pytest.mark.parametrize("angle", ["degree", "radian"])
+@pytest.mark.parametrize("kind", ["hinge", "slide"])
+def test_a_spring_in_the_model_has_its_rest_in_the_models_own_unit(angle: str, kind: str) -> None:
+    """1 N m/rad at 0.2 beside 3 at 0.6, whatever the unit of angles: a slide has none."""
+    own = 0.2 if kind == "slide" or angle == "radian" else float(np.degrees(0.2))
+    text = f"""<mujoco><compiler angle="{angle}"/><worldbody><body>
+    <joint name="turn" type="{kind}" stiffness="1" springref="{own!r}"/><geom size=".1"/></body></worldbody></mujoco>"""
+    spec = mujoco.MjSpec.from_string(text)
+    effect, theta = build("spring_offset", "turn", {"stiffness": 3.0, "rest": 0.6})
+    written, outside = corrected(spec, plant_of(spec.compile(), effect), theta)
+    model = mujoco.MjModel.from_xml_string(written)
+    assert not outside
+    np.testing.assert_allclose(model.jnt_stiffness, 4.0)
+    np.testing.assert_allclose(model.qpos_spring, 0.5, rtol=1e-5)
+
+
+WRIST = mujoco.MjModel.from_xml_string("""
+<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="wrist" type="ball"/><geom type="box" size=".1 .1 .1"/>
+<body><joint name="thumb"/><geom size=".05" pos=".2 0 0"/></body></body>
+<body pos="3 0 0"><freejoint name="flight"/><geom size=".1"/></body></worldbody></mujoco>""")
+ROUND = {
+    "coulomb": {"level": 0.05},
+    "damping_poly": {"linear": 0.1, "quadratic": 0.0, "cubic": 0.0},
+    "armature": {"inertia": 0.1},
+}
+# Families that take a joint's name and one number for its force, position or speed.
+LINEAR = ("stribeck", "load_friction", "directional_friction", "spring_offset", "hysteresis", "backlash", "cogging")
+
+
+@pytest.mark.parametrize("family", ROUND)
+def test_what_is_alike_about_all_axes_of_a_ball_joint_acts_about_all(family: str) -> None:
+    """Turning about any axis it slows, or is pushed less by the same torque, as about another."""
+    torque = "" if family != "armature" else '<actuator><motor name="{0}" joint="wrist" gear="{1}"/></actuator>'
+    own = []
+    for axis in range(3):
+        gear = " ".join(str(int(axis == k)) for k in range(3))
+        ball = f"""<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="wrist" type="ball"/>
+        <geom type="sphere" size=".1" mass="1"/></body></worldbody>{torque.format("push", gear)}</mujoco>"""
+        effect, theta = build(family, "wrist", ROUND[family])
+        speed = np.zeros(3) if torque else np.eye(3)[axis]
+        after = [run(ball, e, t, 1, qvel=speed, ctrl=1.0).qvel[0, 0, 1] for e, t in ((effect, theta), (None, []))]
+        own.append((after[0] - after[1])[axis])
+        assert effect.params[0].unit in ("N m", "N m s/rad", "kg m^2")
+    assert abs(own[0]) > 1e-4
+    np.testing.assert_allclose(own, own[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("joint", ["wrist", "flight"])
+@pytest.mark.parametrize("family", LINEAR)
+def test_a_law_along_one_axis_refuses_other_joints_and_names_those_it_takes(family: str, joint: str) -> None:
+    effect, _ = make(family, joint, {p.name: p.probes[0] for p in FAMILIES[family].PARAMS})
+    with pytest.raises(InputError, match=f"'{joint}' is a (ball|free) joint.*thumb"):
+        effect.bind(WRIST)
+
+
+def test_a_force_along_a_joint_refuses_a_ball_joint() -> None:
+    with pytest.raises(InputError, match=r"'wrist' is a ball joint.*thumb"):
+        build("external_force", "wrist", {"force": 1.0})[0].bind(WRIST)
+
+
+@pytest.mark.parametrize("family", ROUND)
+def test_nothing_is_alike_about_all_axes_of_a_free_joint(family: str) -> None:
+    with pytest.raises(InputError, match=r"'flight' is a free joint.*wrist, thumb"):
+        build(family, "flight", ROUND[family])[0].bind(WRIST)
+
+
+def test_every_candidate_can_be_bound() -> None:
+    ones = np.ones(WRIST.nv)
+    scales = Scales(ones, ones, ones[:0], ones[:0], 0.01, low=WRIST.qpos0 - 9, high=WRIST.qpos0 + 9)
+    found = propose(WRIST, scales)
+    assert {"coulomb", "spring_offset"} <= {e.family for e in found}
+    for effect in found:
+        effect.bind(WRIST)

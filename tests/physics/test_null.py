@@ -6,8 +6,10 @@ import pytest
 from machines import ZOO, candidates, plant_of, probe, zoo, zoo_scales, zoo_segments
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.measured.export import READ_COMMANDS
+from nfc_gym.physics import acting
 from nfc_gym.physics.effects import FAMILIES, build, complete_inertia, propose
-from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.effects.base import Context, Effect, overrides
 
 MODEL = zoo()
 CANDIDATES = candidates(MODEL)
@@ -96,6 +98,7 @@ def test_structural_edit_equals_the_hooks(family: str) -> None:
     effect = CANDIDATES[family][0]
     spec = mujoco.MjSpec.from_string(ZOO)
     theta = probe(effect)
+    effect.bind(MODEL)
     if not effect.spec(spec, theta):
         pytest.skip("not carried by MJCF")
     edited = spec.compile()
@@ -107,6 +110,27 @@ def test_structural_edit_equals_the_hooks(family: str) -> None:
     for model in (edited, reread):
         theirs = plant_of(model).shoot(np.zeros((1, 0)), segments)
         np.testing.assert_allclose(mine.qpos, theirs.qpos, atol=2e-6, err_msg=effect.id)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_who_reads_commands_is_known_to_the_export(monkeypatch: pytest.MonkeyPatch, family: str) -> None:
+    """A model that carries effects on commands would show other ones to these laws."""
+    seen: list[Context] = []
+
+    class Watched(Context):
+        @property
+        def ctrl(self) -> np.ndarray:
+            seen.append(self)
+            return self.held
+
+        @ctrl.setter
+        def ctrl(self, values: np.ndarray) -> None:
+            self.held = values
+
+    monkeypatch.setattr(acting, "Context", Watched)
+    effect = CANDIDATES[family][0]
+    _observed(effect, probe(effect)[None], 0)
+    assert bool(seen) == (family in READ_COMMANDS)
 
 
 def test_build_returns_the_effect_that_was_saved() -> None:

@@ -6,8 +6,9 @@ import pytest
 from machines import make
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.sensors import unit_of
-from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, vector_to_quat
+from nfc_gym.physics.effects.saved import from_row
+from nfc_gym.physics.effects.sensors import true_state, unit_of
+from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate_back, vector_to_quat
 
 MODEL = mujoco.MjModel.from_xml_string("""
 <mujoco><worldbody><body name="base"><freejoint/><geom size=".1"/><site name="imu"/></body>
@@ -102,6 +103,8 @@ def test_unsense_recovers_the_start_state(family: str, channel: str, parameters:
     wrong[:, at : at + dim] = effect.sense(channel, array[:, None, at : at + dim], theta, DT)[:, 0]
     if (family, channel) == ("sensor_gain", "joint:arm:pos"):
         wrong_v[:, 6] *= 1.2  # speed taken from the same channel
+    if channel == "body:base:quat":
+        wrong_v[:, 3:6] = rotate_back(vector_to_quat(theta)[None], v[:, 3:6])  # and so are rates, in the mount's frame
     back_q, back_v = effect.unsense(wrong_q, wrong_v, theta)
     np.testing.assert_allclose(back_q, q, atol=1e-12)
     np.testing.assert_allclose(back_v, v, atol=1e-12)
@@ -128,6 +131,38 @@ def test_misalignment_turns_vectors_and_orientations_alike() -> None:
     turn = lambda q, x: quat_multiply(quat_multiply(q, np.c_[[0.0], x]), quat_conjugate(q))[:, 1:]  # noqa: E731
     np.testing.assert_allclose(turn(seen_quat, seen), turn(quat, a), atol=1e-12)
     assert np.linalg.norm(seen - a) > 0.01
+
+
+def test_values_for_each_channel_act_on_their_own() -> None:
+    """Of one family at two channels, each with a value of its own."""
+    joined, theta = from_row(
+        {
+            "family": "sensor_bias",
+            "where": ["joint:arm:pos", "joint:arm:vel"],
+            "each": True,
+            "parameters": {"bias@joint:arm:pos": 0.3, "bias@joint:arm:vel": -0.2},
+        }
+    )
+    joined.bind(MODEL)
+    zero = np.zeros((5, 1))
+    np.testing.assert_allclose(joined.sense("joint:arm:pos", zero, theta, DT), 0.3)
+    np.testing.assert_allclose(joined.sense("joint:arm:vel", zero, theta, DT), -0.2)
+    q, v = true_state([joined], [theta], np.zeros(MODEL.nq), np.zeros(MODEL.nv))
+    assert (q[7], v[6]) == (pytest.approx(-0.3), pytest.approx(0.2))
+
+
+@pytest.mark.parametrize(
+    ("family", "channel", "parameters"),
+    [
+        ("sensor_bias", "joint:arm:pos", {"x": 0.1, "y": 0.2, "z": 0.3}),
+        ("sensor_bias", "body:base:quat", {"bias": 0.1}),
+        ("sensor_gain", "body:base:quat", {"gain": 1.1}),
+        ("misalignment", "joint:arm:pos", {"x": 0.1, "y": 0.2, "z": 0.3}),
+    ],
+)
+def test_faults_that_a_channel_cannot_have_are_refused(family: str, channel: str, parameters: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=f"{family} of '{channel}' .*; want"):
+        _bound(family, channel, parameters)
 
 
 def test_unknown_channels_are_refused() -> None:

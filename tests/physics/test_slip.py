@@ -6,6 +6,7 @@ import pytest
 from machines import make, run
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects.base import Context, Forces
 from nfc_gym.physics.effects.slip import wheels
 
 MU, G = 0.6, 9.81
@@ -100,3 +101,46 @@ def test_creep_slides_below_the_cone_in_proportion_to_the_force() -> None:
             drift[creep, push] = float(t.qvel[0, 0, -200:, 1].mean())
     assert drift[100.0, 0.2] > 10 * drift[0.0, 0.2] > 0
     assert drift[100.0, 0.2] / drift[100.0, 0.1] == pytest.approx(2, rel=0.1)
+
+
+FLOOR = '<geom name="floor" type="plane" size="50 50 1" friction=".8"/>'
+WALL = '<geom name="wall" type="box" size=".1 1 1" pos="5 0 1" friction="2"/>'
+SIDE = '<geom name="side" type="plane" size="9 9 1" pos="0 8 0" euler="90 0 0" friction="2"/>'
+TABLE = '<geom name="table" type="box" size="2 2 .1" pos="0 0 3" friction="2"/>'
+STAGE = '<geom name="stage" type="box" size="2 2 .1" pos="0 0 -.1" friction="1.2"/>'
+PIT = '<geom name="floor" type="plane" size="50 50 1" pos="0 0 -1" friction=".8"/>'
+FIELD = '<geom name="hills" type="hfield" hfield="hills" friction="1.2"/>'
+
+
+@pytest.mark.parametrize(
+    ("scene", "expected"),
+    [
+        (FLOOR + WALL, 0.8),
+        (WALL + FLOOR, 0.8),
+        (SIDE + FLOOR, 0.8),
+        (TABLE + FLOOR, 0.8),
+        (PIT + STAGE, 1.2),
+        (STAGE + PIT, 1.2),
+        (PIT + FIELD, 1.2),
+        (WALL + FIELD, 1.2),
+    ],
+)
+def test_the_friction_is_that_of_what_the_wheels_stand_on(scene: str, expected: float) -> None:
+    """Lost grip is given back in proportion to it, whatever else stands about."""
+    wheels_ = "".join(WHEEL.format(i, x, y, 1e4, 0.6) for i, (x, y) in enumerate([(0.4, 0.4), (-0.4, -0.4)]))
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep=".002" cone="elliptic"/>
+    <asset><hfield name="hills" nrow="3" ncol="3" size="3 3 1 .1" elevation="0 0 0 0 0 0 0 0 1"/></asset>
+    <worldbody>{scene}<body name="rover" pos="0 0 .099"><freejoint/>
+    <inertial pos="0 0 -.08" mass="20" diaginertia="1 1 1"/>{wheels_}</body></worldbody></mujoco>""")
+    effect, theta = make("slip", "ground", {"lateral": 0.5, "longitudinal": 0.0})
+    effect.bind(model)
+    data = mujoco.MjData(model)
+    data.qvel[1] = 1.0
+    mujoco.mj_forward(model, data)
+    out = Forces(np.zeros(model.nv), np.zeros((model.nbody, 6)))
+    read = lambda name: getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)  # noqa: E731
+    effect.force(
+        Context(model, 0.002, data.qpos, data.qvel, data.ctrl, {}, lambda n: getattr(data, n), read), theta, out
+    )
+    weight = model.body_mass.sum() * G
+    assert out.xfrc[:, 1].sum() == pytest.approx(0.5 * expected * weight / np.sqrt(1 + 0.02**2), rel=1e-6)

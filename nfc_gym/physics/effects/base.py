@@ -32,6 +32,9 @@ Rows = slice | NDArray[np.intp]  # what picks rows of an array, see `index`
 TIME = "exo:time"  # seconds since the log, or the episode, began: a signal that every log has
 _HAIR = 1e-9  # by which a fit's arithmetic may pass a bound that it stopped at
 _NO_CHOICE = 0.01  # of a value: a range so narrow is no range
+_BALL = int(mujoco.mjtJoint.mjJNT_BALL)
+# Degrees of freedom of the joints that move in one way, and not in two that have no unit in common.
+_SIZES = {_BALL: 3, int(mujoco.mjtJoint.mjJNT_SLIDE): 1, int(mujoco.mjtJoint.mjJNT_HINGE): 1}
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,10 @@ class Effect(ABC):
     divisible: ClassVar[bool] = True
     # Whether it sits at one place alone, and not with the same values at several.
     lone: ClassVar[bool] = False
+    # Whether it may sit on a ball joint, and then acts alike along all three of its degrees of freedom.
+    BALLS: ClassVar[bool] = False
+    # Attributes that `propose` sets and no parameter holds, each a text or a number: saved effects keep them.
+    SETTINGS: ClassVar[tuple[str, ...]] = ()
     # Model fields that `modulate` writes to.
     MODULATES: ClassVar[tuple[str, ...]] = ()
     # Whether the hidden state of `action` outlives the history before a segment: it then begins where the log does.
@@ -197,7 +204,7 @@ class Effect(ABC):
     singles: "tuple[Effect, ...]" = ()
 
     def __init__(self, where: Sequence[str], params: Sequence[Param] | None = None) -> None:
-        self.where = tuple(where)
+        self.where: tuple[str, ...] = (where,) if isinstance(where, str) else tuple(where)
         self.params = self.PARAMS if params is None else tuple(params)
 
     @property
@@ -232,6 +239,16 @@ class Effect(ABC):
     def signals(self) -> tuple[str, ...]:
         """Exogenous signals that the effect reads."""
         return ()
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What `SETTINGS` names, by name."""
+        return {name: getattr(self, name) for name in self.SETTINGS}
+
+    @property
+    def on_command(self) -> bool:
+        """Whether it changes what reaches the actuators, and not what they make of it."""
+        return overrides(self, "action")
 
     def known_as(self, theta: Array) -> tuple[str, ...]:
         """Families that are this very law by another name at the same place, at these parameters (k,)."""
@@ -276,7 +293,11 @@ class Effect(ABC):
     # ---- hooks ----------------------------------------------------------------------------------------------------
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        """Structural edit that lets plain MJCF carry the effect; returns whether it now does. theta (k,)."""
+        """Structural edit that lets plain MJCF carry the effect; returns whether it now does. theta (k,).
+
+        An effect on commands (`on_command`) acts before all that the spec makes of a command already, so that of
+        several the last goes first; every other acts after what the spec says already. Of a bound effect.
+        """
         return False
 
     def model(self, fields: ModelFields, theta: Array) -> None:  # noqa: B027 (a hook: does nothing by design)
@@ -371,14 +392,28 @@ def overrides(effect: Effect, hook: str) -> bool:
     return getattr(type(effect), hook) is not getattr(Effect, hook)
 
 
-def joint_dofs(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
-    """Dof address of each named hinge or slide joint, (n,)."""
-    out = []
+def joint_dofs(model: mujoco.MjModel, names: Sequence[str], balls: bool = False) -> NDArray[np.intp]:
+    """Dof addresses of named joints, (n,): one of each hinge and slide joint, all three of each ball joint.
+
+    Args:
+      balls: whether there may be ball joints. No law has one number for the forces and the torques of a free joint.
+
+    Raises:
+      InputError: the model has no such joint, or it is of another type.
+    """
+    known = ", ".join(scalar_joints(model, balls)) or "none"
+    out: list[int] = []
     for name in names:
         joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
         if joint < 0:
-            raise InputError(f"the model has no joint named {name!r}; it has: {', '.join(scalar_joints(model))}")
-        out.append(int(model.jnt_dofadr[joint]))
+            raise InputError(f"the model has no joint named {name!r}; it has: {known}")
+        kind, first = int(model.jnt_type[joint]), int(model.jnt_dofadr[joint])
+        if kind not in _SIZES or (kind == _BALL and not balls):
+            told = "ball" if kind == _BALL else "free"
+            raise InputError(
+                f"joint {name!r} is a {told} joint, on which the effect cannot sit; joints for it: {known}"
+            )
+        out += range(first, first + _SIZES[kind])
     return np.array(out, np.intp)
 
 
@@ -395,24 +430,21 @@ def limited(x: Array, low: Array, high: Array) -> Array:
     return np.minimum(np.maximum(x, low), high)
 
 
-def scalar_joints(model: mujoco.MjModel) -> list[str]:
-    """Names of the hinge and slide joints."""
-    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
-    return [
-        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j)
-        for j in range(model.njnt)
-        if int(model.jnt_type[j]) >= slide
-    ]
+def scalar_joints(model: mujoco.MjModel, balls: bool = False) -> list[str]:
+    """Names of the hinge and slide joints, and with `balls` of the ball joints."""
+    names = (mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) for j in range(model.njnt))
+    kinds = [kind for kind in _SIZES if balls or kind != _BALL]
+    return [name for name, kind in zip(names, model.jnt_type, strict=True) if name and int(kind) in kinds]
 
 
 def actuator_names(model: mujoco.MjModel) -> list[str]:
-    """Names of the actuators, in id order."""
-    return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
+    """What actuators are called, in id order: an unnamed one as the joint that it moves, as in logs of its model."""
+    return names_in(model).actuators
 
 
 def actuator_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
-    """Id of each named actuator, (n,); an unnamed one goes by the joint that it moves, as in logs of its model."""
-    known = names_in(model).actuators
+    """Id of each actuator, (n,), as `actuator_names` calls them."""
+    known = actuator_names(model)
     for name in names:
         if name not in known:
             raise InputError(f"the model has no actuator named {name!r}; it has: {', '.join(known)}")

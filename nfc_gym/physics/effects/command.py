@@ -12,10 +12,16 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names, index, limited
 from nfc_gym.physics.effects.drive import actuator_places, command_unit, is_position, plain
 from nfc_gym.physics.effects.places import sized, with_units
+from nfc_gym.physics.effects.ranges import narrow_ranges, shift_range
 from nfc_gym.physics.fields import ModelFields
 
 _NONE, _AFFINE = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
-_ENDLESS = 1e12  # a force that no actuator reaches
+_FIXED_GAIN, _AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
+# Dynamics whose state goes where the command is, and stays there.
+_FOLLOWS = tuple(
+    int(d) for d in (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+)
+_ENDLESS, _IDLE = 1e12, 1e-9  # N or N m: a force that no actuator reaches, and one that is none
 
 
 class _OnCommand(Effect):
@@ -53,17 +59,23 @@ class Offset(_OnCommand):
         return out
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        actuators = [spec.actuator(n) for n in self.where]
+        actuators, offset = [spec.actuator(n) for n in self.where], float(theta[0])
+        # What integrates its command would integrate the offset, too: no constant force.
+        if any(int(a.dyntype) not in _FOLLOWS or int(a.gaintype) not in (_FIXED_GAIN, _AFFINE_GAIN) for a in actuators):
+            return False
         if any(int(a.biastype) not in (_NONE, _AFFINE) for a in actuators):
             return False
         for actuator in actuators:
-            bias = np.asarray(actuator.biasprm).copy()
+            gain, bias = np.array(actuator.gainprm), np.array(actuator.biasprm)
+            terms = 3 if int(actuator.gaintype) == _AFFINE_GAIN else 1
             if int(actuator.biastype) == _NONE:
                 bias[:3] = 0
-            bias[0] += float(actuator.gainprm[0] * theta[0])
+            bias[:terms] += gain[:terms] * offset
             actuator.biastype, actuator.biasprm = mujoco.mjtBias.mjBIAS_AFFINE, bias
-            # clip(u + offset, low, high) = clip(u, low - offset, high - offset) + offset
-            actuator.ctrlrange = np.asarray(actuator.ctrlrange) - float(theta[0])
+            # clip(u + offset, low, high) = clip(u, low - offset, high - offset) + offset, and so of the state of a
+            # filter, which is lower by the offset and begins as if it had settled under it.
+            for kind in ("ctrl", "act"):
+                shift_range(actuator, kind, offset)
         return True
 
     @classmethod
@@ -126,6 +138,10 @@ class Saturation(_OnCommand):
         """Whether the force is limited rather than the command."""
         return self.params[0].name == "inverse_limit"
 
+    @property
+    def on_command(self) -> bool:
+        return not self.on_force
+
     def bind(self, model: mujoco.MjModel) -> None:
         super().bind(model)
         if not self.on_force and not model.actuator_ctrllimited[self.rows].all():
@@ -140,32 +156,31 @@ class Saturation(_OnCommand):
         if self.on_force:
             return ctrl, memory
         out = np.array(ctrl)
-        cut = theta[..., :1] * (self.range_high - self.range_low) / 2
-        out[..., self.rows] = limited(ctrl[..., self.rows], self.range_low + cut, self.range_high - cut)
+        out[..., self.rows] = limited(ctrl[..., self.rows], *self._limits(theta))
         return out, memory
+
+    def _limits(self, theta: Array) -> tuple[Array, Array]:
+        """(low, high) of the commands, (..., n) each."""
+        cut = theta[..., :1] * (self.range_high - self.range_low) / 2
+        return self.range_low + cut, self.range_high - cut
 
     def model(self, fields: ModelFields, theta: Array) -> None:
         if not self.on_force:
             return
         limit = 1 / np.maximum(theta[..., :1], 1 / _ENDLESS)
-        limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
-        free = ~fields.nominal("actuator_forcelimited")[self.rows].astype(bool)
+        bounded, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
+        free = bounded[..., self.rows] == 0
         low = np.where(free, -_ENDLESS, ranges[..., self.rows, 0])
         high = np.where(free, _ENDLESS, ranges[..., self.rows, 1])
-        ranges[..., self.rows, 0], ranges[..., self.rows, 1] = np.maximum(low, -limit), np.minimum(high, limit)
-        limited[..., self.rows] = True
+        ranges[..., self.rows, 0], ranges[..., self.rows, 1] = limited(low, -limit, limit), limited(high, -limit, limit)
+        bounded[..., self.rows] = True
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        for actuator in (spec.actuator(n) for n in self.where):
-            if self.on_force:
-                limit = 1 / max(float(theta[0]), 1 / _ENDLESS)
-                low, high = actuator.forcerange if np.any(actuator.forcerange) else (-limit, limit)
-                actuator.forcerange, actuator.forcelimited = (max(low, -limit), min(high, limit)), True
-            else:
-                low, high = actuator.ctrlrange
-                cut = float(theta[0]) * (high - low) / 2
-                actuator.ctrlrange = (low + cut, high - cut)
-        return True
+        kind, low, high = "ctrl", *self._limits(theta)
+        if self.on_force:
+            high = np.full(len(self.where), 1 / max(float(theta[0]), 1 / _ENDLESS))
+            kind, low = "force", -high
+        return narrow_ranges(spec, self.where, kind, low, high)
 
     def say(self, theta: Array, sd: Array | None = None) -> str:
         if not self.on_force:
@@ -180,7 +195,9 @@ class Saturation(_OnCommand):
         ]
         out: list[Effect] = [cls(where, cls.PARAMS) for where in actuator_places(model, ranged)]
         for where in actuator_places(model, [n for n in plain(model) if n not in ranged]):
-            force = max(float(np.median(np.abs(scales.actuation[actuator_ids(model, where)]))), 1e-6)
+            force = float(np.median(np.abs(scales.actuation[actuator_ids(model, where)])))
+            if force < _IDLE:
+                continue  # no limit bites on what pushes nothing
             # The scale is a root mean square: forces reach two or three times as high, where a limit begins to bite.
             change = {"probes": (0.4 / force, 0.7 / force, 1.2 / force), "high": 20 / force, "resolution": 2e-3 / force}
             out.append(cls(where, sized(cls.ON_FORCE, inverse_limit=change)))
@@ -208,6 +225,7 @@ class SupplySag(_OnCommand):
         Param("reference", "V", 1e-3, 1e4, probes=(12.0,), shape=True),
     )
     divisible = False  # drives of one make on one battery; one that gives less than the others has lost force
+    SETTINGS = ("signal",)
     signal = "exo:supply"
 
     @property

@@ -6,6 +6,7 @@ effect inside it, which `Plant.under` puts in its place with the values of each 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -55,6 +56,11 @@ class Conditioned(Effect):
     def signals(self) -> tuple[str, ...]:
         """Exogenous signals that the effect reads."""
         return self.inner.signals
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Those of the effect inside."""
+        return self.inner.settings
 
     def bind(self, model: mujoco.MjModel) -> None:
         """See `Effect`."""

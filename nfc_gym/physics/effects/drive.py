@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import (
     Array,
     Context,
@@ -24,16 +25,17 @@ from nfc_gym.physics.fields import ModelFields
 
 _FIXED, _AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
 _NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
-_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
+_JOINT, _TENDON = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_TENDON)
+_JOINTS = (_JOINT, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def plain(model: mujoco.MjModel) -> list[str]:
-    """Named actuators whose force is gain * input + bias with constant or affine coefficients (motors and servos)."""
+    """Actuators whose force is gain * input + bias with constant or affine coefficients (motors and servos)."""
     return [
         n
         for i, n in enumerate(actuator_names(model))
-        if n
-        and int(model.actuator_gaintype[i]) in (_FIXED, _AFFINE_GAIN)
+        if int(model.actuator_gaintype[i]) in (_FIXED, _AFFINE_GAIN)
         and int(model.actuator_biastype[i]) in (_NO_BIAS, _AFFINE_BIAS)
     ]
 
@@ -45,17 +47,31 @@ def is_position(model: mujoco.MjModel, actuator: int) -> bool:
 
 def command_unit(model: mujoco.MjModel, actuator: int) -> str:
     """Unit of an actuator's command, read from its law: a position, a speed, or a share of its force."""
-    slide = False
-    if int(model.actuator_trntype[actuator]) == _JOINT:
-        slide = int(model.jnt_type[model.actuator_trnid[actuator, 0]]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    slides = _slides(model, actuator)
+    if slides is None:
+        return "1"
     if is_position(model, actuator):
-        return "m" if slide else "rad"
+        return "m" if slides else "rad"
     if int(model.actuator_biastype[actuator]) == _AFFINE_BIAS and model.actuator_biasprm[actuator, 2] != 0:
-        return "m/s" if slide else "rad/s"
+        return "m/s" if slides else "rad/s"
     whole = model.actuator_gainprm[actuator, 0] == 1 and model.actuator_gear[actuator, 0] == 1
-    if whole and int(model.actuator_trntype[actuator]) == _JOINT:
-        return "N" if slide else "N m"
+    if whole and int(model.actuator_trntype[actuator]) in _JOINTS:
+        return "N" if slides else "N m"
     return "1"
+
+
+def _slides(model: mujoco.MjModel, actuator: int) -> bool | None:
+    """Whether what an actuator moves is a length, in m; else it is an angle, or None: neither alone."""
+    kind, first = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind in _JOINTS:
+        return int(model.jnt_type[first]) == _SLIDE
+    if kind == _TENDON:
+        part = slice(int(model.tendon_adr[first]), int(model.tendon_adr[first] + model.tendon_num[first]))
+        if (model.wrap_type[part] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+            return True  # a spatial tendon's length
+        each = {int(k) == _SLIDE for k in model.jnt_type[model.wrap_objid[part]]}
+        return each.pop() if len(each) == 1 else None
+    return True if kind == int(mujoco.mjtTrn.mjTRN_SLIDERCRANK) else None
 
 
 def actuator_places(model: mujoco.MjModel, names: Sequence[str]) -> list[tuple[str, ...]]:
@@ -74,13 +90,17 @@ def scale_force(fields: ModelFields, rows: NDArray[np.intp], factor: Array) -> N
     """Multiply everything that an actuator's force is made of, its limits included, by `factor` (...,)."""
     for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
         scale_rows(fields, name, rows, factor)
+    ranges = fields["actuator_forcerange"]
+    ranges[..., rows, :] = np.sort(ranges[..., rows, :], -1)  # of a force turned round the lower end was the upper
 
 
 def _scale_spec(spec: mujoco.MjSpec, names: Sequence[str], factor: float) -> None:
     for name in names:
         actuator = spec.actuator(name)
-        for key in ("gainprm", "biasprm", "forcerange"):
+        for key in ("gainprm", "biasprm"):
             setattr(actuator, key, np.asarray(getattr(actuator, key)) * factor)
+        if factor != 0:  # no force at all needs no limit, and MJCF has none of zero width
+            actuator.forcerange = np.sort(np.asarray(actuator.forcerange) * factor)
 
 
 class Gain(Effect):
@@ -109,7 +129,8 @@ class Gain(Effect):
 
     def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
         out = np.array(force)
-        out[..., self.rows] /= np.maximum(self.factor(theta), 1e-6)[..., None]
+        factor = self.factor(theta)
+        out[..., self.rows] /= np.copysign(np.maximum(np.abs(factor), 1e-6), factor)[..., None]
         return out
 
     @classmethod
@@ -139,8 +160,9 @@ class TorqueSpeed(Effect):
     """Force limit that falls with speed in the driving direction: |force| <= peak (1 - fall * speed).
 
     `peak` is what the model allows at rest (its force range, else the command range times the gain); `fall` is the
-    share of it that is gone for each rad/s (m/s), the inverse of the no-load speed. What exceeds the line, by the force
-    of the substep before, is taken off at the joint. Braking is not limited.
+    share of it that is gone for each rad/s (m/s) of the joint or fixed tendon that the actuator moves, the inverse of
+    the no-load speed. What exceeds the line, by the force of the substep before, is taken off there. Braking is not
+    limited.
     """
 
     family = "torque_speed"
@@ -149,26 +171,34 @@ class TorqueSpeed(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.rows = actuator_ids(model, self.where)
-        self.dofs = np.array([model.jnt_dofadr[model.actuator_trnid[r, 0]] for r in self.rows], np.intp)
+        arms = [_arm(model, int(r)) for r in self.rows]
+        for name, arm in zip(self.where, arms, strict=True):
+            if arm is None:
+                fit = [n for i, n in enumerate(actuator_names(model)) if _arm(model, i) is not None]
+                raise InputError(
+                    f"torque_speed: {name!r} moves no hinge, slide or fixed tendon, whose speed would set its limit; "
+                    f"actuators that do: {', '.join(fit) or 'none'}"
+                )
+        self.arms = np.array(arms)
         self.gear = model.actuator_gear[self.rows, 0].copy()
         self.peak = np.array([_peak(model, int(r)) for r in self.rows])
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         made = ctx.data("actuator_force")[..., self.rows]
-        driving = np.maximum(0.0, np.sign(made * self.gear) * ctx.v[..., self.dofs])
+        driving = np.maximum(0.0, np.sign(made * self.gear) * (ctx.v @ self.arms.T))
         lost = np.minimum(theta[..., :1] * driving, 1.0) * self.peak
         excess = np.clip(np.abs(made) - (self.peak - lost), 0.0, lost)
-        for i, dof in enumerate(self.dofs):  # one joint may have several actuators
-            out.qfrc[..., dof] -= np.sign(made[..., i]) * excess[..., i] * self.gear[i]
+        out.qfrc[...] -= (np.sign(made) * excess * self.gear) @ self.arms
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         known = actuator_names(model)
-        fit = [n for n in plain(model) if _peak(model, known.index(n)) > 0 and on_scalar(model, known.index(n))]
+        fit = [n for n in plain(model) if _peak(model, known.index(n)) > 0]
+        arms = {n: arm for n in fit if (arm := _arm(model, known.index(n))) is not None}
         out: list[Effect] = []
-        for where in actuator_places(model, fit):
-            dofs = [int(model.jnt_dofadr[model.actuator_trnid[known.index(n), 0]]) for n in where]
-            speed = max(float(np.median(scales.speed[dofs])), 1e-2)
+        for where in actuator_places(model, list(arms)):
+            speeds = [float(np.abs(arms[n]) @ scales.speed) for n in where]
+            speed = max(float(np.median(speeds)), 1e-2)
             sizes = {"probes": (0.1 / speed, 0.4 / speed), "high": 2 / speed, "resolution": 0.01 / speed}
             out.append(cls(where, sized(cls.PARAMS, fall=sizes)))
         return out
@@ -179,6 +209,22 @@ def on_scalar(model: mujoco.MjModel, actuator: int) -> bool:
     if int(model.actuator_trntype[actuator]) != _JOINT:
         return False
     return int(model.jnt_type[model.actuator_trnid[actuator, 0]]) >= int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _arm(model: mujoco.MjModel, actuator: int) -> Array | None:
+    """(nv,) by which speeds add up to that of the hinge, slide or fixed tendon that an actuator moves; else None."""
+    arm, at = np.zeros(model.nv), int(model.actuator_trnid[actuator, 0])
+    if on_scalar(model, actuator):
+        arm[model.jnt_dofadr[at]] = 1.0
+        return arm
+    if int(model.actuator_trntype[actuator]) != _TENDON:
+        return None
+    parts = slice(int(model.tendon_adr[at]), int(model.tendon_adr[at] + model.tendon_num[at]))
+    if (model.wrap_type[parts] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+        return None  # a spatial tendon: its arms change as it moves
+    for joint, coefficient in zip(model.wrap_objid[parts], model.wrap_prm[parts], strict=True):
+        arm[model.jnt_dofadr[joint]] += coefficient
+    return arm
 
 
 def _peak(model: mujoco.MjModel, actuator: int) -> float:

@@ -47,6 +47,16 @@ class Each(Effect):
         """Exogenous signals that any member reads."""
         return tuple(dict.fromkeys(s for m in self.members for s in m.signals))
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Those that the members share."""
+        return self.members[0].settings
+
+    @property
+    def on_command(self) -> bool:
+        """As any member."""
+        return self.members[0].on_command
+
     def bind(self, model: mujoco.MjModel) -> None:
         """Bind every member."""
         self._dofs = np.arange(model.nv)
@@ -55,6 +65,10 @@ class Each(Effect):
 
     def _theta(self, theta: Array) -> list[Array]:
         return [theta[..., p] for p in self._parts]
+
+    def apart(self, theta: Array) -> list[tuple[Effect, Array]]:
+        """Each member with its own parameters (..., k), of all of them (..., k')."""
+        return list(zip(self.members, self._theta(theta), strict=True))
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
         """See `Effect`: all members or none, lest one act in the model and beside it as well."""
@@ -117,6 +131,12 @@ class Each(Effect):
             force = m.demand(force, t, exogenous, dt)
         return force
 
+    def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
+        """See `Effect`."""
+        for m, t in self.apart(theta):
+            values = m.sense(channel, values, t, dt)
+        return values
+
     def chart(self, theta: Array) -> Array:
         """See `Effect`."""
         return np.concatenate([m.chart(t) for m, t in zip(self.members, self._theta(theta), strict=True)], -1)
@@ -142,6 +162,8 @@ def split(effect: Effect, plant: "Plant") -> tuple[Effect, NDArray[np.intp]] | N
     # What bounds all joints alike is no bound of one: a knee carries more than the typical joint of a leg.
     own = [e.params for e in effect.singles] or [effect.params] * len(effect.where)
     members = [type(effect)((name,), params) for name, params in zip(effect.where, own, strict=True)]
+    for member in members:
+        vars(member).update(effect.settings)
     together = each(members)
     together.bind(plant.model)
     return together, np.tile(np.arange(len(effect.params)), len(members))

@@ -40,12 +40,12 @@ def sharpen(fields: ModelFields, dofs: NDArray[np.intp]) -> None:
 
 
 class _JointFriction(Effect):
-    """What the laws share: scalar joints, a sharp constraint, a level in N m or N."""
+    """What the laws share: joints, a sharp constraint, a level in N m or N."""
 
     LEVELS = ("level",)
 
     def bind(self, model: mujoco.MjModel) -> None:
-        self.dofs = joint_dofs(model, self.where)
+        self.dofs = joint_dofs(model, self.where, self.BALLS)
         self.at, self.params = index(self.dofs), with_joint_units(self.params, model, self.dofs)
 
     def model(self, fields: ModelFields, theta: Array) -> None:
@@ -85,6 +85,7 @@ class Coulomb(_JointFriction):
     """Constant friction: |force| <= level, opposing motion."""
 
     family = "coulomb"
+    BALLS = True
     summary = "Dry (Coulomb) friction"
     PARAMS = (Param("level", "N m", 0.0, 1e3, probes=(0.01, 0.1)),)
 

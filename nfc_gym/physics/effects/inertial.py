@@ -85,7 +85,7 @@ def _complete(model: mujoco.MjModel) -> list[str]:
 
 
 class Moved(Effect):
-    """What the three share: named bodies, and a spec that takes the edited inertia as an explicit one."""
+    """What the three share: named bodies."""
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.bodies = body_ids(model, self.where)
@@ -98,19 +98,6 @@ class Moved(Effect):
                     "short cut, which fixes the centre of mass; compile it with simple='false' "
                     "(inertial.complete_inertia does so to a spec)"
                 )
-
-    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        compiled = spec.copy().compile()
-        self.bind(compiled)
-        self.model(ModelFields(compiled), np.asarray(theta, float))
-        for name, b in zip(self.where, self.bodies, strict=True):
-            body = spec.body(name)
-            body.explicitinertial = True
-            body.fullinertia = np.full(6, np.nan)
-            body.mass = compiled.body_mass[b]
-            body.ipos, body.iquat = compiled.body_ipos[b], compiled.body_iquat[b]
-            body.inertia = compiled.body_inertia[b]
-        return True
 
 
 class Payload(Moved):

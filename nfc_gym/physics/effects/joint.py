@@ -20,10 +20,10 @@ from nfc_gym.physics.fields import ModelFields, rows_of
 
 
 class _OnJoint(Effect):
-    """What the laws share: scalar joints resolved to dofs."""
+    """What the laws share: joints resolved to dofs."""
 
     def bind(self, model: mujoco.MjModel) -> None:
-        dofs = joint_dofs(model, self.where)
+        dofs = joint_dofs(model, self.where, self.BALLS)
         self.dofs, self.params = index(dofs), with_joint_units(self.params, model, dofs)
 
 
@@ -31,6 +31,7 @@ class DampingPoly(_OnJoint):
     """Damping force -(linear v + quadratic v |v| + cubic v^3), added to what the model has."""
 
     family = "damping_poly"
+    BALLS = True
     summary = "Joint damping"
     PARAMS = (
         Param("linear", "N m s/rad", -1e3, 1e3, probes=(0.01,)),  # it may be less than the model's own
@@ -42,12 +43,6 @@ class DampingPoly(_OnJoint):
         fields["dof_damping"][..., self.dofs] += theta[..., 0:1]
         fields["dof_dampingpoly"][..., self.dofs, 0] += theta[..., 1:2]
         fields["dof_dampingpoly"][..., self.dofs, 1] += theta[..., 2:3]
-
-    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        for name in self.where:
-            joint = spec.joint(name)
-            joint.damping = np.asarray(joint.damping) + theta[:3]
-        return True
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -71,16 +66,12 @@ class Armature(_OnJoint):
     """Inertia of a rotor behind a gear, seen at the joint (gear ratio squared times the rotor's own)."""
 
     family = "armature"
+    BALLS = True
     summary = "Rotor inertia reflected to the joint"
     PARAMS = (Param("inertia", "kg m^2", 0.0, 1e3, probes=(0.01,)),)
 
     def model(self, fields: ModelFields, theta: Array) -> None:
         fields["dof_armature"][..., self.dofs] += theta[..., :1]
-
-    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        for name in self.where:
-            spec.joint(name).armature += float(theta[0])
-        return True
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -125,16 +116,6 @@ class SpringOffset(_OnJoint):
         share = np.where(total > 0, added / np.where(total > 0, total, 1.0), 0.0)
         rests[..., self.coordinates] += share * (theta[..., 1:2] - rests[..., self.coordinates])
         stiffness[..., self.joints] = total
-
-    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        for name in self.where:
-            joint = spec.joint(name)
-            own = float(joint.stiffness[0])
-            total = own + float(theta[0])
-            if total > 0:
-                joint.springref += float(theta[0]) / total * (float(theta[1]) - joint.springref)
-            joint.stiffness = [total, *np.asarray(joint.stiffness)[1:]]
-        return True
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:

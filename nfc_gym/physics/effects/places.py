@@ -13,7 +13,7 @@ from nfc_gym.physics.effects.base import Array, Param, Scales, groups, joint_dof
 from nfc_gym.physics.fields import ModelFields, names_of
 
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
-_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _LIGHT = 1e-3  # share of mass below which a body only carries another
 
 
@@ -72,10 +72,10 @@ def _floating(model: mujoco.MjModel) -> set[int]:
 
 
 def turns(model: mujoco.MjModel, dof: int) -> bool:
-    """Whether a degree of freedom is an angle: a hinge, or a free joint's rotation."""
+    """Whether a degree of freedom is an angle: of a hinge or a ball joint, or of a free joint's rotation."""
     joint = int(model.dof_jntid[dof])
     kind = int(model.jnt_type[joint])
-    return kind == _HINGE or (kind == _FREE and dof - int(model.jnt_dofadr[joint]) >= 3)
+    return kind in (_HINGE, _BALL) or (kind == _FREE and dof - int(model.jnt_dofadr[joint]) >= 3)
 
 
 def with_joint_units(params: Iterable[Param], model: mujoco.MjModel, dofs: Iterable[int]) -> tuple[Param, ...]:
@@ -136,11 +136,13 @@ def base_bodies(model: mujoco.MjModel) -> list[str]:
 
 
 def body_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
-    """Id of each named body, (n,); an unknown name raises `InputError` listing what exists."""
+    """Id of each named body, (n,); an unknown name raises `InputError` listing what exists, and so does the world,
+    which nothing moves."""
     known = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
     for name in names:
-        if name not in known:
-            raise InputError(f"the model has no body named {name!r}; it has: {', '.join(n for n in known if n)}")
+        if name not in known[1:]:
+            told = "the world does not move" if name == known[0] else f"the model has no body named {name!r}"
+            raise InputError(f"{told}; bodies: {', '.join(n for n in known[1:] if n)}")
     return np.array([known.index(n) for n in names], np.intp)
 
 

@@ -13,7 +13,7 @@ from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import Each, each
 
 Array = NDArray[np.float64]
-_READ = ("family", "where", "parameters", "each", "own_values", "conditions")
+_READ = ("family", "where", "parameters", "each", "own_values", "conditions", "settings")
 # What the measured loop says of an effect besides, in `effects.yaml` and `report.json`.
 _TOLD = ("id", "sentence", "share_of_excess", "equivalents", "proposal", "nearest", "alike", "mended_by")
 
@@ -26,13 +26,14 @@ def to_row(effect: Effect, theta: Array) -> dict[str, Any]:
         "where": list(effect.where),
         "each": isinstance(effect, Each),
         **conditions,
+        **({"settings": effect.settings} if effect.settings else {}),
         "parameters": {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(effect.params, theta, strict=True)},
     }
 
 
 def from_row(row: Mapping[str, Any]) -> tuple[Effect, Array]:
-    """An effect and its values from a row: `family`, `where`, `parameters`, and `each` or `own_values` or
-    `conditions` where it has some.
+    """An effect and its values from a row: `family`, `where`, `parameters`, and `each` or `own_values`, `conditions`
+    and `settings` where it has some.
 
     Raises:
       InputError: a key is missing or unknown, or the family, a parameter or a value is none, or cannot be.
@@ -42,11 +43,11 @@ def from_row(row: Mapping[str, Any]) -> tuple[Effect, Array]:
         if row.get("conditions"):
             return _conditioned(family, where, parameters, row)
         if not (row.get("each") or row.get("own_values")):
-            return _possible(*build(family, where, parameters))
+            return _possible(*_built(family, where, parameters, row))
         members, thetas = [], []
         for place in [where] if isinstance(where, str) else where:
             own = {k.rpartition("@")[0]: v for k, v in parameters.items() if k.rpartition("@")[2] == place}
-            member, theta = _possible(*build(family, [place], own))
+            member, theta = _possible(*_built(family, [place], own, row))
             members.append(member)
             thetas.append(theta)
     except (TypeError, KeyError, ValueError, OverflowError) as e:
@@ -59,6 +60,21 @@ def from_row(row: Mapping[str, Any]) -> tuple[Effect, Array]:
     return each(members), np.concatenate(thetas)
 
 
+def _built(family: str, where: str | list[str], parameters: Mapping, row: Mapping) -> tuple[Effect, Array]:
+    """`build`, with the settings of a row."""
+    effect, theta = build(family, where, parameters)
+    settings = row.get("settings", {})
+    if not isinstance(settings, Mapping) or not set(settings) <= set(effect.SETTINGS):
+        known = ", ".join(effect.SETTINGS) or "none"
+        raise InputError(f"effect {family!r}: `settings` maps names to values, of: {known}; and not {_short(settings)}")
+    for name, value in settings.items():
+        wanted = type(getattr(effect, name))
+        if type(value) is not wanted:
+            raise InputError(f"effect {family!r}: {name} is {_short(value)}; want a value of type {wanted.__name__}")
+        setattr(effect, name, value)
+    return effect, theta
+
+
 def _conditioned(family: str, where: str | list[str], given: Mapping[str, Any], row: Mapping) -> tuple[Effect, Array]:
     """An effect with values of its own in each condition."""
     labels = row["conditions"]
@@ -66,7 +82,7 @@ def _conditioned(family: str, where: str | list[str], given: Mapping[str, Any], 
         raise InputError(f"effect {family!r}: `conditions` is a list of labels, and not {_short(labels)}")
     labels = [str(c) for c in labels]
     first = {k.rpartition("@")[0] or k: v for k, v in given.items() if "@" not in k or k.endswith(f"@{labels[0]}")}
-    effect = Conditioned(build(family, where, first)[0], labels)
+    effect = Conditioned(_built(family, where, first, row)[0], labels)
     missing = [p.name for p in effect.params if p.name not in given]
     if missing:
         raise InputError(f"{effect.id}: the value of {missing[0]!r} is missing; there are: {', '.join(given)}")

@@ -1,26 +1,30 @@
 """Sensors that report something else than the truth: bias, gain, delay, misalignment. `where` names channels.
 
-A channel that the start state is read from carries its fault into that state: `unsense` takes it out again.
+A channel that the start state is read from carries its fault into that state: `true_state` takes it out again.
 """
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Effect, Param, Scales
+from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, overrides
+from nfc_gym.physics.effects.each import Each
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.fields import object_id
-from nfc_gym.physics.state import quat_conjugate, quat_multiply, rotate, vector_to_quat
+from nfc_gym.physics.state import quat_conjugate, quat_multiply, rotate, rotate_back, vector_to_quat
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _OF_HINGE = {"pos": "rad", "vel": "rad/s", "acc": "rad/s^2"}
 _OF_SLIDE = {"pos": "m", "vel": "m/s", "acc": "m/s^2"}
 _OF_BODY = {"pos": "m", "linvel": "m/s", "angvel": "rad/s"}
+# A free body's velocities in the order in which states take them: of several that are measured the first.
+SPEEDS, RATES = ("linvel", "linvel@body"), ("angvel@body", "angvel")
 
 
 @dataclass(frozen=True)
@@ -68,19 +72,38 @@ def unit_of(model: mujoco.MjModel, channel: str) -> str:
 
 
 class _OnChannel(Effect):
-    """What the faults share: channels, resolved; each has the fault."""
+    """What the faults share: channels, resolved; each has the fault.
+
+    A fault changes what is measured at a moment and, with it, the slope that the measurements have there (of an
+    orientation the rate in its own frame): a speed that no channel of its own measures is such a slope.
+    """
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.at = {channel: resolve_channel(model, channel) for channel in self.where}
+        for channel, at in self.at.items():
+            if not self.fits(at):
+                raise InputError(
+                    f"{self.family} of {channel!r} with {', '.join(p.name for p in self.params)}: the channel has "
+                    f"{'the four numbers of an orientation' if at.quantity == 'quat' else f'{at.dim} number(s)'}; "
+                    f"{self.WANTED}"
+                )
+
+    WANTED = "any channel will do"
+
+    def fits(self, at: Place) -> bool:
+        """Whether such a channel can have the fault; `WANTED` says which can."""
+        return True
+
+    def slope(self, slope: Array, theta: Array) -> Array:
+        """True slope of a channel (..., dim), of an orientation (..., 3) -> the slope of what is measured."""
+        return slope
+
+    def undo(self, channel: str, value: Array, slope: Array, theta: Array) -> tuple[Array, Array]:
+        """What is measured at a moment (..., dim) and its slope -> what they truly are."""
+        raise NotImplementedError
 
     def unsense(self, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        for channel in self.where:
-            q, v = self.undo(channel, q, v, theta)
-        return q, v
-
-    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        """`unsense` for one channel."""
-        raise NotImplementedError
+        return true_state((self,), (theta,), q, v)
 
     @staticmethod
     def _channels(model: mujoco.MjModel, scales: Scales) -> list[tuple[str, Place, float, float]]:
@@ -105,22 +128,16 @@ class SensorBias(_OnChannel):
     def declare(cls, names: tuple[str, ...]) -> tuple[Param, ...]:  # type: ignore[override]
         return cls.ON_VECTOR if set(names) == set("xyz") else super().declare(names)
 
+    WANTED = "want `bias` of numbers that are no orientation, or `x`, `y` and `z` of a vector"
+
+    def fits(self, at: Place) -> bool:
+        return at.quantity != "quat" and len(self.params) in (1, at.dim)
+
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
         return values + theta[..., None, :] if channel in self.where else values
 
-    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        at = self.at[channel]
-        if at.kind == "joint" and at.quantity in ("pos", "vel"):
-            q, v = np.array(q), np.array(v)
-            target, column = (q, at.q) if at.quantity == "pos" else (v, at.v)
-            target[..., column] -= theta[..., 0]
-        elif at.kind == "body" and at.quantity == "linvel" and at.v is not None:
-            v = np.array(v)
-            v[..., at.v : at.v + 3] -= theta
-        elif at.kind == "body" and at.quantity == "angvel@body" and at.v is not None:
-            v = np.array(v)
-            v[..., at.v + 3 : at.v + 6] -= theta
-        return q, v
+    def undo(self, channel: str, value: Array, slope: Array, theta: Array) -> tuple[Array, Array]:
+        return value - theta, slope
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -145,36 +162,23 @@ class SensorGain(_OnChannel):
     family = "sensor_gain"
     summary = "Sensor gain"
     PARAMS = (Param("gain", "1", 0.3, 3.0, null=1.0, probes=(1.05,), resolution=1e-3, floor=-np.inf),)
-    # A joint whose speed is not measured has its speed from the position channel, and with it the gain.
-    with_speed = True
+    WANTED = "want numbers that are no orientation"
+
+    def fits(self, at: Place) -> bool:
+        return at.quantity != "quat"
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
         return values * theta[..., None, :] if channel in self.where else values
 
-    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        at = self.at[channel]
-        if at.kind == "joint" and at.quantity in ("pos", "vel"):
-            q, v = np.array(q), np.array(v)
-            if at.quantity == "pos":
-                q[..., at.q] /= theta[..., 0]
-            alone = f"{channel.removesuffix(':pos')}:vel" not in self.where
-            if at.quantity == "vel" or (self.with_speed and alone):
-                v[..., at.v] /= theta[..., 0]
-        elif at.kind == "body" and at.quantity in ("linvel", "angvel@body", "angvel") and at.v is not None:
-            v = np.array(v)
-            first = at.v + (0 if at.quantity == "linvel" else 3)
-            v[..., first : first + 3] /= theta
-        return q, v
+    def slope(self, slope: Array, theta: Array) -> Array:
+        return slope * theta
+
+    def undo(self, channel: str, value: Array, slope: Array, theta: Array) -> tuple[Array, Array]:
+        return value / theta, slope / theta
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
-        out: list[Effect] = []
-        for channel, at, _, _ in cls._channels(model, scales):
-            effect = cls((channel,), cls.PARAMS)
-            if at.kind == "joint" and at.quantity == "pos":
-                effect.with_speed = f"{channel.removesuffix(':pos')}:vel" not in scales.channels
-            out.append(effect)
-        return out
+        return [cls((channel,), cls.PARAMS) for channel, *_ in cls._channels(model, scales)]
 
 
 class SensorDelay(_OnChannel):
@@ -197,21 +201,11 @@ class SensorDelay(_OnChannel):
         there = np.take_along_axis(values, np.broadcast_to(after[..., None], values.shape), -2)
         return here + (when - before)[..., None] * (there - here)
 
-    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        at = self.at[channel]
-        if at.q is None or at.v is None or at.quantity not in ("pos", "quat"):
-            return q, v
-        q = np.array(q)
-        late = theta[..., :1]
-        if at.kind == "joint":
-            q[..., at.q : at.q + 1] += late * v[..., at.v : at.v + 1]
-        elif at.quantity == "pos":
-            q[..., at.q : at.q + 3] += late * v[..., at.v : at.v + 3]
-        else:
-            turn = vector_to_quat(late * v[..., at.v + 3 : at.v + 6])
-            quat = q[..., at.q + 3 : at.q + 7]
-            q[..., at.q + 3 : at.q + 7] = quat_multiply(quat, turn)
-        return q, v
+    def undo(self, channel: str, value: Array, slope: Array, theta: Array) -> tuple[Array, Array]:
+        since = theta[..., :1] * slope
+        if self.at[channel].quantity == "quat":
+            return quat_multiply(value, vector_to_quat(since)), slope
+        return value + since, slope
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -226,6 +220,11 @@ class Misalignment(_OnChannel):
     summary = "Sensor mounted at an angle"
     PARAMS = tuple(Param(axis, "rad", -0.3, 0.3, probes=(0.03,), resolution=5e-4) for axis in "xyz")
 
+    WANTED = "want an orientation or a vector"
+
+    def fits(self, at: Place) -> bool:
+        return at.dim in (3, 4)
+
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:
         if channel not in self.where:
             return values
@@ -234,21 +233,15 @@ class Misalignment(_OnChannel):
             return quat_multiply(values, np.broadcast_to(mount, values.shape))
         return rotate(np.broadcast_to(quat_conjugate(mount), (*values.shape[:-1], 4)), values)
 
-    def undo(self, channel: str, q: Array, v: Array, theta: Array) -> tuple[Array, Array]:
-        at = self.at[channel]
-        if at.kind != "body" or at.q is None or at.v is None:
-            return q, v
+    def slope(self, slope: Array, theta: Array) -> Array:
+        return rotate_back(_alike(vector_to_quat(theta), slope), slope)
+
+    def undo(self, channel: str, value: Array, slope: Array, theta: Array) -> tuple[Array, Array]:
         mount = vector_to_quat(theta)
-        if at.quantity == "quat":
-            q = np.array(q)
-            quat = q[..., at.q + 3 : at.q + 7]
-            q[..., at.q + 3 : at.q + 7] = quat_multiply(quat, np.broadcast_to(quat_conjugate(mount), quat.shape))
-        elif at.quantity in ("linvel", "angvel@body"):
-            v = np.array(v)
-            first = at.v + (0 if at.quantity == "linvel" else 3)
-            part = v[..., first : first + 3]
-            v[..., first : first + 3] = rotate(np.broadcast_to(mount, (*part.shape[:-1], 4)), part)
-        return q, v
+        slope = rotate(_alike(mount, slope), slope)
+        if self.at[channel].quantity == "quat":
+            return quat_multiply(value, _alike(quat_conjugate(mount), value)), slope
+        return rotate(_alike(mount, value), value), slope
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -258,3 +251,99 @@ class Misalignment(_OnChannel):
             if at.dim == 4 or (at.dim == 3 and at.kind == "sensor"):
                 out.append(cls((channel,), cls.PARAMS))
         return out
+
+
+def _alike(quat: Array, vectors: Array) -> Array:
+    """Quaternions (..., 4), one for each of vectors (..., n)."""
+    return np.broadcast_to(quat, (*vectors.shape[:-1], 4))
+
+
+def true_state(
+    effects: Sequence[Effect], thetas: Sequence[Array], q: Array, v: Array, channels: Collection[str] | None = None
+) -> tuple[Array, Array]:
+    """The state that faulty sensors were measuring, from the state that was read from them as if they were right.
+
+    The faults of each channel are undone in reverse order, and in what was computed from the channel as well: in a
+    speed that no other channel measures, in velocities that were turned by a faulty orientation. What a delayed
+    velocity has changed by since then is not known: a state holds no accelerations.
+
+    Args:
+      effects: in the order in which their `sense` acts; those that are no faults of sensors act by their `unsense`.
+      thetas: the parameters of each, (..., k).
+      q, v: (..., nq), (..., nv).
+      channels: names of all that was measured; None takes it to be the channels that have a fault, and no others.
+    """
+    faults: dict[str, list[tuple[_OnChannel, Array]]] = {}
+    for effect, theta in zip(effects, thetas, strict=True):
+        for part, own in effect.apart(theta) if isinstance(effect, Each) else [(effect, theta)]:
+            if isinstance(part, _OnChannel):
+                for channel in part.where:
+                    faults.setdefault(channel, []).append((part, own))
+            elif overrides(part, "unsense"):
+                q, v = part.unsense(q, v, own)
+    if not faults:
+        return q, v
+    q, v = np.array(q), np.array(v)
+    sensors = _Sensors(faults, faults if channels is None else channels)
+    places = {channel.rpartition(":")[0]: of[0][0].at[channel] for channel, of in faults.items()}
+    for name, at in places.items():
+        if at.q is not None and at.v is not None:
+            (sensors.joint if at.kind == "joint" else sensors.body)(name, q[..., at.q :], v[..., at.v :])
+    return q, v
+
+
+@dataclass(frozen=True)
+class _Sensors:
+    """All channels that were measured, and the faults of those that have some, in the order in which they act."""
+
+    faults: Mapping[str, Sequence[tuple[_OnChannel, Array]]]
+    channels: Collection[str]
+
+    def _first(self, place: str, kinds: Sequence[str]) -> str | None:
+        return next((c for kind in kinds if (c := f"{place}:{kind}") in self.channels), None)
+
+    def _slope(self, channel: str | None, slope: Array) -> Array:
+        for fault, theta in self.faults.get(channel or "", ()):
+            slope = fault.slope(slope, theta)
+        return slope
+
+    def _undo(self, channel: str | None, value: Array, slope: Array) -> tuple[Array, Array]:
+        for fault, theta in reversed(self.faults.get(channel or "", ())):
+            value, slope = fault.undo(channel or "", value, slope, theta)
+        return value, slope
+
+    def _placed(self, channel: str | None, speed: str | None, at: Array, shown: Array) -> tuple[Array, Array]:
+        """True position (..., n) and velocity, from the measured position and the velocity that the state has.
+
+        The latter is the true one where a channel `speed` measures it, and else the slope of the positions.
+        """
+        if speed is None:
+            return self._undo(channel, at, shown)
+        return self._undo(channel, at, self._slope(channel, shown))[0], shown
+
+    def _speed(self, channel: str | None, shown: Array) -> Array:
+        return self._undo(channel, shown, np.zeros_like(shown))[0]
+
+    def joint(self, place: str, q: Array, v: Array) -> None:
+        """A joint's state (..., 1 and more), in place."""
+        speed = self._first(place, ("vel",))
+        known = self._speed(speed, v[..., :1])
+        q[..., :1], v[..., :1] = self._placed(self._first(place, ("pos",)), speed, q[..., :1], known)
+
+    def body(self, place: str, q: Array, v: Array) -> None:
+        """A free body's state (..., 7 and more), (..., 6 and more), in place."""
+        speed, rates, attitude = (self._first(place, kinds) for kinds in (SPEEDS, RATES, ("quat",)))
+        seen, turning = q[..., 3:7].copy(), v[..., 3:6].copy()
+        # Where a state turned what was measured, only the difference is turned: where there is none, no bit changes.
+        if rates and not rates.endswith("@body"):
+            raw = rotate(seen, turning)
+            slope = turning + (rotate_back(seen, self._speed(rates, raw)) - rotate_back(seen, raw))
+        else:
+            slope = self._slope(attitude if rates else None, self._speed(rates, turning))
+        q[..., 3:7], v[..., 3:6] = self._undo(attitude, seen, slope)
+        if speed and speed.endswith("@body"):
+            raw = rotate_back(seen, v[..., :3])
+            known = v[..., :3] + (rotate(q[..., 3:7], self._speed(speed, raw)) - rotate(seen, raw))
+        else:
+            known = self._speed(speed, v[..., :3])
+        q[..., :3], v[..., :3] = self._placed(self._first(place, ("pos",)), speed, q[..., :3], known)

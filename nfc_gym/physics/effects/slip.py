@@ -20,6 +20,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, groups
@@ -28,6 +29,9 @@ from nfc_gym.physics.state import cross
 
 _EPS = 0.02  # m/s: below it the patch is taken to stick
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_PLANE, _FIELD, _BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{n}")) for n in ("PLANE", "HFIELD", "BOX"))
+_GROUNDS = (_PLANE, _FIELD, _BOX)  # what vehicles stand on
+_LEVEL = 0.5  # cosine of the angle by which an upper side may lean
 
 
 def wheels(model: mujoco.MjModel) -> list[int]:
@@ -101,8 +105,9 @@ class Slip(Effect):
         # (nbody, wheels): the share of each body's weight that a wheel of its vehicle carries.
         carried = [model.body_rootid[model.geom_bodyid[o]] for o in found]
         self.load = np.stack([(model.body_rootid == r) / carried.count(r) for r in self.roots], 1)
-        ground = [g for g in range(model.ngeom) if int(model.body_weldid[model.geom_bodyid[g]]) == 0]
-        self.ground = [g for g in ground if model.geom_contype[g] or model.geom_conaffinity[g]]
+        still = [g for g in range(model.ngeom) if int(model.body_weldid[model.geom_bodyid[g]]) == 0]
+        solid = [g for g in still if model.geom_contype[g] or model.geom_conaffinity[g]]
+        self.ground = [g for g in solid if int(model.geom_type[g]) in _GROUNDS] or solid[:1]
 
     def model(self, fields: ModelFields, theta: Array) -> None:
         if theta.shape[-1] < 3:
@@ -131,13 +136,46 @@ class Slip(Effect):
         out.xfrc[..., self.bodies, 3:] += cross(arm, push)
 
     def _friction(self, ctx: Context) -> Array:
-        """Sliding friction of the wheels' contact with the ground: the geom of higher priority, else the larger."""
+        """Sliding friction of the wheels' contact with what they stand on: of the geom of higher priority, else the
+        larger."""
         friction, priority = ctx.nominal("geom_friction")[..., 0], ctx.model.geom_priority
         own = friction[..., self.geoms]
-        for other in self.ground[:1]:
-            floor, above = friction[..., other, None], priority[other] - priority[self.geoms]
-            own = np.where(above > 0, floor, np.where(above == 0, np.maximum(own, floor), own))
-        return own
+        if not self.ground:
+            return own
+        ground = np.array(self.ground)
+        beneath = self._beneath(ctx) if len(ground) > 1 else np.zeros(own.shape, np.intp)
+        floor = np.take_along_axis(np.broadcast_to(friction[..., ground], (*own.shape[:-1], len(ground))), beneath, -1)
+        above = priority[ground][beneath] - priority[self.geoms]
+        return np.where(above > 0, floor, np.where(above == 0, np.maximum(own, floor), own))
+
+    def _beneath(self, ctx: Context) -> NDArray[np.intp]:
+        """Which of `ground` each wheel stands on: the first surface below its centre, (..., wheels)."""
+        wheels = ctx.data("geom_xpos")[..., self.geoms, :]
+        places, frames = ctx.data("geom_xpos")[..., self.ground, :], ctx.data("geom_xmat")[..., self.ground, :]
+        drops = []
+        for i, g in enumerate(self.ground):
+            frame = frames[..., i, :].reshape(*frames.shape[:-2], 1, 3, 3)
+            at = ((wheels - places[..., i, None, :])[..., None] * frame).sum(-2)  # in the geom's own frame
+            drops.append(np.where(frame[..., 2, 2] > _LEVEL, self._drop(ctx.model, g, at), np.inf))
+        return np.stack(drops, -1).argmin(-1)
+
+    @staticmethod
+    def _drop(model: mujoco.MjModel, geom: int, at: Array) -> Array:
+        """How far a geom's upper side lies below points (..., 3) of its frame, infinite where it does not, (...,)."""
+        kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+        if kind == _PLANE:
+            return np.where(at[..., 2] >= 0, at[..., 2], np.inf)
+        top, extent = size[2], size[:2]
+        if kind == _FIELD:
+            h = int(model.geom_dataid[geom])
+            shape, extent = (int(model.hfield_nrow[h]), int(model.hfield_ncol[h])), model.hfield_size[h, :2]
+            first = int(model.hfield_adr[h])
+            heights = model.hfield_data[first : first + shape[0] * shape[1]].reshape(shape) * model.hfield_size[h, 2]
+            share = np.clip((at[..., :2] / extent + 1) / 2, 0, 1)
+            row, column = (np.rint(share[..., k] * (n - 1)).astype(int) for k, n in ((1, shape[0]), (0, shape[1])))
+            top = heights[row, column]
+        over = (np.abs(at[..., :2]) <= extent).all(-1) & (at[..., 2] >= top)
+        return np.where(over, at[..., 2] - top, np.inf)
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:

@@ -23,6 +23,7 @@ from nfc_gym.physics.effects.base import (
 )
 from nfc_gym.physics.effects.drive import actuator_places
 from nfc_gym.physics.effects.places import sized
+from nfc_gym.physics.effects.ranges import narrow_ranges, range_of
 
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
 
@@ -42,6 +43,11 @@ class _Late(Effect):
         self.rows = index(actuator_ids(model, self.where))
         self.limits = command_limits(model, self.rows)
 
+    @staticmethod
+    def _splits(spec: mujoco.MjSpec) -> bool:
+        """Whether the spec's stages within a step would each see a filter or a buffer at another moment."""
+        return int(spec.option.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+
     def _commands(self, ctrl: Array) -> Array:
         return limited(ctrl[..., self.rows], *self.limits)
 
@@ -52,7 +58,7 @@ class _Late(Effect):
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
-        names = [n for n in actuator_names(model) if n]
+        names = actuator_names(model)
         # Under a sample and a half the logs say little; beyond 0.3 s no drive of a robot would be called late.
         probes = tuple(p for p in (0.01, 0.03, 0.08) if p > 0.4 * scales.interval) or (2 * scales.interval,)
         params = sized(cls.PARAMS, **{cls.PARAMS[0].name: {"probes": probes, "resolution": 0.05 * scales.interval}})
@@ -86,8 +92,13 @@ class Lag(_Late):
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
         actuators = [spec.actuator(n) for n in self.where]
-        if any(int(a.dyntype) != _STATELESS for a in actuators):
+        nominal = zip(*self.limits, strict=True)
+        # MuJoCo clips before it filters: what clips to less than the filter was given would do so on the wrong side.
+        clips = [range_of(a, "ctrl") for a in actuators]
+        wider = all(r[0] <= low and high <= r[1] for r, (low, high) in zip(clips, nominal, strict=True))
+        if any(int(a.dyntype) != _STATELESS for a in actuators) or not wider or self._splits(spec):
             return False
+        narrow_ranges(spec, self.where, "ctrl", *self.limits)
         for actuator in actuators:
             actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
             actuator.dynprm = [float(theta[0]), *np.asarray(actuator.dynprm)[1:]]
@@ -130,6 +141,8 @@ class Delay(_Late):
         actuators = [spec.actuator(n) for n in self.where]
         # MuJoCo reads its buffer before it writes, so that it knows no delay shorter than one step.
         if delay < dt * (1 - 1e-9) or any(a.delay > 0 or a.nsample > 0 for a in actuators):
+            return False
+        if self._splits(spec) or not narrow_ranges(spec, self.where, "ctrl", *self.limits):
             return False
         for actuator in actuators:
             actuator.delay = delay
