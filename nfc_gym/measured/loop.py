@@ -25,6 +25,7 @@ from nfc_gym.measured.calibrate import calibrate, compared
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import clusters, dispersion
 from nfc_gym.measured.dataset import Dataset
+from nfc_gym.measured.drowned import ADVICE, REASON, drowned
 from nfc_gym.measured.elsewhere import STARTS, hollows, resized
 from nfc_gym.measured.fisher import Lens
 from nfc_gym.measured.fit import Fit, differs, stand
@@ -242,6 +243,8 @@ def _fold(
     claims = {e["id"] for e in outcome["effects"]}
     outcome["identifiability"] = [row | {"claimed": row["id"] in claims} for row in advice.rows]
     outcome["findings"] += advice.findings
+    if found.rounds[-1].reason == REASON:
+        outcome["findings"].append({"kind": "advice", "text": ADVICE})
     outcome["seconds"] = round(time.monotonic() - began, 1)
     write(out, bench, final, outcome)
     stages.finish()
@@ -270,12 +273,17 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
         run.stages.put("calibrated", calibrate(work, plant, run.seed, run.say, bench.belief, bench.compare))
     x = np.array(run.stages.get("calibrated")["x"], float)
     sigma = work.covariance(plant, x)
-    calibrated = stand(work, metric(work, sigma), plant, x)
-    pool = candidates(bench, fitting)
+    under = metric(work, sigma)
+    calibrated = stand(work, under, plant, x)
+    lost = bench.mode == "rollout" and drowned(work, under, plant, x, run.seed)
+    pool = [] if lost else candidates(bench, fitting)
     data = Data(work, sigma), Data(select, select.covariance(plant, x))
     search = Search(*data, pool, Options(seed=run.seed), run.say, _suspects(run, fitting, x))
     if run.stages.get("found") is None:
-        _keep_found(run.stages, _hunt(run, search, calibrated, pool))
+        hunted = _hunt(run, search, calibrated, pool)
+        if lost:
+            hunted.rounds[-1].reason = REASON
+        _keep_found(run.stages, hunted)
     kept = run.stages.get("found")
     state = unpack_state(kept, plant, pool)
     assert state is not None  # every effect that was found is one of the pool's

@@ -52,7 +52,7 @@ def complaint(path: Path) -> str:
          ["longest horizon 0.9 s is longer than the segment"]),
         (("{length: 0.4}", "{length: 0.4, mode: backward}"), ["'rollout', 'inverse' or 'forward'", "(got 'backward')"]),
         (("{length: 0.4}", "{length: 0.4}\neffects: {only: [slipp]}"), ["no family 'slipp'; did you mean 'slip'?"]),
-        (("time: {column: t}", "time: {column: t, unit: V}"), ["time is one column, in s, ms, us or ns"]),
+        (("time: {column: t}", "time: {column: t, unit: V}"), ["time is in s, ms, us or ns"]),
         (("time: {column: t}", "time: {column: t, columns: [t]}"), ["has both `column` and `columns`"]),
         (("time: {column: t}", "time: {column: t, interval: 0.01}"), [":8: time: has both `column` and `interval`"]),
         (("time: {column: t}", "time: {interval: 0}"), [":8: time.interval", "greater than 0", "(got 0)"]),
