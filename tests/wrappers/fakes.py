@@ -44,12 +44,13 @@ class FakeEnv(MujocoEnv, EzPickle):
 
     def __init__(self, xml: str = CUBE, frame_skip: int = 4, **kwargs: Any) -> None:
         EzPickle.__init__(self, xml, frame_skip, **kwargs)
-        folder = Path(tempfile.mkdtemp())
-        (folder / "fake.xml").write_text(xml)
+        self._folder = tempfile.TemporaryDirectory()  # goes with the environment, which may read it again
+        file = Path(self._folder.name) / "fake.xml"
+        file.write_text(xml)
         model = mujoco.MjModel.from_xml_string(xml)
         self.metadata = {**self.metadata, "render_fps": round(1 / (model.opt.timestep * frame_skip))}
         box = spaces.Box(-np.inf, np.inf, (model.nq + model.nv,), np.float64)
-        super().__init__(str(folder / "fake.xml"), frame_skip, box, **kwargs)
+        super().__init__(str(file), frame_skip, box, **kwargs)
         self.start = (self.init_qpos, self.init_qvel)
 
     def _set_action_space(self) -> spaces.Box:
