@@ -24,3 +24,36 @@ def test_the_unit_of_a_command(actuator: str, unit: str) -> None:
         f"<mujoco><worldbody>{bodies}</worldbody><actuator>{actuator}</actuator></mujoco>"
     )
     assert command_unit(model, 0) == unit
+
+
+TENDONS = """
+<mujoco><worldbody>
+  <body name="a"><joint name="left" type="slide" axis="1 0 0"/><geom size=".1"/><site name="a"/></body>
+  <body name="b" pos="1 0 0"><joint name="right" type="slide" axis="1 0 0"/><geom size=".1"/><site name="b"/></body>
+  <body name="c" pos="2 0 0"><joint name="turn" axis="0 0 1"/><geom size=".1" pos=".2 0 0"/></body></worldbody>
+<tendon>
+  <fixed name="slides"><joint joint="left" coef="1"/><joint joint="right" coef="-1"/></fixed>
+  <fixed name="turns"><joint joint="turn" coef="2"/></fixed>
+  <fixed name="both"><joint joint="left" coef="1"/><joint joint="turn" coef="1"/></fixed>
+  <spatial name="rope"><site site="a"/><site site="b"/></spatial></tendon>
+<actuator><position {of} kp="10"/><velocity {of} kv="10"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("of", "position", "speed"),
+    [
+        ('joint="left"', "m", "m/s"),
+        ('joint="turn"', "rad", "rad/s"),
+        ('tendon="slides"', "m", "m/s"),
+        ('tendon="rope"', "m", "m/s"),
+        ('tendon="turns"', "rad", "rad/s"),
+        ('tendon="both"', "1", "1"),
+        ('site="a" refsite="b"', "1", "1"),
+    ],
+)
+def test_a_servo_is_commanded_in_the_unit_of_what_it_moves(of: str, position: str, speed: str) -> None:
+    text = TENDONS.format(of=of)
+    if "refsite" in of:
+        text = text.replace('<velocity site="a" refsite="b" kv="10"/>', '<velocity site="a" kv="10"/>')
+    model = mujoco.MjModel.from_xml_string(text)
+    assert [command_unit(model, i) for i in (0, 1)] == [position, speed]

@@ -11,6 +11,7 @@ from machines import make
 
 import nfc_gym  # noqa: F401  (registers the ids)
 from nfc_gym.core.errors import InputError
+from nfc_gym.physics.effects import FAMILIES
 from nfc_gym.physics.effects.saved import from_row
 from nfc_gym.wrappers import ApplyEffects
 
@@ -92,3 +93,20 @@ def test_around_an_environment_and_from_a_file(tmp_path: Path) -> None:
         seen.append([env.step(np.array([0.5, 0.2], np.float32))[0]["proprio"] for _ in range(5)])
     np.testing.assert_array_equal(seen[0], seen[2])
     np.testing.assert_array_equal(seen[1], seen[2])
+
+
+UNNAMED = """
+<mujoco><worldbody>
+  <body name="a"><joint name="left" type="slide" axis="1 0 0"/><geom size=".1"/></body>
+  <body name="c" pos="2 0 0"><joint name="turn" axis="0 0 1"/><geom size=".1" pos=".2 0 0"/></body></worldbody>
+<actuator><motor joint="left"/><motor joint="turn"/></actuator></mujoco>"""
+
+
+def test_unnamed_actuators_go_by_their_joints_everywhere() -> None:
+    """Of a model that nobody prepared, as environments of others have it."""
+    model = mujoco.MjModel.from_xml_string(UNNAMED)
+    for family, theta in (("delay", {"delay": 0.01}), ("backlash", {"gap": 0.01, "rotor": 0.01})):
+        effect, _ = make(family, "all", theta)
+        effect.bind(model)
+        assert effect.where == ("left", "turn")
+    assert FAMILIES["coulomb"]("turn").where == ("turn",)  # a name alone is one place
