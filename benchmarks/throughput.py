@@ -89,9 +89,9 @@ def vector(table: Table, ids: list[str], sizes: list[int], turns: int) -> None:
             envs.close()
 
 
-def elevation(table: Table, turns: int) -> None:
+def elevation(table: Table, batch: int, turns: int) -> None:
     """What the 128 x 128 map costs: a step with it minus a step without, the same states and terrain."""
-    for n, limit in ((1, 80.0), (1024, 120.0)):
+    for n, limit in ((1, 80.0), (batch, 120.0)):
         single = n == 1
         made = {}
         for key, kwargs in {"without": {"context": ["psi"]}, "full": {}, "10 Hz": {"elevation_hz": 10}}.items():
@@ -346,8 +346,8 @@ def main() -> None:
     table = Table()
     runs: dict[str, Callable[[], None]] = {
         "vector": lambda: vector(table, grounds, sizes, turns),
-        "elevation": lambda: elevation(table, turns),
-        "async": lambda: asynchronous(table, 64, turns),
+        "elevation": lambda: elevation(table, 64 if quick else 1024, turns),
+        "async": lambda: asynchronous(table, 8 if quick else 64, turns),
         "ant": lambda: ant(table, [64] if quick else [16, 256, 1024], turns),
         "single": lambda: single(table, [f"{robot}Flat" for robot in robots] + ["Ant-v5"], turns),
         "torchrl": lambda: torchrl(table, turns),

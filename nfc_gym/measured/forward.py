@@ -147,10 +147,8 @@ def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Delivered
     late = longest_delay(model)
     if commanding or model.na or late:
         start = out[:, :, 0].copy()
-        parts = max(
-            1, round(dt / rows / model.opt.timestep)
-        )  # steps of the physics from one row of the log to the next
-
+        # Steps of the physics from one row of the log to the next.
+        parts = max(1, round(dt / rows / model.opt.timestep))
         step = dt / (rows * parts)
         memories = {i: plant.effects[i].state0(start.shape[:-1], start, thetas[i], step) for i in commanding}
         if not late and all(m is None for m in memories.values()):

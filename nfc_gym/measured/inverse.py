@@ -14,6 +14,7 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.measured.recent import Recent
 from nfc_gym.physics.effects.base import Context, Effect, Forces, actuator_names, overrides
+from nfc_gym.physics.effects.drive import arm_of
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import resolve, write_field
 from nfc_gym.physics.past import trace
@@ -63,22 +64,9 @@ def levers(model: mujoco.MjModel) -> Array:
 
     Zero for others, whose levers depend on the motion, and for what acts on more than one degree of freedom of a joint.
     """
-    kinds = mujoco.mjtTrn
-    out = np.zeros((model.nu, model.nv))
-    for a, (kind, of) in enumerate(zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True)):
-        if int(kind) in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
-            pulled = [(int(of), 1.0)]
-        elif int(kind) == int(kinds.mjTRN_TENDON):
-            wraps = slice(int(model.tendon_adr[of]), int(model.tendon_adr[of] + model.tendon_num[of]))
-            if (model.wrap_type[wraps] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
-                continue
-            pulled = list(zip(map(int, model.wrap_objid[wraps]), map(float, model.wrap_prm[wraps]), strict=True))
-        else:
-            continue
-        for joint, share in pulled:
-            if int(model.jnt_type[joint]) >= int(mujoco.mjtJoint.mjJNT_SLIDE):
-                out[a, model.jnt_dofadr[joint]] += share * model.actuator_gear[a, 0]
-    return out
+    arms = [arm_of(model, a) for a in range(model.nu)]
+    rows = [np.zeros(model.nv) if of is None else of for of in arms]
+    return np.reshape(rows, (model.nu, model.nv)) * model.actuator_gear[:, :1]
 
 
 def _require_told_apart(model: mujoco.MjModel, actuators: Sequence[int]) -> None:

@@ -25,8 +25,8 @@ from nfc_gym.physics.fields import ModelFields
 
 _FIXED, _AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
 _NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
-_JOINT, _TENDON = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_TENDON)
-_JOINTS = (_JOINT, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -171,10 +171,10 @@ class TorqueSpeed(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.rows = actuator_ids(model, self.where)
-        arms = [_arm(model, int(r)) for r in self.rows]
+        arms = [arm_of(model, int(r)) for r in self.rows]
         for name, arm in zip(self.where, arms, strict=True):
             if arm is None:
-                fit = [n for i, n in enumerate(actuator_names(model)) if _arm(model, i) is not None]
+                fit = [n for i, n in enumerate(actuator_names(model)) if arm_of(model, i) is not None]
                 raise InputError(
                     f"torque_speed: {name!r} moves no hinge, slide or fixed tendon, whose speed would set its limit; "
                     f"actuators that do: {', '.join(fit) or 'none'}"
@@ -194,7 +194,7 @@ class TorqueSpeed(Effect):
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         known = actuator_names(model)
         fit = [n for n in plain(model) if _peak(model, known.index(n)) > 0]
-        arms = {n: arm for n in fit if (arm := _arm(model, known.index(n))) is not None}
+        arms = {n: arm for n in fit if (arm := arm_of(model, known.index(n))) is not None}
         out: list[Effect] = []
         for where in actuator_places(model, list(arms)):
             speeds = [float(np.abs(arms[n]) @ scales.speed) for n in where]
@@ -206,25 +206,25 @@ class TorqueSpeed(Effect):
 
 def on_scalar(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator moves one hinge or slide joint."""
-    if int(model.actuator_trntype[actuator]) != _JOINT:
+    if int(model.actuator_trntype[actuator]) not in _JOINTS:
         return False
     return int(model.jnt_type[model.actuator_trnid[actuator, 0]]) >= int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-def _arm(model: mujoco.MjModel, actuator: int) -> Array | None:
+def arm_of(model: mujoco.MjModel, actuator: int) -> Array | None:
     """(nv,) by which speeds add up to that of the hinge, slide or fixed tendon that an actuator moves; else None."""
-    arm, at = np.zeros(model.nv), int(model.actuator_trnid[actuator, 0])
+    found, at = np.zeros(model.nv), int(model.actuator_trnid[actuator, 0])
     if on_scalar(model, actuator):
-        arm[model.jnt_dofadr[at]] = 1.0
-        return arm
+        found[model.jnt_dofadr[at]] = 1.0
+        return found
     if int(model.actuator_trntype[actuator]) != _TENDON:
         return None
     parts = slice(int(model.tendon_adr[at]), int(model.tendon_adr[at] + model.tendon_num[at]))
     if (model.wrap_type[parts] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
         return None  # a spatial tendon: its arms change as it moves
     for joint, coefficient in zip(model.wrap_objid[parts], model.wrap_prm[parts], strict=True):
-        arm[model.jnt_dofadr[joint]] += coefficient
-    return arm
+        found[model.jnt_dofadr[joint]] += coefficient
+    return found
 
 
 def _peak(model: mujoco.MjModel, actuator: int) -> float:
