@@ -48,7 +48,7 @@ class BulletVectorEnv(VectorEnv):
         *,
         hidden: Hidden,
         num_envs: int,
-        max_episode_steps: int | None = 1000,
+        max_episode_steps: int = 1000,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         workers: int = 1,
         **settings: Any,
@@ -70,7 +70,7 @@ class BulletVectorEnv(VectorEnv):
         self.single_observation_space, self.single_action_space = self._observe.space, box(robot.action_size, bound=1.0)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._horizon = np.iinfo(np.int64).max if max_episode_steps in (None, -1) else max_episode_steps
+        self._horizon = np.iinfo(np.int64).max if max_episode_steps == -1 else max_episode_steps
         self._start(robot, hidden, min(workers, num_envs))
 
     def _start(self, robot: type[Robot], hidden: Hidden, workers: int) -> None:

@@ -105,7 +105,7 @@ class World:
         num_envs: int = 1,
         *,
         camera: bool = False,
-        max_episode_steps: int | None = 1000,
+        max_episode_steps: int = 1000,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         nthread: int = 1,
         render_mode: str | None = None,

@@ -9,9 +9,9 @@ fresh noise, through the same pipeline. A model that misses no more than its twi
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.metric import Metric, metric
+from nfc_gym.measured.metric import Metric
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.verdict import mean_square
+from nfc_gym.measured.verdict import mean_square, twin
 from nfc_gym.physics.rollout import Plant
 
 MAGNIFIED = 1.15  # mean square of a twin's whitened numbers from which on noise is magnified; 1 on straight lines
@@ -35,14 +35,13 @@ def drowned(problem: Problem, under: Metric, plant: Plant, x: NDArray[np.float64
     """
     if problem.rough:
         return False
+    rng, shown = np.random.default_rng(seed), []
+    while len(shown) < _TWINS:
+        made = twin(problem, under, plant, x, rng)
+        if made is None:
+            return False
+        shown.append(mean_square(*made))
+        if shown[0] < MAGNIFIED:
+            return False
     own = mean_square(problem, under.whiten(problem.residual(plant, x[None]))[0])
-    rng, twins = np.random.default_rng(seed), []
-    while len(twins) < _TWINS:
-        twin = problem.synthetic(plant, x, rng)
-        if not len(twin):
-            return False
-        measure = metric(twin, twin.covariance(plant, x))
-        twins.append(mean_square(twin, measure.whiten(twin.residual(plant, x[None]))[0]))
-        if twins[0] < MAGNIFIED:
-            return False
-    return own <= float(np.mean(twins))
+    return own <= float(np.mean(shown))

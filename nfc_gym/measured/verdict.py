@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured.contest import bootstrap, clusters
 from nfc_gym.measured.fit import Fit, uncertainty
-from nfc_gym.measured.metric import beyond, metric, taken
+from nfc_gym.measured.metric import Metric, beyond, metric, taken
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.ranking import Round
 from nfc_gym.physics.effects.conditions import Conditioned
@@ -72,6 +72,27 @@ def column_means(problem: Problem, white: Array) -> Array:
     return squares.sum(0) / np.maximum(problem.mask.sum(0), 1)
 
 
+def twin(
+    problem: Problem, under: Metric, plant: Plant, x: Array, rng: np.random.Generator
+) -> tuple[Problem, Array] | None:
+    """A problem made of a model's own motion with fresh noise, and its whitened residual (S, m) under that model.
+
+    Args:
+      problem, under: what it is the twin of, and the metric of that at the model.
+      plant, x: the model.
+
+    Returns:
+      None where the model is unstable on every segment.
+    """
+    made = problem.synthetic(plant, x, rng)
+    if not len(made):
+        return None
+    # Where bodies touch a covariance is dear, and a twin starts within the noise of what it is the twin of.
+    alike = problem.rough and len(made) == len(problem)
+    measure = under if alike else metric(made, made.covariance(plant, x))
+    return made, measure.whiten(made.residual(plant, x[None]))[0]
+
+
 def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Generator) -> Verified:
     """Predict the verification logs with all three models, and what chi-squared a perfect model would show.
 
@@ -89,18 +110,14 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
         residual[stage], white[stage] = r[0], measure.whiten(r)[0]
     null, floors = [], []
     for _ in range(replicas):
-        twin = problem.synthetic(plant, x, rng)
-        if not len(twin):
+        made = twin(problem, measure, plant, x, rng)
+        if made is None:
             raise InputError(
                 "the model that fits the other logs is unstable on every segment that verifies, at half the physics "
                 "step: look whether these logs are of the same machine, in the same units (`nfc-gym check`)"
             )
-        # Where bodies touch a covariance is dear, and a twin starts within the noise of what it is the twin of.
-        alike = problem.rough and len(twin) == len(problem)
-        under = measure if alike else metric(twin, twin.covariance(plant, x))
-        seen = under.whiten(twin.residual(plant, x[None]))[0]
-        null.append(mean_square(twin, seen))
-        floors.append(column_means(twin, seen))
+        null.append(mean_square(*made))
+        floors.append(column_means(*made))
     floor = np.mean(floors, 0) if floors else np.ones(problem.mask.shape[1])
     return Verified(problem, residual, white, sigma, np.array(null), floor)
 

@@ -136,7 +136,7 @@ def with_psi(env: Any, effects: Given, randomize: type[RandomizePsi] | type[Vect
         return env
     bounds = {name: (value, value) for name, value in psi_said(effects, read_effects(effects)).items()}
     there = (w.arguments["distribution"] for w in beneath(env) if isinstance(w, RandomizePsi | VectorRandomizePsi))
-    return env if not bounds or any(d == bounds for d in there) else randomize(env, bounds)
+    return env if not bounds or any(isinstance(d, dict) and d == bounds for d in there) else randomize(env, bounds)
 
 
 class Application:

@@ -53,6 +53,13 @@ def test_a_loop_whose_joints_are_all_measured_is_sound(tmp_path: Path) -> None:
     assert not found(tmp_path, LINKAGE.format(elbow=""), {"crank": 1, "elbow": -1, "rocker": 1})
 
 
+def test_a_loop_is_looked_at_in_sparse_models_too(tmp_path: Path) -> None:
+    model = LINKAGE.format(elbow="").replace('timestep="0.005"', 'timestep="0.005" jacobian="sparse"')
+    assert not found(tmp_path, model, {"crank": 1, "elbow": -1, "rocker": 1})
+    findings = found(tmp_path, model, {"crank": 1, "elbow": -1, "rocker": 1.2})
+    assert said(findings, "equality 'pin' is off by") == ["warning"]
+
+
 @pytest.mark.parametrize(
     ("elbow", "extra", "severity", "words"),
     [

@@ -321,3 +321,6 @@ def test_psi_beside_the_effects_of_a_file_holds_in_every_episode(tmp_path: Path)
     np.testing.assert_allclose(envs.unwrapped.batch.expand("body_mass")[:, base], 20)
     with pytest.raises(InputError, match="psi is written by"):
         RandomizePsi(env)
+    drawn = RandomizePsi(gym.make("nfc_gym/JackalFlat-v0"), np.tile(env.unwrapped.psi_space.nominal, (2, 1)))
+    with pytest.raises(InputError, match="psi is written by"):
+        ApplyEffects(drawn, file)

@@ -62,16 +62,13 @@ def command_unit(model: mujoco.MjModel, actuator: int) -> str:
 
 def _slides(model: mujoco.MjModel, actuator: int) -> bool | None:
     """Whether what an actuator moves is a length, in m; else it is an angle, or None: neither alone."""
-    kind, first = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
-    if kind in _JOINTS:
-        return int(model.jnt_type[first]) == _SLIDE
-    if kind == _TENDON:
-        part = slice(int(model.tendon_adr[first]), int(model.tendon_adr[first] + model.tendon_num[first]))
-        if (model.wrap_type[part] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
-            return True  # a spatial tendon's length
-        each = {int(k) == _SLIDE for k in model.jnt_type[model.wrap_objid[part]]}
+    kind, arm = int(model.actuator_trntype[actuator]), arm_of(model, actuator)
+    if arm is not None:
+        each = {int(k) == _SLIDE for k in model.jnt_type[model.dof_jntid[arm != 0]]}
         return each.pop() if len(each) == 1 else None
-    return True if kind == int(mujoco.mjtTrn.mjTRN_SLIDERCRANK) else None
+    if kind in _JOINTS:
+        return False  # of a ball or free joint
+    return True if kind in (_TENDON, int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)) else None  # a spatial tendon's length
 
 
 def actuator_places(model: mujoco.MjModel, names: Sequence[str]) -> list[tuple[str, ...]]:
