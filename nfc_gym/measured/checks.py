@@ -13,6 +13,7 @@ from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order, part
 from nfc_gym.measured.mapping import SPLITS, Mapping, load_mapping
 from nfc_gym.measured.model import compile_model, read_spec
 from nfc_gym.measured.model_checks import model_findings
+from nfc_gym.measured.sign_checks import turned_round
 from nfc_gym.measured.signal_checks import suspicions
 from nfc_gym.measured.speed_checks import clock_unit
 from nfc_gym.measured.splits import find_logs
@@ -58,6 +59,8 @@ def examine(dataset_path: Path | str) -> tuple[Dataset | None, list[Finding]]:
     dataset, found = _logs(mapping, path, model)
     if dataset is not None:
         found += _whole(dataset)
+        if not any(f.severity == "error" for f in findings + found):  # roll-outs need all of it right
+            found += turned_round(dataset)
     return dataset, in_order(findings + found)
 
 

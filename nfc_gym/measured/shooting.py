@@ -157,6 +157,11 @@ class RolloutProblem(Problem):
         return out
 
     @property
+    def noise(self) -> Array:
+        """(S, m) standard deviation of each measured number."""
+        return self._noise
+
+    @property
     def observers(self) -> list[Observer]:
         """The compared channels, in the order of the columns."""
         return self._observers
@@ -320,11 +325,18 @@ class RolloutProblem(Problem):
         out._whole = self
         return out
 
-    def beginning(self, segments: Segments) -> "RolloutProblem":
-        """The same measurements, predicted along other segments: other starts, other signals, another step."""
+    def beginning(self, segments: Segments, signs: Mapping[str, Array] | None = None) -> "RolloutProblem":
+        """The same measurements, predicted along other segments: other starts, other signals, another step.
+
+        Args:
+          signs: that the numbers of channels are multiplied by, channel -> (dim,).
+        """
         out = object.__new__(RolloutProblem)
         out.__dict__.update(self.__dict__)
         out.segments, out._recent, out._whole = segments, Recent(_RECENT), None
+        if signs:
+            pairs = zip(self._observers, self._measured, strict=True)
+            out._measured = [m * signs[o.name] if o.name in signs else m for o, m in pairs]
         return out
 
     def take(self, index: NDArray[np.intp]) -> "RolloutProblem":

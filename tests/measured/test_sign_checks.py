@@ -1,0 +1,108 @@
+"""What `check` says of encoders, commands and frames that are the wrong way round."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from nfc_gym.measured.checks import check
+from nfc_gym.measured.findings import Finding
+
+ARM = """
+<mujoco><option timestep="0.005"/><worldbody>
+  <body name="upper"><joint name="shoulder" axis="0 1 0" damping=".1"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" mass=".5"/>
+    <body name="fore" pos="0 0 -.3"><joint name="elbow" axis="0 1 0" damping=".05"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.25" mass=".3"/></body></body>
+</worldbody><actuator>
+  <position name="lift" joint="shoulder" kp="8" kv=".5"/><motor name="bend" joint="elbow"/></actuator></mujoco>"""
+# A thruster that leans with its body: where it drifts to tells which way z is.
+FLIER = """
+<mujoco><option timestep="0.005"/><worldbody>
+  <body name="hull"><freejoint/><geom type="box" size=".1 .1 .03" mass="1"/><site name="fan"/></body>
+</worldbody><actuator><motor name="thrust" site="fan" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
+NED = {"p": np.array([1.0, -1, -1]), "q": np.array([1.0, 1, -1, -1])}
+
+
+def moved(model: mujoco.MjModel, k: int) -> dict[str, np.ndarray]:
+    """Columns of 4 s of a machine, sampled at 100 Hz with a little noise: t, u0.., qpos as `joint` or `p`, `q`."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(k)
+    free = model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
+    if free:
+        data.qpos[3:7] = [1, 0.3 * np.sin(k), 0.3 * np.cos(k), 0]
+        data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+    rows = []
+    for n in range(400):
+        wave = 0.6 * np.sin(np.array([2.3, 3.1]) * (0.01 * n) + k + np.arange(2))
+        ctrl = (9.81 + 2 * wave if free else wave * [1, 0.5])[: model.nu]
+        rows.append(np.concatenate([[0.01 * n], ctrl, data.qpos]))
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data, 2)
+    table = np.array(rows).T
+    table[1 + model.nu :] += 1e-4 * rng.standard_normal((model.nq, 400))
+    columns = {"t": table[0], **{f"u{i}": table[1 + i] for i in range(model.nu)}}
+    state = table[1 + model.nu :]
+    return columns | ({"p": state[:3].T, "q": state[3:].T} if free else {"shoulder": state[0], "elbow": state[1]})
+
+
+def found(folder: Path, xml: str, signs: dict[str, float | np.ndarray], wrong: str = "") -> list[Finding]:
+    """Findings of three logs of `xml` whose columns are multiplied by signs, checked against `xml` or `wrong`."""
+    (folder / "machine.xml").write_text(wrong or xml)
+    model = mujoco.MjModel.from_xml_string(xml)
+    for k in range(3):
+        np.savez(folder / f"log{k}.npz", **{c: v * signs.get(c, 1.0) for c, v in moved(model, k).items()})
+    names = [model.actuator(i).name for i in range(model.nu)]
+    unit = {"lift": "rad", "bend": "N m", "thrust": "N"}
+    controls = "\n".join(f"  ctrl:{n}: {{column: u{i}, unit: {unit[n]}}}" for i, n in enumerate(names))
+    channels = (
+        "  body:hull:pos: {column: p, unit: m, noise: 0.0001}\n"
+        "  body:hull:quat: {column: q, order: wxyz, noise: 0.0001}"
+        if xml is FLIER
+        else "\n".join(f"  joint:{j}:pos: {{column: {j}, unit: rad, noise: 0.0001}}" for j in ("shoulder", "elbow"))
+    )
+    body = model.body(1).name
+    (folder / "mapping.yaml").write_text(
+        "version: 1\nmodel: machine.xml\nparameters:\n"
+        f"  - {{name: mass, field: body_mass, of: {body}, unit: kg, low: 0.1, high: 5}}\nlogs:\n  - {{path: '*.npz'}}\n"
+        f"time: {{column: t, unit: s}}\ncontrols:\n{controls}\nchannels:\n{channels}\n"
+    )
+    return check(folder / "mapping.yaml")
+
+
+def turned(findings: list[Finding]) -> list[Finding]:
+    return [f for f in findings if "turned round" in f.message]
+
+
+@pytest.mark.parametrize("xml", [ARM, FLIER])
+def test_nothing_is_said_where_all_is_the_right_way_round(tmp_path: Path, xml: str) -> None:
+    assert not turned(found(tmp_path, xml, {}))
+
+
+def test_nor_where_the_model_is_far_off_in_another_way(tmp_path: Path) -> None:
+    wrong = ARM.replace('kp="8"', 'kp="2"').replace('mass=".3"', 'mass=".9"').replace('damping=".1"', 'damping="1"')
+    assert not turned(found(tmp_path, ARM, {}, wrong))
+
+
+@pytest.mark.parametrize(
+    ("column", "joint", "command"),
+    [
+        ("shoulder", "shoulder", "lift"),
+        ("u0", "shoulder", "lift"),
+        ("elbow", "elbow", "bend"),
+        ("u1", "elbow", "bend"),
+    ],
+)
+def test_a_joint_or_its_command_with_the_other_sign_is_told(
+    tmp_path: Path, column: str, joint: str, command: str
+) -> None:
+    (finding,) = turned(found(tmp_path, ARM, {column: -1.0}))
+    assert finding.severity == "warning"
+    want = f"joint '{joint}'" if column == joint else f"the command 'ctrl:{command}'"
+    assert want in finding.message
+
+
+def test_a_frame_with_z_downwards_is_told(tmp_path: Path) -> None:
+    (finding,) = turned(found(tmp_path, FLIER, NED))
+    assert "north-east-down" in finding.message
+    assert "(w, x, -y, -z)" in finding.advice
