@@ -6,6 +6,7 @@ full has shown too little, and what is believed is the prior. `Sequential` adds 
 rounds to a neural posterior; `Assimilation` (in a module of its own) needs no network.
 """
 
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -56,9 +57,15 @@ def asked(posterior: Any, trajectory: Trajectory) -> Window | None:
 
 
 def believed(posterior: Any, trajectory: Trajectory) -> Sampler:
-    """What a posterior with `given` says of a trajectory."""
+    """What a posterior with `given` says of a trajectory.
+
+    A network's delta_e is left out: it is of the ground around the robot at one moment, and worlds are whole maps.
+    """
     window = asked(posterior, trajectory)
-    return Unseen(posterior.prior) if window is None else posterior.given(window)
+    if window is None:
+        return Unseen(posterior.prior)
+    given = posterior.given(window)
+    return given.of(*(p for p in given.parts if p != "delta_e")) if isinstance(given, NeuralPosterior) else given
 
 
 @dataclass(frozen=True)
@@ -86,7 +93,7 @@ class Sequential:
     """A neural posterior that simulates around what it believes, and learns from that, after each anomaly.
 
     Attributes:
-      posterior: pretrained; its network is trained further, in place.
+      posterior: pretrained; a copy of its network is trained further, so that earlier beliefs stay what they were.
       simulate: psi -> windows, `nfc_gym.simulate.Simulator` of the environment.
       rounds: see `inference.sequential`; the first draws from the prior, later ones where the posterior has mass.
       training: of each round.
@@ -116,8 +123,9 @@ class Sequential:
         window = asked(self.posterior, trajectory)
         if window is None:
             return self
-        sequential(self.posterior.network, self.simulate, window, self.rounds, self.training, scales=False)
-        return Sequential(NeuralPosterior(self.posterior.network), self.simulate, self.rounds, self.training)
+        network = deepcopy(self.posterior.network)
+        sequential(network, self.simulate, window, self.rounds, self.training, scales=False)
+        return Sequential(NeuralPosterior(network), self.simulate, self.rounds, self.training)
 
     def fine_tuned(self, dataset: Dataset) -> "Sequential":
         """After the mission: rounds for every anomalous trajectory that was gathered."""

@@ -18,7 +18,7 @@ from nfc_gym.wrappers.anomaly import scored
 
 Array = NDArray[np.float64]
 LOOK = 25  # control steps from one map that is kept to the next: 1 m at 2 m/s, of 6.4 m to each side
-_LATER = ("maps", "looks")
+_LATER = ("maps", "looks", "alarm_map")
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Trajectory:
       ended: whether the episode ended early.
       maps: (k, 128, 128) perceived along the way, or (0, 128, 128).
       looks: (k,) rows of `states` at which they were.
+      alarm_map: (128, 128) perceived after the transition that was most unusual, or (0, 0).
     """
 
     states: Array
@@ -51,6 +52,7 @@ class Trajectory:
     ended: bool = False
     maps: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, SIZE, SIZE), np.float32))
     looks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    alarm_map: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -69,10 +71,11 @@ class Trajectory:
         """Up to the transition that was most unusual: what a posterior that sees one window is to look at."""
         stop = int(np.argmax(self.scores)) + 1
         seen = self.looks <= stop
+        elevation = self.alarm_map.astype(float) if self.alarm_map.size else self.elevation
         return Trajectory(
             self.states[: stop + 1], self.actions[:stop], self.rewards[:stop], self.scores[:stop], self.threshold,
-            self.estimate[: stop + 1], self.maps[seen][-1] if seen.any() else self.elevation, self.reached, self.ended,
-            self.maps[seen], self.looks[seen],
+            self.estimate[: stop + 1], elevation, self.reached, self.ended, self.maps[seen], self.looks[seen],
+            self.alarm_map,
         )  # fmt: skip
 
     def window(self) -> Window:
@@ -163,8 +166,9 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
     detector.reset()
     states, estimate = [_proprio(observation)], [_estimate(world)]
     actions, rewards, scores = [], [], []
-    maps, looks = [], []
+    maps, looks, alarm_map = [], [], np.zeros((0, 0), np.float32)
     over = reached = ended = False
+    most = -np.inf
     while not over:
         if "elevation" in observation and len(actions) % LOOK == 0:
             maps.append(np.array(observation["elevation"], np.float32))
@@ -172,6 +176,8 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
         action = np.asarray(policy(observation), np.float64)
         after, reward, ended, truncated, info = world.step(action)
         scores.append(float(scored(world, detector, observation, action, after)))
+        if "elevation" in after and scores[-1] > most:
+            most, alarm_map = scores[-1], np.array(after["elevation"], np.float32)
         rewards.append(_reward(reward, len(actions)))
         actions.append(action)
         states.append(_proprio(after))
@@ -184,6 +190,7 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
     return Trajectory(
         np.array(states), np.array(actions), np.array(rewards), np.array(scores), threshold, np.array(estimate),
         elevation, reached, bool(ended), np.array(maps, np.float32).reshape(-1, SIZE, SIZE), np.array(looks, np.intp),
+        alarm_map,
     )  # fmt: skip
 
 
