@@ -1,6 +1,7 @@
 """Options and infos of a vector environment: for all, for each, for some."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import operator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from nfc_gym.envs.contract import checked_options
 from nfc_gym.physics.parameters import numbers
 
 Ids = NDArray[np.intp]
+# What can be gone through, but not as seeds; an iterator would be used up by the first wrapper that reads it.
+_NO_SEEDS = (str, bytes, Mapping, Iterator)
 
 
 def vector_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -32,16 +35,38 @@ def ids_of(mask: Any, n: int) -> Ids:
     return np.flatnonzero(mask)
 
 
-def seeds_of(seed: int | Sequence[int | None] | None, n: int) -> list[int | None]:
-    """A seed for each of n environments: s gives s, s + 1, ...; None leaves a generator as it is."""
+def seeds_of(seed: int | Iterable[int | None] | None, n: int) -> list[int | None]:
+    """A seed for each of n environments: s gives s, s + 1, ...; None leaves a generator as it is.
+
+    Args:
+      seed: a whole number or None, or anything that holds n of them: a list, a range, an array.
+      n: environments.
+
+    Raises:
+      InputError: it is neither, or holds another number of seeds, or something that is no whole number.
+    """
     if seed is None:
         return [None] * n
-    if isinstance(seed, str) or not isinstance(seed, int | np.integer | Iterable):
+    if (one := _whole(seed)) is not None:
+        return [one + i for i in range(n)]
+    if not isinstance(seed, Iterable) or isinstance(seed, _NO_SEEDS) or getattr(seed, "ndim", 1) == 0:
         raise InputError(f"seed is {seed!r}, want a whole number, or one for each of {n} environments")
-    seeds: list[int | None] = [int(seed) + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
-    if len(seeds) != n:
-        raise InputError(f"seed holds {len(seeds)} seeds, want one for each of {n} environments")
+    given = list(seed)
+    if len(given) != n:
+        raise InputError(f"seed is {seed!r}, which holds {len(given)} seeds, want one for each of {n} environments")
+    seeds = [_whole(s) for s in given]
+    for i, (own, s) in enumerate(zip(seeds, given, strict=True)):
+        if own is None and s is not None:
+            raise InputError(f"seed[{i}] is {s!r}, want a whole number, or None for a generator to stay as it is")
     return seeds
+
+
+def _whole(value: Any) -> int | None:
+    """A whole number of any library's as Python's own; None for what is none."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None
 
 
 def rows_of(value: Any, ids: Ids, n: int, name: str) -> Any:

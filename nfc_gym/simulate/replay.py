@@ -23,6 +23,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
@@ -61,8 +62,9 @@ class Replay:
       draws: replays a window.
       motor: standard deviation of the motors' noise, a share of the actions' range.
       ground: the map underfoot, for a Rough environment: one for all windows, or several to choose from.
-      standing: () -> (n,) which of several maps each row of a vector environment stands on at present:
-        `lambda: env.unwrapped.terrain_id`.
+      standing: the vector environment (one of this package's) whose rows are replayed, each on the map that it is on.
+        Else () -> (n,), which map the last transition of each row was driven on; it is asked once the step is over,
+        and of same-step autoreset `terrain_id` then is the next episode's.
       seed: of all draws.
       nthread: threads; the scores do not depend on them.
 
@@ -72,8 +74,8 @@ class Replay:
 
     def __init__(
         self, environment: str, belief: Sampler | None = None, *, draws: int = DRAWS, motor: float = MOTOR,
-        ground: Heightfield | Sequence[Heightfield] | None = None, standing: Callable[[], Any] | None = None,
-        seed: int = 0, nthread: int = 1,
+        ground: Heightfield | Sequence[Heightfield] | None = None,
+        standing: VectorEnv | Callable[[], Any] | None = None, seed: int = 0, nthread: int = 1,
     ) -> None:  # fmt: skip
         self.machine = machine = Machine(environment)
         if draws < 2:
@@ -86,7 +88,7 @@ class Replay:
         self.horizon = machine.habit.horizon
         self.states, self.actions = machine.kind.proprio_size, machine.kind.action_size
         self.draws, self.nthread = draws, nthread
-        self.maps, self.standing = maps, standing
+        self.maps, self.standing = maps, Driven(standing) if isinstance(standing, VectorEnv) else standing
         rng = np.random.default_rng(seed)
         self.psi = _psi(machine, belief, draws, rng)
         self.jitter = motor * rng.standard_normal((draws, self.horizon, self.actions))
@@ -120,7 +122,7 @@ class Replay:
         return self.summed(self.steps(states, actions, start, which))
 
     def score_rows(self, states: Array, actions: Array, rows: NDArray[np.intp]) -> Array:
-        """The same for windows of some rows of a vector environment, each on the map that it stands on."""
+        """The same for windows of some rows of a vector environment, each on the map that it was driven on."""
         which = None if self.standing is None else np.asarray(self.standing())[rows]
         return self.score(states, actions, which=which)
 
@@ -258,6 +260,33 @@ class Replay:
         effect, theta = self.lacks
         effect.bind(sims.model)
         return [Given(effect, slice(0, sims.n), np.tile(theta, (sims.n, 1)))]
+
+
+class Driven:
+    """() -> (n,) which map each row of a vector environment was on in its last transition.
+
+    It is noted at the physics: with same-step autoreset a row may stand on another map once its step is over.
+
+    Raises:
+      InputError: a vector environment that has no such maps.
+    """
+
+    def __init__(self, env: VectorEnv) -> None:
+        base: Any = env.unwrapped
+        if not (hasattr(base, "terrain_id") and hasattr(base, "after_hooks")):
+            raise InputError(
+                f"replay: standing is {type(base).__name__}, want a vector environment that gymnasium.make_vec makes "
+                "of this package's ids, or a callable"
+            )
+        self._ids = base.terrain_id
+        base.after_hooks.append(self._note)
+
+    def __call__(self) -> NDArray[np.intp]:
+        """Before the first step it is where the rows stand."""
+        return self._ids
+
+    def _note(self, env: Any) -> None:
+        self._ids = env.terrain_id
 
 
 def told(machine: Machine) -> NDArray[np.bool_]:

@@ -148,7 +148,7 @@ class _Robot:
             self.due = now
         elif now < self.time:
             raise InputError(f"time {now:g} s is before the last update's {self.time:g} s; reset in between")
-        else:
+        elif now > self.time:  # no draws for no time: a second look at one moment changes nothing that comes later
             walk = np.array([self.camera.drift] * 3 + [self.camera.yaw_drift]) * np.sqrt(now - self.time)
             self.drift += walk * self.rng.standard_normal(4)
         self.time = now

@@ -1,6 +1,8 @@
 """What all wrappers share: recorded arguments, pickling, random numbers, and the checks on what is wrapped."""
 
+import operator
 import os
+from collections.abc import Iterable, Iterator
 from typing import Any
 from zlib import crc32
 
@@ -76,18 +78,22 @@ class _Common(RecordConstructorArgs):
         """Whether the wrapper writes what `order` says that only one may; some do so only with certain arguments."""
         return True
 
+    def own_seed(self, seed: Any) -> Any:
+        """The one seed that the wrapper's own stream follows from."""
+        return seed
+
     def stream(self, seed: Any) -> np.random.Generator:
         """The generator of the coming episode: anew from a seed, else as it goes on from the last episode."""
+        seed = self.own_seed(seed)
         if seed is None and self.rng is not None:
             return self.rng
         if seed is None:  # never seeded: what the environment has, which makes itself a seed where it has none
-            seed = self.env.unwrapped.np_random_seed
-        if isinstance(seed, list | tuple):  # one a row: the first that is given counts
-            seed = next((s for s in seed if s is not None), None)
-        if not isinstance(seed, int | np.integer) or seed < 0:  # the environment refuses what is no seed
-            entropy = None
-        else:
-            entropy = [int(seed), crc32(kind(self).encode()), self._depth]
+            seed = self.own_seed(self.env.unwrapped.np_random_seed)
+        try:
+            own = operator.index(seed)
+        except TypeError:
+            own = -1  # the environment refuses what is no seed
+        entropy = None if own < 0 else [own, crc32(kind(self).encode()), self._depth]
         self.rng = np.random.default_rng(entropy)
         return self.rng
 
@@ -119,6 +125,11 @@ class VectorEnvWrapper(_Common, VectorWrapper):
         self.require(env)
         self._open(env, arguments)
         VectorWrapper.__init__(self, env)
+
+    def own_seed(self, seed: Any) -> Any:
+        """Of the rows' seeds the first that is given; what can be read only once is left for the environment."""
+        several = isinstance(seed, Iterable) and not isinstance(seed, str | Iterator) and getattr(seed, "ndim", 1)
+        return next((s for s in seed if s is not None), None) if several else seed
 
     @classmethod
     def require(cls, env: Any) -> None:

@@ -25,7 +25,7 @@ from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.belief import Belief
 from nfc_gym.wrappers.dynamics import Injection, Mode, checked_mode, component_names
-from nfc_gym.wrappers.order import PSI, TERRAIN
+from nfc_gym.wrappers.order import PSI, TERRAIN, beneath
 from nfc_gym.wrappers.psi import Psi, Space, space_of
 from nfc_gym.wrappers.simulation import Simulation, simulation_of
 from nfc_gym.wrappers.source import Source, sampler_of
@@ -93,9 +93,9 @@ class Hallucinate(_Hallucinating, EnvWrapper):
       space: psi of an environment that has none of its own, as for `RandomizePsi`.
       mode, components: of delta_s, as for `ResidualDynamics`; entries that are no physical state are left out.
 
-    Where the posterior speaks of delta_e, the first step begins the episode again from the same draws, on the ground
-    that was asked for. The action's layout is (own, psi, modes, delta_s): `belief` has the sizes; `fidelity` is what
-    holds.
+    Where the posterior speaks of delta_e, the first step begins the episode again from the same draws, those of the
+    environment and of this package's wrappers beneath, on the ground that was asked for. The action's layout is
+    (own, psi, modes, delta_s): `belief` has the sizes; `fidelity` is what holds.
     """
 
     def __init__(
@@ -149,10 +149,14 @@ class Hallucinate(_Hallucinating, EnvWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in the posterior's mean."""
         self._chosen = False
-        state = copy.deepcopy(self.env.unwrapped.np_random.bit_generator.state) if seed is None else None
-        self._again = (seed, options, state)
+        self._again = (seed, options, self._draws() if seed is None else None)
         self._h = np.zeros(self.belief.size)
         return self._begin(seed, options)
+
+    def _draws(self) -> tuple[Any, list[tuple[EnvWrapper, np.random.Generator | None]]]:
+        """Where the environment's generator stands, and the streams of the wrappers beneath."""
+        streams = [(w, copy.deepcopy(w.rng)) for w in beneath(self.env) if isinstance(w, EnvWrapper)]
+        return copy.deepcopy(self.env.unwrapped.np_random.bit_generator.state), streams
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
         world = self.fidelity
@@ -186,9 +190,11 @@ class Hallucinate(_Hallucinating, EnvWrapper):
     def _enter(self) -> None:
         """Psi and ground of the episode, as its first action has chosen them."""
         if self.ground is not None:
-            seed, options, state = self._again
-            if state is not None:
-                self.env.unwrapped.np_random.bit_generator.state = state
+            seed, options, draws = self._again
+            if draws is not None:
+                self.env.unwrapped.np_random.bit_generator.state, streams = draws
+                for wrapper, stream in streams:
+                    wrapper.rng = stream
             self._begin(seed, options)
             return
         self._made = self.belief.held_part(self._h[: self.belief.held], self.beta)

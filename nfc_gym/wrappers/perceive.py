@@ -90,6 +90,7 @@ class PerceiveTerrain(EnvWrapper):
         self.map = terrain.PerceivedMap(camera_of(noise))
         own = hasattr(env.unwrapped, "perceived")
         self.ground = None if own else read_ground(self.sim.nominal, "PerceiveTerrain")
+        self._time = -np.inf
         self.observation_space = with_map(env.observation_space)
 
     @property
@@ -105,14 +106,16 @@ class PerceiveTerrain(EnvWrapper):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step and look."""
-        observation, *rest = self.env.step(action)
-        return self._look(observation), *rest
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._look(observation, bool(terminated)), reward, terminated, truncated, info
 
-    def _look(self, observation: Any) -> dict[str, Any]:
+    def _look(self, observation: Any, ends: bool = False) -> dict[str, Any]:
         data, at = self.env.unwrapped.data, self.at
+        # A simulation that came apart ends its episode at rest, with its clock at 0: no time passes for the camera.
+        self._time = max(data.time, self._time) if ends else data.time
         ground = self.ground if self.ground is not None else self.env.unwrapped.perceived
         quat = data.qpos[at + 3 : at + 7]
-        return _seen(observation, self.map.update(ground, data.qpos[at : at + 3], quat, yaw(quat), data.time))
+        return _seen(observation, self.map.update(ground, data.qpos[at : at + 3], quat, yaw(quat), self._time))
 
 
 class VectorPerceiveTerrain(VectorEnvWrapper):
@@ -127,6 +130,7 @@ class VectorPerceiveTerrain(VectorEnvWrapper):
         self.rows = Rows(env)
         self.at = base_joint(self.sim.nominal, type(env.unwrapped).__name__)
         self.map = terrain.PerceivedMap(camera_of(noise), env.num_envs)
+        self._time = np.full(env.num_envs, -np.inf)
         self._stepping, self._ends = False, None
         self.sim.on_reset.add(self._end)
         self.single_observation_space = with_map(env.single_observation_space)
@@ -169,12 +173,15 @@ class VectorPerceiveTerrain(VectorEnvWrapper):
 
     def _forget(self, rows: NDArray[np.bool_]) -> None:
         new = iter(self.stream(None).spawn(int(rows.sum())))
+        self._time[rows] = -np.inf
         self.map.reset([next(new) if row else None for row in rows], rows)  # type: ignore[misc]
 
     def _maps(self, rows: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """(k, 128, 128) what robots see now, all or those of some rows."""
         base, at = self.env.unwrapped, self.at
         self.sim.look_again()
-        qpos, time = self.sim.qpos, self.sim.bind("time")
+        qpos = self.sim.qpos
+        # See `PerceiveTerrain`; only a simulation that came apart has its clock put back.
+        self._time = np.maximum(self.sim.bind("time"), self._time)
         quat = qpos[:, at + 3 : at + 7]
-        return self.map.update(base.perceived, qpos[:, at : at + 3], quat, yaw(quat), time, rows)
+        return self.map.update(base.perceived, qpos[:, at : at + 3], quat, yaw(quat), self._time, rows)

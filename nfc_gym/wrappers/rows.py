@@ -25,7 +25,7 @@ class Rows:
     def reset(self, options: Any) -> Mask:
         """Rows that a `reset` with these options begins anew."""
         mask = (options or {}).get("reset_mask")
-        new = np.ones(self.n, bool) if mask is None else np.asarray(mask, bool)
+        new = np.ones(self.n, bool) if mask is None else np.array(mask, bool)  # a copy: the caller may write to its own
         self.done = self.done & ~new
         return new
 

@@ -14,7 +14,7 @@ from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
 from nfc_gym.simulate.trials import trials
 from nfc_gym.terrain import make
-from nfc_gym.wrappers import MonitorAnomaly
+from nfc_gym.wrappers import MonitorAnomaly, VectorMonitorAnomaly
 
 JACKAL = "nfc_gym/JackalFlat-v0"
 
@@ -153,7 +153,7 @@ def test_every_row_of_a_vector_environment_is_replayed_on_its_own_ground() -> No
     noise = Machine("nfc_gym/JackalRough-v0").noise
     own, other = (
         WindowDetector(Replay("nfc_gym/JackalRough-v0", ground=inner.maps, standing=who))
-        for who in (lambda: inner.terrain_id, lambda: 1 - inner.terrain_id)
+        for who in (env, lambda: 1 - inner.terrain_id)
     )
     for t in range(50):
         action = np.array([[0.8, 0.3 * np.sin(t / 9)], [0.8, -0.3 * np.sin(t / 9)]], np.float32)
@@ -174,3 +174,44 @@ def test_several_maps_ask_for_whose_is_whose() -> None:
         several.score(*windows)
     with pytest.raises(InputError, match="0 to 1"):
         several.score(*windows, which=np.array([2]))
+
+
+class Where(Replay):
+    """Scores a window by the map that it would be replayed on, 1 to as many as there are."""
+
+    def score(self, states, actions, start=None, which=None):
+        return 1.0 + which
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
+def test_an_episodes_last_window_is_replayed_on_the_ground_that_it_was_driven_on(mode: str) -> None:
+    """Also where the row stands on the next episode's already, as after a step that resets it."""
+    made = {"context": ["psi"], "terrain_pool": 4, "autoreset_mode": mode, "max_episode_steps": 50}
+    env = gymnasium.make_vec("nfc_gym/JackalRough-v0", num_envs=3, **made)
+    inner, scored = env.unwrapped, 0
+    where = Where("nfc_gym/JackalRough-v0", draws=2, ground=inner.maps, standing=env)
+    env = VectorMonitorAnomaly(env, WindowDetector(where), threshold=9.0)
+    env.reset(seed=3)
+    for _ in range(2):
+        done, moved, last = np.zeros(3, bool), np.zeros(3, bool), {}
+        while not done.all():
+            ground = inner.terrain_id
+            _, _, terminated, truncated, info = env.step(np.zeros((3, 2)))
+            done = terminated | truncated
+            last = info["final_info"] if mode == "SameStep" and done.any() else info
+            moved = inner.terrain_id != ground
+        np.testing.assert_array_equal(last["anomaly_score"], 1.0 + ground)
+        assert moved.any() == (mode == "SameStep"), "other seeds would prove nothing"
+        scored += 1
+        if mode == "NextStep":
+            env.step(np.zeros((3, 2)))
+        elif mode == "Disabled":
+            env.reset()
+    assert scored == 2
+
+
+def test_rows_whose_maps_nobody_knows_are_refused() -> None:
+    maps = [make("rough", 0.3, seed) for seed in (0, 1)]
+    others = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")])
+    with pytest.raises(InputError, match="standing is SyncVectorEnv, want a vector environment that"):
+        Replay("nfc_gym/JackalRough-v0", draws=2, ground=maps, standing=others)

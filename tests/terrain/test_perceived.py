@@ -297,3 +297,16 @@ def test_some_robots_of_a_batch_look_while_the_others_wait() -> None:
         whole, part = both.update(FLAT, *pose, time), one.update(FLAT, *pose, time, np.array([False, True]))
         np.testing.assert_array_equal(part, whole[1:])
     np.testing.assert_array_equal(one.valid.any((1, 2)), [False, True])
+
+
+def test_a_second_look_at_one_moment_changes_nothing_that_comes_later() -> None:
+    once, twice = PerceivedMap(), PerceivedMap()
+    for each in (once, twice):
+        each.reset(np.random.default_rng(0))
+    rough = make("rough", 0.5, 0)
+    for k in range(6):
+        for again in range(2):
+            seen = twice.update(rough, (0.1 * k, 0, 0.6), LEVEL, 0.0, 0.05 * k)
+            if not again:
+                first = once.update(rough, (0.1 * k, 0, 0.6), LEVEL, 0.0, 0.05 * k)
+            np.testing.assert_array_equal(seen, first)

@@ -12,7 +12,7 @@ from scipy.special import ndtr, ndtri
 import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
-from nfc_gym.wrappers import ApplyEffects, Hallucinate, PerturbSignals, RandomizePsi
+from nfc_gym.wrappers import ApplyEffects, Hallucinate, PerturbSignals, RandomizePsi, ResidualDynamics
 from nfc_gym.wrappers.belief import Belief
 
 SPACE = ParameterSpace(
@@ -152,6 +152,22 @@ def test_ground_is_chosen_by_the_first_action_from_the_same_start() -> None:
         np.testing.assert_array_equal(before["psi"], after["psi"])
         # And sees the ground as before.
         np.testing.assert_array_equal(base.perceived.heights, seen)
+
+
+def test_the_wrappers_beneath_begin_again_from_the_same_draws_too() -> None:
+    rng = np.random.default_rng(0)
+    env = gym.make("nfc_gym/JackalRough-v0", terrain_pool=2, context=["psi"])
+    residual = ResidualDynamics(env, 0.01 * rng.standard_normal((9, 15)))
+    signals = PerturbSignals(residual, {"proprio": {"bias_sd": 0.5, "sd": 0.1}})
+    env = Hallucinate(signals, Fidelity(delta_e=0.001 * rng.standard_normal((16, 256, 256))), modes=2, samples=16)
+    biases = []
+    for seed in (None, 0, None, None):
+        env.reset(seed=seed)
+        before = signals.channels["proprio"].total.copy(), residual.injection.bias.copy()
+        env.step(np.zeros(env.action_space.shape))
+        same(before, (signals.channels["proprio"].total, residual.injection.bias))
+        biases.append(before[0][0])
+    assert len(set(biases)) == 4, "each episode has its own"
 
 
 def test_spec_and_pickle(tmp_path: Path) -> None:

@@ -181,3 +181,16 @@ def test_a_last_observation_takes_nothing_from_the_other_rows() -> None:
             error = info["final_obs"][0] - [2.0, 20.0]
             assert (abs(error) > 0).all()
             assert (abs(error) < 0.6).all()
+
+
+def test_a_mask_that_its_owner_clears_afterwards_was_a_mask() -> None:
+    mode = gym.vector.AutoresetMode.DISABLED
+    env = VectorPerturbSignals(gym.vector.SyncVectorEnv([Counting] * 2, autoreset_mode=mode), {"action": {"delay": 3}})
+    env.reset()
+    for _ in range(5):
+        env.step(np.ones((2, 1), np.float32))
+    mask = np.array([True, False])
+    env.reset(options={"reset_mask": mask})
+    mask[:] = False
+    observation, *_ = env.step(np.full((2, 1), -1, np.float32))
+    np.testing.assert_array_equal(observation["action"], [[-1], [1]])  # a new episode's first command, and a late one

@@ -224,6 +224,91 @@ def test_rows_see_with_cameras_of_their_own() -> None:
     assert (observation["elevation"][0] != observation["elevation"][1]).any()
 
 
+def test_a_row_sees_what_it_would_see_if_no_other_were_reset() -> None:
+    seen = []
+    for part in (False, True):
+        made = gym.make_vec("nfc_gym/JackalRough-v0", num_envs=3, autoreset_mode="Disabled", terrain_pool=2)
+        envs, rng, maps = VectorPerceiveTerrain(made), np.random.default_rng(0), []
+        envs.reset(seed=0)
+        for t in range(16):
+            if part and t == 7:
+                again, _ = envs.reset(options={"reset_mask": np.array([False, True, False])})
+                same(again["elevation"][[0, 2]], maps[-1])
+            maps.append(envs.step(rng.uniform(-1, 1, (3, 2)))[0]["elevation"][[0, 2]])
+        seen.append(maps)
+    same(*seen)
+
+
+@pytest.mark.parametrize("mode", [None, *gym.vector.AutoresetMode])
+def test_a_simulation_that_comes_apart_ends_an_episode_and_not_the_run(mode: gym.vector.AutoresetMode | None) -> None:
+    """It is at rest in its last observation, its clock put back: the camera's is not."""
+    arguments = {"context": ["psi"], "terrain_pool": 2}
+    env = (
+        PerceiveTerrain(gym.make(ROUGH_ID, **arguments))
+        if mode is None
+        else VectorPerceiveTerrain(gym.make_vec(ROUGH_ID, num_envs=2, autoreset_mode=mode, **arguments))
+    )
+    env.reset(seed=0)
+    still = np.zeros(env.action_space.shape)
+    for _ in range(5):
+        env.step(still)
+    base = env.unwrapped
+    (base.data.qvel if mode is None else base.batch.bind("qvel")[1])[0] = 1e6
+    observation, _, terminated, _, info = env.step(still)
+    np.testing.assert_array_equal(terminated, True if mode is None else [False, True])
+    if mode is gym.vector.AutoresetMode.SAME_STEP:
+        assert np.isfinite(info["final_obs"][1]["elevation"]).all()
+    if mode is None:
+        env.reset()
+    elif mode is gym.vector.AutoresetMode.DISABLED:
+        env.reset(options={"reset_mask": np.array([True, False])})  # the other one still waits
+        env.reset(options={"reset_mask": np.array([False, True])})
+    for _ in range(12):
+        assert np.isfinite(observation["elevation"]).all()
+        observation, _, terminated, *_ = env.step(still)
+        assert not np.any(terminated)
+    assert env.valid.any((-2, -1)).all(), "the next episode's camera sees"
+
+
+NOISE = {"proprio": {"sd": 0.1}}
+SEEDS = [range(4, 7), np.arange(4, 7), list(np.arange(4, 7)), (4, 5, np.int32(6)), np.int64(4), 4]
+
+
+@pytest.mark.parametrize("seed", SEEDS, ids=lambda s: type(s).__name__)
+def test_seeds_of_any_kind_are_those_of_the_wrappers_too(seed: Any) -> None:
+    def drawn(seed: Any) -> tuple[Any, ...]:
+        envs = VectorPerturbSignals(VectorRandomizePsi(_vector(), 0.5), NOISE)
+        return envs.reset(seed=seed)[0], envs.step(np.zeros((N, 2)))[0]
+
+    same(drawn(seed), drawn([4, 5, 6]))
+
+
+@pytest.mark.parametrize(
+    ("seed", "message"),
+    [
+        (range(2), r"seed is range\(0, 2\), which holds 2 seeds, want one for each of 3"),
+        ([0, 1.5, 2], r"seed\[1\] is 1\.5, want a whole number, or None"),
+        (np.zeros(3), r"seed\[0\] is .*0\.0.*, want a whole number"),
+        (np.zeros((3, 1)), r"seed\[0\] is array\(\[0\.\]\), want a whole number"),
+        (2.5, r"seed is 2\.5, want a whole number, or one for each of 3"),
+        (np.array(2.5), r"seed is array\(2\.5\), want a whole number"),
+        ("012", "seed is '012', want a whole number"),
+        (iter([0, 1, 2]), "seed is <list_iterator .*, want a whole number"),
+    ],
+)
+@pytest.mark.parametrize("wrap", [lambda e: e, lambda e: VectorPerturbSignals(e, NOISE)], ids=["bare", "wrapped"])
+def test_what_are_no_seeds_is_told(wrap: Any, seed: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        wrap(_vector()).reset(seed=seed)
+
+
+def test_rows_without_a_seed_go_on() -> None:
+    """A list of nothing is no seed: neither the rows' generators nor the wrapper's begin anew."""
+    one, two = (VectorPerturbSignals(_vector(), NOISE) for _ in range(2))
+    same(one.reset(seed=0)[0], two.reset(seed=[0, 1, 2])[0])
+    same(one.reset()[0], two.reset(seed=[None] * N)[0])
+
+
 def test_each_row_holds_what_its_own_first_action_said() -> None:
     rng = np.random.default_rng(0)
     space = _vector().unwrapped.psi_space
