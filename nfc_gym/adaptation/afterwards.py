@@ -15,15 +15,15 @@ Both are judged on trajectories that nothing was learned from, and stay as they 
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from torch import nn
+from torch import Tensor
 
 from nfc_gym.adaptation import normal as normality
 from nfc_gym.adaptation import resume
@@ -37,15 +37,19 @@ from nfc_gym.inference.contrast import Contrast
 from nfc_gym.inference.data import WindowSet
 from nfc_gym.inference.detector import WindowDetector
 from nfc_gym.inference.jobs import device_of
+from nfc_gym.inference.learner import Learner
 from nfc_gym.inference.posterior import NeuralPosterior, load
 from nfc_gym.inference.progress import Spoken, quiet
 from nfc_gym.inference.rates import Threshold
 from nfc_gym.inference.train import TrainConfig
+from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.simulate.machine import MOTOR, full_id
+from nfc_gym.simulate.replay import Replay
 
 Array = NDArray[np.float64]
 REPORT, STATE = "learned.json", "state.safetensors"
 RATE = 0.05  # false-positive rate of windows, where a detector does not say which it was set for
+_TOLD = 256  # windows by which a set is told from another of its size
 _TRAINING = TrainConfig(epochs=20, batch=128, rate=1e-4, warmup=20, average=0.99, patience=5)
 
 
@@ -108,7 +112,8 @@ def learn_from_mission(
         forgotten.
       config: see `LearnConfig`.
       folder: where what was learned is kept, and from where the same call goes on when it was interrupted; default
-        `learned` in the mission's folder. A data set without one keeps nothing.
+        `learned` in the mission's folder. A data set without one keeps nothing. What a detector came to whose scorer is
+        neither a `Contrast` nor a `Replay` is found anew each time.
       jobs: processes of simulation; 0 takes all cores.
       device: of training: auto, cpu or cuda.
       console: is told.
@@ -121,10 +126,7 @@ def learn_from_mission(
     old = load(posterior) if isinstance(posterior, str | Path) else posterior
     watch = detector_file.load(detector) if isinstance(detector, str | Path) else detector
     _check(old, watch)
-    of = _described(trajectories, old, watch, config) | {
-        "environment": environment, "normal": getattr(normal, "__qualname__", type(normal).__name__),
-        "beside": None if beside is None else len(beside),
-    }  # fmt: skip
+    of = _described(trajectories, old, watch, normal, beside, config) | {"environment": environment}
     done = None if folder is None else _finished(folder, of, old, watch)
     if done is not None:
         return done
@@ -134,13 +136,13 @@ def learn_from_mission(
         rate = config.rate or (watch.calibration.rate if watch.calibration else RATE)
         out.detector, report["detector"] = normality.tuned(
             watch, trajectories, normal, rate, training=config.training, beside=beside,
-            folder=_part(folder, "detector"), report=told, seed=config.seed, device=device_of(device),
+            folder=_part(folder, "detector", of), report=told, seed=config.seed, device=device_of(device),
         )  # fmt: skip
         told.message(_says("detector", report["detector"]))
     if old is not None:
         out.posterior, report["posterior"] = relearned(
             old, trajectories, environment, simulations=config.simulations, effects=config.effects,
-            motor=config.motor, training=config.training, beside=beside, folder=_part(folder, "posterior"),
+            motor=config.motor, training=config.training, beside=beside, folder=_part(folder, "posterior", of),
             report=told, seed=config.seed, jobs=jobs, device=device_of(device),
         )  # fmt: skip
         told.message(_says("posterior", report["posterior"]))
@@ -184,26 +186,67 @@ def _mission(
 
 def _described(
     trajectories: Sequence[Trajectory], posterior: NeuralPosterior | None, detector: WindowDetector | None,
-    config: LearnConfig,
+    normal: Normal, beside: WindowSet | None, config: LearnConfig,
 ) -> dict[str, Any]:  # fmt: skip
-    """What another call must have in common with this one to go on from it."""
-    digest = hashlib.sha256()
-    for t in trajectories:
-        digest.update(t.states.tobytes() + t.actions.tobytes() + t.scores.tobytes())
-    for net in (posterior and posterior.network, detector and detector.scorer):
-        if isinstance(net, nn.Module):
-            for tensor in net.state_dict().values():
-                digest.update(tensor.detach().cpu().numpy().tobytes())
-    parts = {"posterior": posterior is not None, "detector": detector is not None}
-    plain = {**asdict(config), **parts, "trajectories": len(trajectories), "digest": digest.hexdigest()[:16]}
-    return json.loads(json.dumps(plain))
+    """What another call must have in common with this one to go on from it; None is a detector that nobody can tell."""
+    told = {"posterior": "none", "detector": "none", "normal": "none", "beside": "none"}
+    told |= {"trajectories": _digest(*(np.asarray(getattr(t, f.name)) for t in trajectories for f in fields(t)))}
+    if posterior is not None:
+        told["posterior"] = _digest(*_network(posterior.network), posterior.parts)
+    if detector is not None:
+        # The flags themselves: two functions may share a name.
+        told |= {"detector": _detector(detector), "normal": _digest(*(np.asarray(normal(t)) for t in trajectories))}
+    if beside is not None:
+        first = next(iter(beside.batches(min(len(beside), _TOLD), None)), {})
+        told["beside"] = _digest(len(beside), *_flat(first))
+    return json.loads(json.dumps({**asdict(config), **told}))
 
 
-def _part(folder: Path | None, name: str) -> Path | None:
+def _digest(*parts: Any) -> str:
+    """What tells things from others: arrays by type, shape and content, anything else as it is printed."""
+    sha = hashlib.sha256()
+    for part in parts:
+        x = part.detach().cpu().numpy() if isinstance(part, Tensor) else part
+        told, content = ((x.dtype, x.shape), x.tobytes()) if isinstance(x, np.ndarray) else (x, b"")
+        sha.update(repr(told).encode() + content)
+    return sha.hexdigest()[:16]
+
+
+def _flat(tensors: Mapping[str, Tensor]) -> list[Any]:
+    return [part for pair in tensors.items() for part in pair]
+
+
+def _network(net: Learner) -> list[Any]:
+    return [net.config, net.prior.to_dict(), *_flat(net.state_dict())]
+
+
+def _detector(detector: WindowDetector) -> str | None:
+    """What tells it from others, or None: nobody knows what a scorer of another kind is made of."""
+    scorer: Any = detector.scorer
+    if type(scorer) is Contrast:
+        parts = _network(scorer)
+    elif type(scorer) is Replay:
+        parts = [scorer.machine.environment, scorer.psi, scorer.jitter, scorer.start, scorer.eps]
+        parts += [part for m in scorer.maps for part in (m.heights, m.resolution, m.origin)]
+        if scorer.lacks is not None:
+            row = to_row(*scorer.lacks)
+            try:
+                from_row(row)
+            except InputError:  # an effect of the caller's own, of which a row does not say everything
+                return None
+            parts.append(row)
+    else:
+        return None
+    return _digest(detector.every, detector.threshold, detector.calibration, *parts)
+
+
+def _part(folder: Path | None, name: str, of: dict[str, Any]) -> Path | None:
+    """Where training keeps its state: what was interrupted goes on under the same arguments alone."""
     if folder is None:
         return None
-    (folder / name).mkdir(parents=True, exist_ok=True)
-    return folder / name
+    part = folder / name / _digest(of)
+    part.mkdir(parents=True, exist_ok=True)
+    return part
 
 
 def _says(what: str, found: dict[str, Any]) -> str:
@@ -228,7 +271,7 @@ def _keep(folder: Path, out: Learned) -> None:
 def _finished(
     folder: Path, of: dict[str, Any], posterior: NeuralPosterior | None, detector: WindowDetector | None
 ) -> Learned | None:
-    """What an earlier call came to, if it ended.
+    """What an earlier call came to, if it ended and nothing that it depends on is unknown.
 
     Raises:
       InputError: it was about something else.
@@ -245,6 +288,8 @@ def _finished(
         raise InputError(
             f"{path} is of another mission or other settings ({', '.join(differ)}): remove the folder, or use another"
         )
+    if of["detector"] is None:
+        return None
     out = Learned(posterior, detector, report)
     if posterior is not None and report["posterior"]["changed"]:
         out.posterior = load(folder / "posterior.safetensors", posterior.prior)

@@ -43,8 +43,18 @@ class Parameters(Effect):
 
     def __init__(self, given: Sequence[Calibrated]) -> None:
         self.given = tuple(given)
-        params = [Param(p.name, p.unit, p.low, p.high) for p in given]
+        params = [Param(p.name, p.unit, -_ANY, _ANY) for p in given]
         super().__init__([w for p in given for w in p.of] or ["world"], params)
+
+    @property
+    def low(self) -> Array:
+        """(k,) the least that nature allows: intervals are no bounds, as draws may be wider. Of a bound effect."""
+        return self.space.least
+
+    @property
+    def high(self) -> Array:
+        """(k,) the most that nature allows."""
+        return self.space.most
 
     def bind(self, model: mujoco.MjModel) -> None:
         """See `Effect`."""

@@ -144,11 +144,17 @@ class Extension:
     def _read_psi(self, theirs: mujoco.MjModel) -> None:
         """Psi as a corrected model has it."""
         for i, p in enumerate(self.space.parameters):
-            if p.field == _RESTITUTION or p.name in self.found.psi:
+            if p.field == _RESTITUTION:
                 continue
             value = value_in(theirs, p)
-            if not np.isclose(value, self.space.nominal[i], rtol=1e-6):
-                self.psi[i] = self.psi_low[i] = self.psi_high[i] = value
+            if np.isclose(value, self.space.nominal[i], rtol=1e-6):
+                continue
+            if p.name in self.found.psi and not np.isclose(value, self.psi[i], rtol=1e-6):
+                raise InputError(
+                    f"psi is said to have {p.name} = {self.psi[i]:g}, and {self.found.model} has {value:g}; "
+                    "leave one of the two out"
+                )
+            self.psi[i] = self.psi_low[i] = self.psi_high[i] = value
 
     def _moved(self, left: Sequence[Calibrated]) -> tuple[str, ...]:
         off = ~np.isclose(self.psi, self.space.nominal, rtol=1e-6)
@@ -191,38 +197,35 @@ class Extension:
 
         Args:
           n: how many.
-          vary: sizes are uniform over this multiple of their 95 % intervals, psi anew in each episode, effects one in
-            each simulation; 0 is the fitted sizes in all.
+          vary: sizes are uniform over this multiple of their 95 % intervals, psi anew in each episode, the rest one in
+            each simulation; 0 is the fitted sizes in all. Parameters go as far as nature allows, effects as a fit may.
           seed: of these draws.
           episode, threads, settings: as `vector_env`.
         """
         envs = vector_env(self.environment, n, threads=threads, episode=episode, **(settings or {}))
         rng = np.random.default_rng(seed)
         if not np.allclose(self.psi, self.space.nominal, rtol=1e-9):
-            psi = _drawn(self.psi, self.psi_low, self.psi_high, vary, _DRAWS, rng, self._ties) if vary else self.psi
-            envs = VectorRandomizePsi(envs, np.where(self._massive, np.maximum(psi, 1e-6), psi))
+            psi, allowed = self.psi, (self.space.least, self.space.most)
+            if vary:
+                psi = _drawn(psi, self.psi_low, self.psi_high, allowed, vary, _DRAWS, rng, self._ties)
+            envs = VectorRandomizePsi(envs, psi)
         acting = [*self.rest, *((e.effect, e.theta, e.low, e.high) for e in self.effects)]
         if not acting:
             return envs
-        values = [_drawn(theta, low, high, vary, n, rng) for _, theta, low, high in acting]
-        values = [_within(e, theta, v) for (e, theta, *_), v in zip(acting, values, strict=True)]
+        values = [_drawn(theta, low, high, (e.low, e.high), vary, n, rng) for e, theta, low, high in acting]
         return VectorApplyEffects(envs, [(e, t) for e, t, *_ in acting], self.signals, values=values)
-
-    @property
-    def _massive(self) -> NDArray[np.bool_]:
-        return np.array([p.field == "body_mass" for p in self.space.parameters])
 
 
 def _drawn(
-    value: Array, low: Array, high: Array, vary: float, n: int, rng: np.random.Generator,
+    value: Array, low: Array, high: Array, bounds: tuple[Array, Array], vary: float, n: int, rng: np.random.Generator,
     ties: NDArray[np.intp] | None = None,
 ) -> Array:  # fmt: skip
-    """(n, k) draws, uniform over `vary` times the interval about the value; those with the same tie go together."""
+    """(n, k) draws, uniform over that part of `vary` times the interval about the value which lies inside the bounds.
+
+    To cut the interval is to draw again what falls outside: nothing piles up at a bound. A value that went beyond one
+    widens it. Those with the same tie go together.
+    """
     u = rng.random((n, len(value)))
-    low, high = value - vary * (value - low), value + vary * (high - value)
+    low = np.maximum(value - vary * (value - low), np.minimum(bounds[0], value))
+    high = np.minimum(value + vary * (high - value), np.maximum(bounds[1], value))
     return low + (high - low) * (u if ties is None else u[:, ties])
-
-
-def _within(effect: Effect, theta: Array, values: Array) -> Array:
-    """Draws (n, k) inside the bounds that an effect has; a fit (k,) that went beyond widens them."""
-    return np.clip(values, np.minimum(effect.low, theta), np.maximum(effect.high, theta))

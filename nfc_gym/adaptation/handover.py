@@ -42,6 +42,7 @@ EPISODES = 100  # by which a policy is judged in each world
 POLICY, REPORT, PAGE, KEPT = "policy.safetensors", "report.json", "report.html", "judged.json"
 NOMINAL, EXTENDED, TRUE, WITHOUT = "nominal", "extended", "world", "without "
 _JUDGED = 3  # stream of random numbers
+_FUNCTION = "function"  # in place of a world's digest: nothing tells two lambdas apart, so no call recalls another's
 World = Callable[[int], VectorEnv]
 
 
@@ -59,7 +60,7 @@ def hand_over(
       out: folder for `policy.safetensors`, `report.json`, `report.html`; the same call goes on where it was stopped.
       policy: to begin with: a file, or the id of one that comes with the package; default the environment's.
       world: what plays the real machine: of the same kinds as `effects`, or n -> a vector environment of n simulations
-        without autoreset. It is judged in, never learned from.
+        without autoreset, which each call measures anew. It is judged in, never learned from.
       config: of learning.
       episodes: by which each policy is judged in each world.
       ablate: fine-tune once more without each effect, and judge that where all effects are.
@@ -91,6 +92,9 @@ def hand_over(
     limit_threads(threads)
     run = _Run(start, extension, truth, config, folder, episodes, threads,
                Record(folder / "log", console))  # fmt: skip
+    # The same finding is another model under another condition or signal.
+    constant = {name: float(value) for name, value in (signals or {}).items()}
+    run.of |= {k: v for k, v in (("condition", condition), ("signals", constant)) if v}
     adapted = run.trained(extension, folder)
     ablated = {e.id: run.trained(extension.without(e.id), folder / "without" / _safe(e.id))
                for e in extension.effects if ablate and e.acts}  # fmt: skip
@@ -123,7 +127,7 @@ def _truth(
         return None
     if callable(world):
         called = getattr(world, "__qualname__", type(world).__qualname__)
-        return _Truth(called, world, called)
+        return _Truth(called, world, _FUNCTION)
     extension = Extension(read_found(world), name, condition=condition, signals=signals)
     return _Truth(str(world), partial(extension.envs, **shape), extension.found.digest)
 
@@ -254,14 +258,15 @@ class _Run:
         return self.scores[key]
 
     def _recall(self, adapted: FineTuning) -> None:
-        """What was judged before an interruption."""
+        """What was judged before an interruption; a world that is a function is judged in anew."""
         told = [self.of, asdict(self.config), self.episodes, adapted.curve]
         self._key = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
         file = self.folder / KEPT
         if file.is_file():
             kept = json.loads(file.read_text(encoding="utf-8"))
             if kept["of"] == self._key:
-                self.scores = {k: from_plain(s) for k, s in kept["scores"].items()}
+                scores = kept["scores"].items()
+                self.scores = {k: from_plain(s) for k, s in scores if not k.endswith(f"| {TRUE} {_FUNCTION}")}
 
     def say(self, report: Mapping[str, Any]) -> None:
         """The outcome, in a few lines."""

@@ -4,6 +4,7 @@ import copy
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,11 +13,12 @@ import torch
 from carts import QUICK, cart, everything, trajectory, watcher
 
 from nfc_gym import InputError
-from nfc_gym.adaptation import learn_from_mission, load_policy
+from nfc_gym.adaptation import afterwards, learn_from_mission, load_policy
 from nfc_gym.adaptation.afterwards import LearnConfig
 from nfc_gym.adaptation.beliefs import Fixed, Sequential
-from nfc_gym.adaptation.normal import quiet_trajectories, quiet_windows, stretches, windows_of
+from nfc_gym.adaptation.normal import Normal, quiet_trajectories, quiet_windows, stretches, windows_of
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
+from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.detector import WindowDetector
@@ -26,8 +28,10 @@ from nfc_gym.inference.rates import rate_above
 from nfc_gym.inference.sequential import SequentialConfig
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
+from nfc_gym.physics.effects.saved import from_row
 from nfc_gym.simulate import Simulator
 from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.replay import Replay
 
 JACKAL, COPTER = "nfc_gym/JackalFlat-v0", "nfc_gym/QuadcopterFlat-v0"
 
@@ -75,8 +79,11 @@ class Loudest:
 
     horizon, states, actions = 10, 2, 1
 
+    def __init__(self, gain: float = 1.0) -> None:
+        self.gain = gain
+
     def score(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        return np.abs(states[:, :, 1]).max(1)
+        return self.gain * np.abs(states[:, :, 1]).max(1)
 
 
 def test_a_scorer_that_cannot_learn_gets_a_threshold() -> None:
@@ -115,6 +122,91 @@ def test_a_trajectory_with_an_alarm_is_not_normal_unless_told_so(detector: Windo
     assert told["changed"]
     with pytest.raises(InputError, match="one a control step, got"):
         learn_from_mission(loud, detector=detector, environment=JACKAL, normal=lambda t: np.ones(3, bool))
+
+
+def test_what_was_found_is_given_back_for_the_same_flags_alone(detector: WindowDetector, tmp_path: Path) -> None:
+    """Functions may share a name: what tells them apart is what they say of the mission."""
+    mission = [cart(200, k, 4.0) for k in range(3)]
+
+    def learned(normal: Normal, watch: WindowDetector = detector, beside: TensorWindows | None = None) -> Any:
+        return learn_from_mission(
+            mission, detector=watch, environment=JACKAL, normal=normal, beside=beside, folder=tmp_path
+        ).report
+
+    first = learned(lambda t: np.ones(len(t), bool))
+    assert learned(everything) == json.loads(json.dumps(first))
+    with pytest.raises(InputError, match=r"other settings \(normal\)"):
+        learned(lambda t: np.zeros(len(t), bool))
+    assert detector.calibration is not None
+    limit = replace(detector.calibration, value=0.5)
+    for other in (WindowDetector(detector.scorer, detector.calibration, 5), WindowDetector(detector.scorer, limit)):
+        with pytest.raises(InputError, match=r"other settings \(detector\)"):
+            learned(everything, other)
+    windows = {"states": torch.zeros(4, 11, 2), "actions": torch.zeros(4, 10, 1), "psi": torch.zeros(4, 2)}
+    with pytest.raises(InputError, match=r"other settings \(beside\)"):
+        learned(everything, beside=TensorWindows(windows))
+
+
+def test_training_goes_on_for_the_same_motion_alone(
+    detector: WindowDetector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was killed between training and report is not taken for training on other flags."""
+    mission = [cart(400, 2000 + k, 4.0) for k in range(16)]
+
+    def learned(first: bool, folder: Path) -> Any:
+        def half(t: Trajectory) -> np.ndarray:  # as many windows either way
+            return (np.arange(len(t)) < len(t) // 2) == first
+
+        config = LearnConfig(training=QUICK)
+        return learn_from_mission(
+            mission, detector=detector, environment=JACKAL, normal=half, config=config, folder=folder, device="cpu"
+        ).report["detector"]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(afterwards, "_keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            learned(True, tmp_path / "cut")
+    assert learned(False, tmp_path / "cut") == learned(False, tmp_path / "whole")
+
+
+def test_what_an_unknown_scorer_came_to_is_found_anew(tmp_path: Path) -> None:
+    mission = [cart(200, k, 4.0) for k in range(20)]
+    one, two = (
+        learn_from_mission(mission, detector=WindowDetector(Loudest(g)), environment=JACKAL, folder=tmp_path)
+        for g in (1.0, 2.0)
+    )
+    assert one.detector is not None
+    assert two.detector is not None
+    assert one.detector.threshold is not None
+    assert two.detector.threshold == 2 * one.detector.threshold
+
+
+def test_a_replay_under_another_belief_is_another_detector(tmp_path: Path) -> None:
+    env = gym.make(JACKAL, context=["psi"], max_episode_steps=50)
+    rng, mission = np.random.default_rng(0), []
+    for k in range(24):
+        states, actions = [env.reset(seed=k)[0]["proprio"]], rng.uniform(-1, 1, (50, 2))
+        states += [env.step(a)[0]["proprio"] for a in actions]
+        mission.append(trajectory(np.array(states, float), actions))
+    heavy = np.tile(Machine(JACKAL).space.nominal, (2, 1))
+    heavy[:, 0] *= 1.5
+    drag = {"family": "drag_linear", "where": "base", "parameters": {"x": 8.0, "y": 8.0, "z": 8.0}}
+    plain, config = Replay(JACKAL, draws=2), LearnConfig(rate=0.25)
+
+    def learned(scorer: Replay) -> Any:
+        return learn_from_mission(
+            mission, detector=WindowDetector(scorer), environment=JACKAL, config=config, folder=tmp_path
+        ).detector
+
+    found = learned(plain)
+    assert found.threshold is not None
+    assert learned(Replay(JACKAL, draws=2, nthread=2)).threshold == found.threshold
+    for other in (
+        Replay(JACKAL, Fidelity(heavy), draws=2), Replay(JACKAL, draws=2, seed=1), Replay(JACKAL, draws=3),
+        Replay(JACKAL, draws=2, motor=0.05), plain.under(np.ones(len(heavy[0])), from_row(drag)),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=r"other settings \(detector\)"):
+            learned(other)
 
 
 def flown(seed: int, steps: int = 200) -> Trajectory:
@@ -222,9 +314,10 @@ def test_rounds_of_a_trained_network_keep_its_scales(posterior: NeuralPosterior,
     )
     simulate = Simulator(COPTER, 0.0, jobs=1, names=("states", "actions"))
     seen = replace(mission[0], scores=np.arange(200.0))
-    Sequential(NeuralPosterior(network), simulate, rounds, training).updated(seen, posterior)
-    assert any((v != first[k]).any() for k, v in network.named_parameters()), "it has learned"
-    assert all(torch.equal(v, own[k]) for k, v in network.encoder.named_buffers())
+    after = Sequential(NeuralPosterior(network), simulate, rounds, training).updated(seen, posterior).posterior.network
+    assert any((v != first[k]).any() for k, v in after.named_parameters()), "it has learned"
+    assert all(torch.equal(v, own[k]) for k, v in after.encoder.named_buffers())
+    assert all(torch.equal(v, first[k]) for k, v in network.named_parameters()), "what was believed stays believed"
 
 
 def test_a_mission_too_short_for_the_posterior_is_said(mission: list[Trajectory], posterior: NeuralPosterior) -> None:

@@ -8,9 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from scipy import stats
 
 from nfc_gym import assets
-from nfc_gym.adaptation.extended import read_found
+from nfc_gym.adaptation.extended import Calibrated, Found, read_found
 from nfc_gym.adaptation.extension import Extension
 from nfc_gym.core.errors import InputError
 
@@ -106,6 +107,27 @@ def test_sizes_vary_within_their_intervals(tmp_path: Path) -> None:
     assert (kept >= 0).all()  # ten times the interval would be a loss of more than everything
 
 
+@pytest.mark.parametrize("vary", [2.0, 5.0])
+def test_wider_sizes_end_where_nature_does(vary: float) -> None:
+    """Beyond the intervals, uniformly: nothing below 0, and nothing piled up at a bound."""
+    grip = Calibrated("grip", "1", "geom_friction[0]", ("front_left_wheel",), 0.3, 0.1, 0.5)
+    rotor = Calibrated("rotor", "kg m^2", "dof_armature", ("front_left_wheel",), 0.02, 0.01, 0.03)
+    load = Calibrated("load", "kg", "body_mass", ("base",), 2.0, 0.5, 4.0)
+    envs = Extension(Found(Path("x"), parameters=(grip, rotor, load)), ID).envs(400, vary=vary, threads=1)
+    envs.reset(seed=0)
+    fields = envs.unwrapped.fields
+    model = fields.nominal_model
+    at = [model.geom("front_left_wheel").id, model.joint("front_left_wheel").dofadr[0], model.body("base").id]
+    drawn = [fields["geom_friction"][:, at[0], 0], fields["dof_armature"][:, at[1]], fields["body_mass"][:, at[2]]]
+    for values, p in zip(drawn, (grip, rotor, load), strict=True):
+        high = p.value + vary * (p.high - p.value)
+        low = max(p.value - vary * (p.value - p.low), 0.0)
+        assert len(np.unique(values)) > 350  # episodes draw psi from a few thousand
+        assert stats.kstest(values, stats.uniform(low, high - low).cdf).pvalue > 1e-3
+        assert low <= values.min()
+        assert values.max() <= high
+
+
 def test_a_model_alone_is_read_field_by_field(tmp_path: Path) -> None:
     x = found_in(corrected(tmp_path / "model.xml", front_left=3.0))
     assert x.effects == ()
@@ -126,6 +148,18 @@ def test_a_hand_written_world_has_psi_by_name(tmp_path: Path) -> None:
     assert x.moved == ("base_mass",)
     with pytest.raises(InputError, match=r"no parameter named 'bse_mass'; there are: base_mass, .*\(of nfc_gym/Jack"):
         found_in(write(tmp_path, [], psi={"bse_mass": 20.0}))
+
+
+def test_psi_by_name_and_a_model_that_say_otherwise_are_refused(tmp_path: Path) -> None:
+    corrected(tmp_path / "model.xml", front_left=3.0)
+    told = write(tmp_path, [], psi={"front_left_wheel_damping": 4.0})
+    with pytest.raises(InputError, match=r"psi is said to have front_left_wheel_damping = 4, and .*model\.xml has 3;"):
+        found_in(told)
+    x = found_in(write(tmp_path, [], psi={"front_left_wheel_damping": 3.0, "base_mass": 20.0}))
+    envs = x.envs(2, threads=1)
+    envs.reset(seed=0)
+    assert envs.unwrapped.fields["body_mass"][0, x.model.body("base").id] == pytest.approx(20.0)
+    np.testing.assert_allclose(envs.unwrapped.fields["actuator_gainprm"][0, 0, 0], 3.0)
 
 
 def test_effects_on_sensors_change_nothing_that_moves(tmp_path: Path) -> None:

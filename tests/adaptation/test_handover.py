@@ -1,6 +1,7 @@
 """`nfc-gym adapt`: from an effects.yaml to a policy and a page, resumed after a kill, refused where it cannot be."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from gymnasium.vector import VectorEnv
 from safetensors.torch import load_file
 from scipy import stats
 from typer.testing import CliRunner
@@ -20,6 +22,7 @@ from nfc_gym.adaptation.returns import figure, from_plain, gain, mean_interval, 
 from nfc_gym.adaptation.worlds import vector_env
 from nfc_gym.cli import app
 from nfc_gym.core.errors import InputError
+from nfc_gym.wrappers import VectorRandomizePsi
 
 ROWS = [
     {"family": "loss", "where": "rear_left"}
@@ -122,6 +125,18 @@ def test_a_true_world_is_judged_in_and_not_learned_from(tmp_path: Path, result: 
     assert plain["returns"]["world"] == plain["returns"]["nominal"]
 
 
+def test_functions_of_one_name_are_worlds_of_their_own(tmp_path: Path, result: Path, jackal: Path) -> None:
+    def world(**psi: tuple[float, float]) -> Callable[[int], VectorEnv]:
+        return lambda n: VectorRandomizePsi(vector_env("JackalFlat", n, threads=1, episode=40), psi)
+
+    stuck = {f"{w}_wheel_friction": (0.0, 0.0) for w in ("front_left", "front_right", "rear_left", "rear_right")}
+    easy, hard = (handed(result, tmp_path / "out", jackal, steps=512, world=w) for w in (world(), world(**stuck)))
+    fresh = handed(result, tmp_path / "fresh", jackal, steps=512, world=world(**stuck))
+    assert hard["returns"]["world"] == fresh["returns"]["world"]
+    assert hard["returns"]["world"] != easy["returns"]["world"]
+    assert hard["curve"] == easy["curve"], "what was learned is kept"
+
+
 def test_learning_that_comes_apart_keeps_the_best_weights(
     tmp_path: Path, result: Path, jackal: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +167,22 @@ def test_folders_of_others_are_left_alone(tmp_path: Path, result: Path, jackal: 
             "JackalFlat", result, tmp_path / "out", policy=jackal, threads=1,
             config=FineTuneConfig(steps=512, seed=1, **SMALL),
         )  # fmt: skip
+
+
+def test_another_condition_or_signal_is_another_run(tmp_path: Path, jackal: Path) -> None:
+    pushes = {f"push_{axis}@{day}": 40.0 * (day == "gale") for day in ("calm", "gale") for axis in "xyz"}
+    wind = {"family": "wind", "where": "base", "conditions": ["calm", "gale"], "parameters": {"drag": 1.0, **pushes}}
+    wheels = ["front_left", "front_right", "rear_left", "rear_right"]
+    sag = {"family": "supply_sag", "where": wheels, "parameters": {"exponent": 1.0, "reference": 24.0}}
+    file, out = tmp_path / "effects.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump({"version": 1, "effects": [wind, sag]}))
+    given: dict[str, Any] = {"steps": 1, "condition": "calm", "signals": {"exo:supply": 20.0}}
+    first = handed(file, out, jackal, **given)
+    assert handed(file, out, jackal, **given)["returns"] == first["returns"]
+    with pytest.raises(InputError, match=r"is of another run \(condition"):
+        handed(file, out, jackal, **{**given, "condition": "gale"})
+    with pytest.raises(InputError, match=r"is of another run \(exo:supply 20.0, now 12.0"):
+        handed(file, out, jackal, **{**given, "signals": {"exo:supply": 12.0}})
 
 
 @pytest.mark.parametrize(
