@@ -13,6 +13,7 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured import foresight
 from nfc_gym.measured.belief import Belief
 from nfc_gym.measured.dataset import Dataset
+from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.model import bare, compile_model, read_spec, registered
@@ -43,6 +44,7 @@ class Bench:
       belief: of a posterior that calibration starts from.
       compare: calibrate from nominal values too, to say what that saved.
       witness: a structure head that is asked about the fit logs, and the name of its file.
+      warned: what `check` warned of.
     """
 
     dataset: Dataset
@@ -52,6 +54,7 @@ class Bench:
     belief: Belief | None = None
     compare: bool = False
     witness: tuple[Witness, str] | None = None
+    warned: tuple[Finding, ...] = ()
 
     @property
     def mode(self) -> str:

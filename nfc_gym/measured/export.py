@@ -95,6 +95,8 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None =
     _soften(fields, whole, x)
     fields.commit()
     spec.copy_back(model)
+    for body in spec.bodies:  # which MuJoCo does not copy
+        body.gravcomp = model.body_gravcomp[body.id]
     carried = [e for e, _ in by_fields]
     carried += [e for e, t in pairs if e not in carried and not e.on_command and e.spec(spec, t)]
     outside = [e for e in effects if e not in carried and not e.on_command]

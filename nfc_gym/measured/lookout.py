@@ -9,6 +9,7 @@ from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screen, Screened, screen_all
 from nfc_gym.measured.suspects import Suspects
+from nfc_gym.measured.telling import paced
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.conditions import MARK
 
@@ -99,7 +100,7 @@ class Lookout:
         else:
             leading, look = [f for f in found[:_PURSUED] if f.gain > 0], screen.pursue
         self.say(f"looking closer at {len(leading)} of them")
-        looked = sorted(map(look, leading), key=lambda f: -f.gain)
+        looked = sorted(map(look, paced(self.say, leading)), key=lambda f: -f.gain)
         chosen = {id(f.effect) for f in looked}
         return looked + [f for f in found if id(f.effect) not in chosen]
 

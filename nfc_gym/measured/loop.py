@@ -109,8 +109,12 @@ def close_loop(
     with one_blas_thread(), untimed():
         # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
         mujoco.set_mju_user_warning(lambda message: None)
-        dataset = require(mapping)[0]
+        dataset, noticed = require(mapping)
         bench = make_bench(dataset, jobs)
+        bench.warned = tuple(f for f in noticed if f.severity == "warning")
+        if console:
+            for warning in bench.warned:
+                console.print(Text.assemble(("warning", "bold yellow"), f"  {warning}"))
         if posterior is not None:
             bench.belief, bench.compare = read_belief(posterior, bench.plant.space, seed), compare
         if witness is not None:

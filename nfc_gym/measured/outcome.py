@@ -64,7 +64,8 @@ def report(
     rows = say.effect_rows(extended, found.rounds, sd, shares)
     errors = say.errors(v)
     laws = {e.id for e in extended.plant.effects if e.generic}
-    judged = _judge(v, rows, laws, found, errors)
+    gain = say.gain_interval(v, rng)
+    judged = _judge(v, rows, laws, found, errors, gain)
     left = judged.verdict in ("unexplained", "partly explained")
     assert found.rest is not None
     parameters = say.parameter_rows(extended, nominal[1], sd)
@@ -85,10 +86,10 @@ def report(
         | {
             "null": float(v.null.mean()),
             "null_95": say.null_bound(v),
-            "extended_over_calibrated_95": say.gain_interval(v, rng),
+            "extended_over_calibrated_95": gain,
         },
         "identifiability": [],
-        "findings": on_parameters(extended, parameters),
+        "findings": [{"kind": "check", "text": f"{w}."} for w in bench.warned] + on_parameters(extended, parameters),
         "rounds": [r.__dict__ for r in (*found.rounds, *found.rest.rounds)],
         "noise": _noise(bench, fold),
         "details": details(bench, v, models, dataset.of("verify", fold))
@@ -128,18 +129,24 @@ def _judge(
     laws: Container[str],
     found: Found,
     errors: dict[str, Any],
+    gain: tuple[float, float],
 ) -> _Judged:
     """Divide what was found into causes and proposals; `laws` are the ids of those without a name.
 
-    See `doubt` for what leads its rivals by too little, `form` for what has another's form.
+    See `doubt` for what leads its rivals by too little, `form` for what has another's form. `gain` is the interval of
+    what is left of the calibrated model's chi-squared: where nothing is missing that the unseen logs show, and what was
+    found may well make no difference there, it is the cause of nothing.
     """
     named, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
     generic = found.generic is not None or bool(proposed)
-    verdict, taken = say.verdict(v, len(named), generic), say.taken_away(v, errors)
-    if verdict != "partly explained":
-        return _Judged(verdict, named, [], proposed, taken)
+    seen = gain[1] < 1 or v.chi2("calibrated") > say.null_bound(v)
+    verdict, taken = say.verdict(v, len(named) if seen else 0, generic), say.taken_away(v, errors)
     # What is weak predicts, and stays in the model; that it is the cause of what is missing is not shown.
     every = [r | {"nearest": True, "alike": found.doubted.get(r["id"], [])} for r in named]
+    if not seen:
+        return _Judged(verdict, [], every, proposed, taken)
+    if verdict != "partly explained":
+        return _Judged(verdict, named, [], proposed, taken)
     every = [r | ({"mended_by": by} if (by := found.misshapen.get(r["id"])) else {}) for r in every]
     weak = every if taken < say.CAUSE else [r for r in every if r["alike"] or "mended_by" in r]
     causes = [r for r in named if r["id"] not in {w["id"] for w in weak}]

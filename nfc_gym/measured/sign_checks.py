@@ -28,6 +28,7 @@ OFTEN, WORSE = 0.9, 0.05  # of the roll-outs, which a turn must make no worse th
 ALIKE = 1.5  # times the least error, up to which another turn explains it as well
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
+_ON_AXES = [int(getattr(mujoco.mjtSensor, f"mjSENS_{s}")) for s in ("ACCELEROMETER", "GYRO", "VELOCIMETER")]
 _NED = np.array([1.0, -1.0, -1.0])  # from north-east-down and forward-right-down: half a turn about x, on both sides
 _NED_QUAT = np.array([1.0, 1.0, -1.0, -1.0])
 
@@ -131,11 +132,15 @@ def _turns(bench: Bench) -> Iterator[_Turn]:
     for j in np.flatnonzero(model.jnt_type == _FREE):
         body, q, v = model.body(int(model.jnt_bodyid[j])).name, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
         measured = {name: _ned(name, c) for name, c in channels.items() if name.startswith(f"body:{body}:")}
+        carried = {name: c for name, c in channels.items() if _reads_axes(model, name, int(model.jnt_bodyid[j]))}
         if measured:
             qpos = dict(enumerate([*_NED, *_NED_QUAT], q))
             where, what = f"channels.{next(iter(measured))}", f"the frame of {body!r} (north-east-down?)"
             qvel = dict(enumerate([*_NED, *_NED], v))
             yield _Turn(where, what, advice, "", qpos=qpos, qvel=qvel, measured=measured)
+            if carried:  # sensors on the body whose axes are forward-right-down as well
+                all_of = measured | {name: _ned(name, c) for name, c in carried.items()}
+                yield _Turn(where, f"{what} and its sensors", advice, "", qpos=qpos, qvel=qvel, measured=all_of)
 
 
 def _driven(bench: Bench, key: str, actuator: int) -> str:
@@ -147,6 +152,16 @@ def _driven(bench: Bench, key: str, actuator: int) -> str:
     if int(model.actuator_trntype[actuator]) != _JOINT or int(model.jnt_type[joint]) == _FREE:
         return ""
     return f"joint:{model.joint(joint).name}"
+
+
+def _reads_axes(model: mujoco.MjModel, name: str, body: int) -> bool:
+    """Whether a channel is a sensor whose numbers are along a body's own axes."""
+    parsed = parse_channel(name)
+    at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, parsed.object) if parsed.kind == "sensor" else -1
+    if at < 0 or int(model.sensor_type[at]) not in _ON_AXES:
+        return False
+    site = int(model.sensor_objid[at])
+    return int(model.site_bodyid[site]) == body and bool(np.isclose(abs(model.site_quat[site, 0]), 1))
 
 
 def _ned(name: str, channel: Channel) -> Array:

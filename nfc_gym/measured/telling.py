@@ -4,7 +4,8 @@ They quote names of models and files, in which `:x:` and `[a]` are no emoji and 
 """
 
 import time
-from typing import Protocol
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol, TypeVar
 
 from rich.console import Console
 from rich.text import Text
@@ -15,6 +16,20 @@ class Tell(Protocol):
 
     def __call__(self, text: str, lead: str = "") -> None:
         """One line."""
+
+
+_Item = TypeVar("_Item")
+_QUIET = 15.0  # s without a word, after which one says how far it is
+
+
+def paced(say: Callable[[str], object], items: Sequence[_Item]) -> Iterator[_Item]:
+    """The items one by one; where they take long, how many are done is said now and then."""
+    last = time.monotonic()
+    for done, item in enumerate(items):
+        if time.monotonic() - last > _QUIET:
+            say(f"{done} of {len(items)} so far")
+            last = time.monotonic()
+        yield item
 
 
 def teller(console: Console | None, began: float) -> Tell:

@@ -153,6 +153,7 @@ CASES: dict[str, tuple[Any, ...]] = {
     "friction, stribeck": (arm(), [RISE], (level(0.3),)),
     "coulomb, stribeck": (arm(), [DRY, RISE]),
     "soft friction, coulomb": (arm(joint='frictionloss="0.05"'), [DRY], (level(0.3),)),
+    "gravcomp, payload": (arm().replace('<body name="a"', '<body name="a" gravcomp="1"'), [PAYLOAD]),
     "springs": (arm(joint='stiffness="2" springref="20"'), [SPRING, SPRING]),
 }  # fmt: skip
 

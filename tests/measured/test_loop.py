@@ -1,6 +1,7 @@
 """The loop end to end, on a one-joint machine that these tests simulate themselves with plain `mj_step`."""
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -13,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 from nfc_gym.adaptation.extended import read_found
 from nfc_gym.core import InputError
@@ -136,6 +138,18 @@ def test_the_hidden_friction_is_found_and_sized(closed: Closed) -> None:
     assert chi2["extended"] == pytest.approx(1, abs=0.3)
     assert chi2["null"] == pytest.approx(1, abs=0.3)
     assert report["effects"][0]["share_of_excess"] > 0.9
+
+
+def test_what_check_warns_of_is_printed_first_and_stands_in_the_report(tmp_path: Path) -> None:
+    """Here the motor's wires are swapped."""
+    mapping = machine(tmp_path, loss=0.0)
+    (tmp_path / "arm.xml").write_text(GIVEN.replace('name="motor"', 'name="motor" gear="-1"'))
+    told = io.StringIO()
+    report = close_loop(mapping, tmp_path / "out", seed=3, jobs=1, console=Console(file=told, width=400))
+    warning = next(line for line in told.getvalue().splitlines() if "turned round" in line)
+    assert told.getvalue().index(warning) < told.getvalue().index("segments")
+    assert any(f["kind"] == "check" and "turned round" in f["text"] for f in report["findings"])
+    assert "turned round" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_an_effect_that_comes_to_nothing_on_all_logs_is_dropped(

@@ -16,6 +16,7 @@ def judged(
     after: float,
     rows: list[dict[str, Any]] = ROWS[:1],
     misshapen: dict[str, str] | None = None,
+    gain: tuple[float, float] = (0.5, 0.9),
     **doubted: list[str],
 ) -> Any:
     """Of models that leave `after` beyond a noise of 1, where calibration leaves 5, with this chi-squared."""
@@ -23,7 +24,7 @@ def judged(
     v: Any = SimpleNamespace(null=np.ones(6), chi2=lambda stage: chi2)
     doubts = {f"{family}:base": ids for family, ids in doubted.items()}
     found: Any = SimpleNamespace(generic=None, doubted=doubts, misshapen=misshapen or {})
-    return _judge(v, rows, {"law_power:base"}, found, {"groups": {"angle": row}})
+    return _judge(v, rows, {"law_power:base"}, found, {"groups": {"angle": row}}, gain)
 
 
 @pytest.mark.parametrize(("after", "claimed"), [(np.sqrt(12.5), True), (np.sqrt(13.5), False)])
@@ -37,6 +38,13 @@ def test_a_cause_takes_away_half_of_what_is_missing(after: float, claimed: bool)
 def test_where_nothing_remains_what_was_found_is_the_cause() -> None:
     out = judged(1.0, 4.9)
     assert (out.verdict, out.claimed, out.weak) == ("explained", ROWS[:1], [])
+
+
+def test_where_nothing_is_seen_to_be_missing_what_makes_no_sure_difference_is_no_cause() -> None:
+    out = judged(1.0, 4.9, gain=(0.75, 1.0006))
+    assert (out.verdict, out.claimed) == ("nothing missing", [])
+    assert out.weak == [ROWS[0] | {"nearest": True, "alike": []}]
+    assert judged(1.05, 4.9, gain=(0.75, 1.0006)).claimed == judged(1.0, 4.9, gain=(0.6, 0.99)).claimed == ROWS[:1]
 
 
 def test_one_guess_among_several_is_no_cause() -> None:

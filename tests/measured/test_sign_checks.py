@@ -21,7 +21,8 @@ ARM = """
 FLIER = """
 <mujoco><option timestep="0.005"/><worldbody>
   <body name="hull"><freejoint/><geom type="box" size=".1 .1 .03" mass="1"/><site name="fan"/></body>
-</worldbody><actuator><motor name="thrust" site="fan" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
+</worldbody><actuator><motor name="thrust" site="fan" gear="0 0 1 0 0 0"/></actuator>
+<sensor><accelerometer name="imu" site="fan"/></sensor></mujoco>"""
 NED = {"p": np.array([1.0, -1, -1]), "q": np.array([1.0, 1, -1, -1])}
 
 
@@ -32,17 +33,20 @@ def moved(model: mujoco.MjModel, k: int) -> dict[str, np.ndarray]:
     if free:
         data.qpos[3:7] = [1, 0.3 * np.sin(k), 0.3 * np.cos(k), 0]
         data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
-    rows = []
+    rows, felt = [], []
     for n in range(400):
         wave = 0.6 * np.sin(np.array([2.3, 3.1]) * (0.01 * n) + k + np.arange(2))
         ctrl = (9.81 + 2 * wave if free else wave * [1, 0.5])[: model.nu]
         rows.append(np.concatenate([[0.01 * n], ctrl, data.qpos]))
         data.ctrl[:] = ctrl
+        mujoco.mj_forward(model, data)
+        felt.append(data.sensordata.copy())
         mujoco.mj_step(model, data, 2)
     table = np.array(rows).T
     table[1 + model.nu :] += 1e-4 * rng.standard_normal((model.nq, 400))
     columns = {"t": table[0], **{f"u{i}": table[1 + i] for i in range(model.nu)}}
     state = table[1 + model.nu :]
+    columns["a"] = np.array(felt) + 1e-3 * rng.standard_normal((400, model.nsensordata))
     return columns | ({"p": state[:3].T, "q": state[3:].T} if free else {"shoulder": state[0], "elbow": state[1]})
 
 
@@ -57,7 +61,8 @@ def found(folder: Path, xml: str, signs: dict[str, float | np.ndarray], wrong: s
     controls = "\n".join(f"  ctrl:{n}: {{column: u{i}, unit: {unit[n]}}}" for i, n in enumerate(names))
     channels = (
         "  body:hull:pos: {column: p, unit: m, noise: 0.0001}\n"
-        "  body:hull:quat: {column: q, order: wxyz, noise: 0.0001}"
+        "  body:hull:quat: {column: q, order: wxyz, noise: 0.0001}\n"
+        "  sensor:imu: {column: a, unit: m/s^2, noise: 0.001}"
         if xml is FLIER
         else "\n".join(f"  joint:{j}:pos: {{column: {j}, unit: rad, noise: 0.0001}}" for j in ("shoulder", "elbow"))
     )
@@ -102,7 +107,10 @@ def test_a_joint_or_its_command_with_the_other_sign_is_told(
     assert want in finding.message
 
 
-def test_a_frame_with_z_downwards_is_told(tmp_path: Path) -> None:
-    (finding,) = turned(found(tmp_path, FLIER, NED))
+@pytest.mark.parametrize("sensors", [False, True])
+def test_a_frame_with_z_downwards_is_told(tmp_path: Path, sensors: bool) -> None:
+    """Whether the body's sensors are read along axes of that kind too or not."""
+    (finding,) = turned(found(tmp_path, FLIER, NED | ({"a": NED["p"]} if sensors else {})))
+    assert ("and its sensors" in finding.message) == sensors
     assert "north-east-down" in finding.message
     assert "(w, x, -y, -z)" in finding.advice

@@ -15,6 +15,7 @@ from nfc_gym.physics.effects.drive import command_unit
         ('<motor joint="hinge" gear="100"/>', "1"),
         ('<position joint="rail" kp="3" gear="5"/>', "m"),
         ('<velocity joint="hinge" kv="3"/>', "rad/s"),
+        ('<general joint="hinge" gainprm="0.12" biastype="affine" biasprm="0 0 -0.035"/>', "1"),
     ],
 )
 def test_the_unit_of_a_command(actuator: str, unit: str) -> None:

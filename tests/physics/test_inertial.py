@@ -66,6 +66,14 @@ def test_payload_moves_as_the_welded_body_does() -> None:
     np.testing.assert_allclose(mine.qpos, theirs.qpos, atol=1e-7)
 
 
+def test_a_load_on_a_body_that_floats_has_weight() -> None:
+    """MuJoCo's compensation is a share of the mass, which the load adds to."""
+    floats = BARE.replace('name="b"', 'name="b" gravcomp="1"').replace('gravity="0 0 0"', 'gravity="0 0 -9.81"')
+    effect, theta = make("payload", "b", {"mass": 0.5, "x": 0.02, "y": -0.01, "z": 0.03})
+    after = run(floats, effect, theta, 1000, qvel=[0.0] * 6).qvel[0, 0, -1, 2]
+    assert after == pytest.approx(-9.81 * 0.5 / 2.5, rel=1e-6)
+
+
 def test_two_payloads_compose() -> None:
     """Half the mass twice at one place is the whole mass once."""
     model = mujoco.MjModel.from_xml_string(BARE)

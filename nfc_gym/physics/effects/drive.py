@@ -52,7 +52,9 @@ def command_unit(model: mujoco.MjModel, actuator: int) -> str:
         return "1"
     if is_position(model, actuator):
         return "m" if slides else "rad"
-    if int(model.actuator_biastype[actuator]) == _AFFINE_BIAS and model.actuator_biasprm[actuator, 2] != 0:
+    # A motor on volts has back-EMF: a force that falls with speed too, but not as its gain times that speed.
+    pull, drag = model.actuator_gainprm[actuator, 0], -model.actuator_biasprm[actuator, 2]
+    if int(model.actuator_biastype[actuator]) == _AFFINE_BIAS and drag != 0 and np.isclose(pull, drag, rtol=1e-3):
         return "m/s" if slides else "rad/s"
     whole = model.actuator_gainprm[actuator, 0] == 1 and model.actuator_gear[actuator, 0] == 1
     if whole and int(model.actuator_trntype[actuator]) in _JOINTS:

@@ -161,7 +161,9 @@ class Payload(Moved):
 def add_point_mass(fields: ModelFields, body: int, mass: Array, place: Array) -> None:
     """Fix a point mass (...,), kg, at `place` (..., 3) of a body's frame: mass, centre and principal inertia, in place.
 
-    About the common centre the two add mu (|d|^2 1 - d d'), mu the reduced mass and d the way from the old centre.
+    About the common centre the two add mu (|d|^2 1 - d d'), mu the reduced mass and d the way from the old centre. What
+    holds a body up against gravity (`gravcomp`, a share of its weight) does not grow with what is put on it; MuJoCo
+    has it act at the common centre.
     """
     masses, iposes = fields["body_mass"], fields["body_ipos"]
     inertias, iquats = fields["body_inertia"], fields["body_iquat"]
@@ -178,6 +180,8 @@ def add_point_mass(fields: ModelFields, body: int, mass: Array, place: Array) ->
     iquats[..., body, :] = quat_multiply(quat, turn)
     inertias[..., body, :] = moments
     masses[..., body] = old + mass
+    if fields.nominal_model.body_gravcomp[body]:
+        fields["body_gravcomp"][..., body] *= 1 - share[..., 0]
 
 
 class ComShift(Moved):
