@@ -157,7 +157,7 @@ class RolloutProblem(Problem):
         return out
 
     @property
-    def noise(self) -> Array:
+    def sensor_sd(self) -> Array:
         """(S, m) standard deviation of each measured number."""
         return self._noise
 

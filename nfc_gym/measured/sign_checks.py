@@ -99,7 +99,7 @@ def _left(bench: Bench, problem: RolloutProblem, turn: _Turn) -> float:
     if not own.any():
         own[:] = True
     stable = np.isfinite(before).all(1) & np.isfinite(after).all(1)
-    noise = np.maximum(problem.noise, np.finfo(float).eps)  # of a channel that never moves it comes out as 0
+    noise = np.maximum(problem.sensor_sd, np.finfo(float).eps)  # of a channel that never moves it comes out as 0
     rms = lambda residual, of: np.sqrt(np.mean((residual / noise)[:, of] ** 2, 1))  # noqa: E731
     told = stable & (rms(before, own) > 0)
     if not told.any():
