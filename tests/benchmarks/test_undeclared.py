@@ -282,5 +282,5 @@ def test_sysid_finds_the_true_psi_of_a_machine_without_effect(tmp_path: Path) ->
     psi = {"base_mass": 0.63, "arm_mass": 0.09, "mount_stiffness": 4.5}
     mapping = case.write_case(tmp_path, kit, case.Machine(psi), 1.6, range(3))
     bench = case.make_bench(case.load(mapping), 1)
-    found = sysid.identify(bench, list(bench.dataset.logs))
+    found = sysid.identify(bench, list(bench.dataset.logs), iterations=6)
     np.testing.assert_allclose(found, [psi[p] for p in bench.plant.space.names], rtol=0.03)
