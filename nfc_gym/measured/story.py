@@ -297,6 +297,10 @@ def _undecided(rivals: Sequence[str], effect: dict[str, Any], report: dict[str, 
 def _on_effects(report: dict[str, Any]) -> list[str]:
     effects = report.get("effects") or []
     if not effects:
+        spare = [e for e in report.get("proposals") or [] if e.get("nearest")]
+        if spare and report.get("verdict") == "nothing missing":
+            fitted = " ".join(str(e.get("sentence")) for e in spare)
+            return [f"Fitted as well, and in effects.yaml as a proposal, but it may make no difference: {fitted}"]
         return []
     out = []
     for e in effects:

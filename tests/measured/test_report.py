@@ -101,6 +101,14 @@ def test_what_comes_nearest_is_no_claim() -> None:
     assert "a proposed law" not in text
 
 
+def test_what_may_make_no_difference_is_told_as_that() -> None:
+    sentence = "Actuator force scaled at m1: gain 1.05."
+    spare = {"id": "gain:m1", "family": "gain", "where": "m1", "sentence": sentence, "nearest": True, "alike": []}
+    report = {"verdict": "nothing missing", "effects": [], "proposals": [spare], "findings": []}
+    assert any(n.endswith(f"it may make no difference: {sentence}") for n in story.notices(report))
+    assert not any(sentence in n for n in story.notices(report | {"proposals": []}))
+
+
 def test_maps_of_the_misfit() -> None:
     page = render(example(), pictures())
     text = read(page).text
