@@ -71,7 +71,11 @@ class Trajectory:
         """Up to the transition that was most unusual: what a posterior that sees one window is to look at."""
         stop = int(np.argmax(self.scores)) + 1
         seen = self.looks <= stop
-        elevation = self.alarm_map.astype(float) if self.alarm_map.size else self.elevation
+        elevation = self.elevation
+        if self.alarm_map.size:
+            elevation = self.alarm_map.astype(float)
+        elif seen.any():  # a file of before that map was kept: the last on the way
+            elevation = self.maps[seen][-1].astype(float)
         return Trajectory(
             self.states[: stop + 1], self.actions[:stop], self.rewards[:stop], self.scores[:stop], self.threshold,
             self.estimate[: stop + 1], elevation, self.reached, self.ended, self.maps[seen], self.looks[seen],

@@ -18,6 +18,8 @@ from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.shooting import RolloutProblem
+from nfc_gym.physics.effects.base import actuator_names
+from nfc_gym.physics.effects.drive import on_scalar
 
 Array = NDArray[np.float64]
 
@@ -27,7 +29,6 @@ BETTER = 0.5  # of the error as the log is, to which a turn must bring it, in th
 OFTEN, WORSE = 0.9, 0.05  # of the roll-outs, which a turn must make no worse than by so much
 ALIKE = 1.5  # times the least error, up to which another turn explains it as well
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
-_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _ON_AXES = [int(getattr(mujoco.mjtSensor, f"mjSENS_{s}")) for s in ("ACCELEROMETER", "GYRO", "VELOCIMETER")]
 _NED = np.array([1.0, -1.0, -1.0])  # from north-east-down and forward-right-down: half a turn about x, on both sides
 _NED_QUAT = np.array([1.0, 1.0, -1.0, -1.0])
@@ -122,7 +123,8 @@ def _turns(bench: Bench) -> Iterator[_Turn]:
         qpos, qvel = {int(j.qposadr[0]): -1.0}, {int(j.dofadr[0]): -1.0}
         where, what = f"channels.{names[0]}", f"joint {joint!r}"
         yield _Turn(where, what, advice, f"joint:{joint}", qpos=qpos, qvel=qvel, measured=measured)
-    every = {key: model.actuator(key.removeprefix("ctrl:")).id for key in controls}
+    known = actuator_names(model)
+    every = {key: known.index(key.removeprefix("ctrl:")) for key in controls}
     advice = "if so, change the sign of the column in the logs, or of the actuator's gear in the model"
     for key, at in every.items():
         yield _Turn(f"controls.{key}", f"the command {key!r}", advice, _driven(bench, key, at), ctrl={at: -1.0})
@@ -148,10 +150,9 @@ def _driven(bench: Bench, key: str, actuator: int) -> str:
     servo, model = bench.dataset.mapping.controls[key].servo, bench.plant.model
     if servo is not None:
         return f"joint:{servo.joint}"
-    joint = int(model.actuator_trnid[actuator, 0])
-    if int(model.actuator_trntype[actuator]) != _JOINT or int(model.jnt_type[joint]) == _FREE:
+    if not on_scalar(model, actuator):
         return ""
-    return f"joint:{model.joint(joint).name}"
+    return f"joint:{model.joint(int(model.actuator_trnid[actuator, 0])).name}"
 
 
 def _reads_axes(model: mujoco.MjModel, name: str, body: int) -> bool:

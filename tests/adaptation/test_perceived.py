@@ -126,6 +126,8 @@ def test_a_posterior_sees_the_map_at_the_alarm(driven: tuple[Trajectory, Heightf
     off = {k: float(np.abs(m - m.mean() - (seen - seen.mean())).mean())
            for k, m in (("alarm", cut.elevation), ("kept", cut.maps[-1]))}  # fmt: skip
     assert off["alarm"] < 0.2 * off["kept"]
+    older = replace(trajectory, alarm_map=np.zeros((0, 0), np.float32)).until_alarm()
+    np.testing.assert_array_equal(older.elevation, trajectory.maps[2], "of a file without it, the last by then")
 
 
 def test_a_world_without_maps_has_none() -> None:
