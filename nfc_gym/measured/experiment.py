@@ -119,6 +119,7 @@ class Stage:
             exogenous=exogenous,
             known=known,
             channels=frozenset(log.channels),
+            condition=np.full(count, log.condition),
             servo=[
                 (law, {n: hold(log.servo[k][n]) for n in ("gain", "supply", "damping")}) for k, law in bound.items()
             ],
@@ -193,6 +194,7 @@ class Stage:
             exogenous={k: self.time if k == TIME else hold(v) for k, v in start.exogenous.items()},
             known={k: hold(v) for k, v in start.known.items()},
             servo={k: {n: hold(v) for n, v in terms.items()} for k, terms in start.servo.items()},
+            condition=start.condition,
         )
 
     def _added(self, w: Array) -> RolloutProblem:

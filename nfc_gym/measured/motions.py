@@ -77,7 +77,7 @@ def _stairs(rng: np.random.Generator, time: Array, count: int) -> Array:
 
 
 FAMILIES = (
-    Family("slow", "slow swings", lambda r, t, n: _sines(r, t, n, 1 / t[-1], 0.5)),
+    Family("slow", "slow swings", lambda r, t, n: _sines(r, t, n, 1 / t[-1], max(0.5, 1.5 / t[-1]))),
     Family("fast", "fast swings", lambda r, t, n: _sines(r, t, n, 0.8, _FASTEST)),
     Family("broad", "swings of all speeds at once", lambda r, t, n: _sines(r, t, n, 1 / t[-1], _FASTEST)),
     Family("chirp", "swings that go from slow to fast", _chirp),

@@ -140,7 +140,7 @@ def _judge(
     named, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
     generic = found.generic is not None or bool(proposed)
     seen = gain[1] < 1 or v.chi2("calibrated") > say.null_bound(v)
-    verdict, taken = say.verdict(v, len(named) if seen else 0, generic), say.taken_away(v, errors)
+    verdict, taken = say.verdict(v, len(named) if seen else 0, generic and seen), say.taken_away(v, errors)
     # What is weak predicts, and stays in the model; that it is the cause of what is missing is not shown.
     every = [r | {"nearest": True, "alike": found.doubted.get(r["id"], [])} for r in named]
     if not seen:

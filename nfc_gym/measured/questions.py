@@ -87,7 +87,7 @@ def reported(bench: Bench, logs: Sequence[Log], folder: Path) -> tuple[dict[str,
     """
     for name in ("report.json", "fit.json"):
         if not (folder / name).is_file():
-            inside = sorted(p.parent.name for p in folder.glob("*/fit.json")) if folder.is_dir() else []
+            inside = sorted(p.parent.relative_to(folder).as_posix() for p in folder.rglob("*/fit.json"))
             hint = f"it holds folds: give one of {', '.join(inside)}" if inside else "run close-loop with it as --out"
             raise InputError(f"{folder / name} does not exist; {hint}")
     try:

@@ -58,13 +58,19 @@ class _Turn:
 
 
 def turned_round(dataset: Dataset) -> Iterator[Finding]:
-    """Joints, commands and frames that the nominal model wants the other way round; of equals the likeliest is told."""
+    """Joints, commands and frames that the nominal model wants the other way round; of equals the likeliest is told.
+
+    Nothing is said where an actuator's commands are not in the logs: roll-outs would be of a machine that is let go.
+    """
+    commanded = {key.removeprefix("ctrl:") for key in dataset.mapping.controls}
     try:
         bench = make_bench(replace(dataset, logs=tuple(_middles(dataset.logs))), nthread=1)
         logs = bench.dataset.logs
         ahead = max(AHEAD, SAMPLES * max(log.interval for log in logs))
         problem = bench.rollouts(logs, [bench.states[log.name] for log in logs], BLOCKS, (ahead,))
     except InputError:  # told elsewhere
+        return
+    if not commanded.issuperset(actuator_names(bench.plant.model)):
         return
     weighed = [(left, turn) for turn in _turns(bench) if (left := _left(bench, problem, turn)) < BETTER]
     told: set[str] = set()

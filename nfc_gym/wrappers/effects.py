@@ -115,7 +115,7 @@ def own_values(effects: Sequence[Effect], each: Sequence[ArrayLike], shape: tupl
     """Values (*shape, k) of each effect.
 
     Raises:
-      InputError: of another number or shape, or not finite.
+      InputError: of another number or shape, not finite, or what cannot be.
     """
     if len(each) != len(effects):
         raise InputError(f"ApplyEffects: values of {len(each)} effects are given, and there are {len(effects)}")
@@ -124,6 +124,8 @@ def own_values(effects: Sequence[Effect], each: Sequence[ArrayLike], shape: tupl
         want = (*shape, len(effect.params))
         if theta.shape != want or not np.isfinite(theta).all():
             raise InputError(f"ApplyEffects: values of {effect.id} must be finite, of shape {want}, got {theta.shape}")
+        for extreme in (theta.reshape(-1, theta.shape[-1]).min(0), theta.reshape(-1, theta.shape[-1]).max(0)):
+            effect.require_possible(extreme)
     return found
 
 

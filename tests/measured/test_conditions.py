@@ -12,6 +12,7 @@ import pytest
 
 from nfc_gym.core import InputError
 from nfc_gym.measured.dataset import load
+from nfc_gym.measured.excite import excite
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.predict import predict
 from nfc_gym.physics.effects import build
@@ -120,6 +121,16 @@ def test_every_log_is_predicted_in_its_own_condition(folder: Path, report: Mappi
         truth = np.load(folder / f"verify_{day}.npz")["px"]
         errors = {s: np.sqrt(np.mean((r[f"verify_{day}"][:, 0] - truth) ** 2)) for s, r in rolled.items()}
         assert errors["extended"] < 0.3 * errors["calibrated"]
+
+
+def test_commands_are_proposed_for_the_condition_of_the_first_log(
+    report: Mapping[str, Any], folder: Path, tmp_path: Path
+) -> None:
+    found = excite(
+        folder / "mapping.yaml", folder / "out", tmp_path / "next.csv", jobs=1, seconds=1.0, tries=2, budget=0.1
+    )
+    assert found["sentences"]
+    assert (tmp_path / "next.csv").exists()
 
 
 def test_a_condition_that_was_never_fitted_is_named(folder: Path, report: Mapping[str, Any], tmp_path: Path) -> None:

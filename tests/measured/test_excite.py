@@ -275,7 +275,9 @@ def test_a_run_over_folds_asks_for_one_of_them(mapping: Path, closed: Path, tmp_
     (tmp_path / "run_a").mkdir()
     (tmp_path / "run_a" / "fit.json").write_text("{}")
     (tmp_path / "report.json").write_text("{}")
-    with pytest.raises(InputError, match="it holds folds: give one of run_a"):
+    (tmp_path / "b" / "run").mkdir(parents=True)  # folds are named by path where two names are alike
+    (tmp_path / "b" / "run" / "fit.json").write_text("{}")
+    with pytest.raises(InputError, match="it holds folds: give one of b/run, run_a"):
         excite(mapping, tmp_path, tmp_path / "next.csv")
 
 

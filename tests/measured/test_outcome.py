@@ -17,13 +17,14 @@ def judged(
     rows: list[dict[str, Any]] = ROWS[:1],
     misshapen: dict[str, str] | None = None,
     gain: tuple[float, float] = (0.5, 0.9),
+    generic: str | None = None,
     **doubted: list[str],
 ) -> Any:
     """Of models that leave `after` beyond a noise of 1, where calibration leaves 5, with this chi-squared."""
     row = {"calibrated": [5.0], "extended": [after], "noise_floor": [1.0]}
     v: Any = SimpleNamespace(null=np.ones(6), chi2=lambda stage: chi2)
     doubts = {f"{family}:base": ids for family, ids in doubted.items()}
-    found: Any = SimpleNamespace(generic=None, doubted=doubts, misshapen=misshapen or {})
+    found: Any = SimpleNamespace(generic=generic, doubted=doubts, misshapen=misshapen or {})
     return _judge(v, rows, {"law_power:base"}, found, {"groups": {"angle": row}}, gain)
 
 
@@ -44,6 +45,9 @@ def test_where_nothing_is_seen_to_be_missing_what_makes_no_sure_difference_is_no
     out = judged(1.0, 4.9, gain=(0.75, 1.0006))
     assert (out.verdict, out.claimed) == ("nothing missing", [])
     assert out.weak == [ROWS[0] | {"nearest": True, "alike": []}]
+    law = judged(1.0, 4.9, ROWS[1:], gain=(0.75, 1.0006))
+    assert (law.verdict, law.laws) == ("nothing missing", ROWS[1:])
+    assert judged(1.0, 4.9, [], gain=(0.75, 1.0006), generic="generic_memory:base").verdict == "nothing missing"
     assert judged(1.05, 4.9, gain=(0.75, 1.0006)).claimed == judged(1.0, 4.9, gain=(0.6, 0.99)).claimed == ROWS[:1]
 
 

@@ -79,6 +79,35 @@ def turned(findings: list[Finding]) -> list[Finding]:
     return [f for f in findings if "turned round" in f.message]
 
 
+LIFT = """
+<mujoco><option timestep="0.005"/><worldbody>
+  <body name="cage"><joint name="mast" type="slide" axis="0 0 1"/><geom size=".05" mass="1"/></body>
+</worldbody><actuator><motor name="winch" joint="mast"/></actuator>
+<sensor><actuatorfrc name="pull" actuator="winch"/></sensor></mujoco>"""
+LIFTED = """
+version: 1
+model: lift.xml
+logs: [{path: '*.npz'}]
+time: {column: t, unit: s}
+channels:
+  joint:mast:pos: {column: x, unit: m, noise: 0.0001}
+  force:winch: {column: f, unit: N, noise: 0.01}
+segments: {mode: inverse}
+"""
+
+
+def test_nothing_is_said_of_a_machine_whose_commands_are_not_logged(tmp_path: Path) -> None:
+    """Hoisted with twice its weight: without the winch's force it would fall as fast as it rises."""
+    (tmp_path / "lift.xml").write_text(LIFT)
+    (tmp_path / "mapping.yaml").write_text(LIFTED)
+    t = 0.01 * np.arange(200)
+    for k in range(3):
+        force = 2 * 9.81 + np.sin(5 * t + k)
+        x = 9.81 * t**2 / 2 + (t * np.cos(k) - (np.sin(5 * t + k) - np.sin(k)) / 5) / 5
+        np.savez(tmp_path / f"{k}.npz", t=t, x=x, f=force)
+    assert turned(check(tmp_path / "mapping.yaml")) == []
+
+
 @pytest.mark.parametrize("xml", [ARM, FLIER])
 def test_nothing_is_said_where_all_is_the_right_way_round(tmp_path: Path, xml: str) -> None:
     assert not turned(found(tmp_path, xml, {}))

@@ -132,6 +132,12 @@ def test_each_stack_does_something(stack: str) -> None:
     assert (shown[0] != shown[1]).any(1).all()
 
 
+def test_own_values_that_cannot_be_are_refused() -> None:
+    light = [[1.0, 0.0, 0.0, 0.0], [-100.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]]
+    with pytest.raises(InputError, match=r"payload:base.*mass is -100 kg; it must be"):
+        VectorApplyEffects(_vector(), [LOAD], values=[light])
+
+
 def test_null_is_no_wrapper_bit_for_bit() -> None:
     nothing = [{**DRY, "parameters": {"level": 0.0}}, {**DELAY, "parameters": {"delay": 0.0}}]
     mass = float(_vector().unwrapped.psi_space.nominal[0])
