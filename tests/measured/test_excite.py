@@ -210,6 +210,8 @@ def test_the_report_advises_a_motion_for_what_it_cannot_tell_apart(mapping: Path
     report["identifiability"] = [{"id": "coulomb:shaft", "worst_mimic": None, "distinguishable": True}]
     advice = advise(bench, logs, report, look(bench, logs, plant, x), lambda text: None, 0)
     (row,) = advice.rows
+    (few,) = advise(bench, logs, report, look(bench, logs, plant, x, 12), lambda text: None, 0).rows
+    assert few["sigma"] == pytest.approx(row["sigma"])  # however many segments the search looked at
     assert row["worst_mimic"] == "damping_poly:shaft"
     assert row["sigma"] < 4
     assert not row["distinguishable"]
