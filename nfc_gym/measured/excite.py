@@ -26,7 +26,7 @@ from nfc_gym.measured.fit import fit
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.proposal_page import render
 from nfc_gym.measured.questions import Present, Visible
-from nfc_gym.measured.telling import teller
+from nfc_gym.measured.telling import teller, warned
 
 Array = NDArray[np.float64]
 _ROUNDS = 8  # iterations of a rival's refit to the simulated recording
@@ -84,7 +84,9 @@ def excite(
     out = _outputs(out if out is not None else mapping.with_name("excite.csv"), overwrite)
     mujoco.set_mju_user_warning(lambda message: None)
     say = teller(console, time.monotonic())
-    bench = make_bench(require(mapping)[0], jobs)
+    dataset, noticed = require(mapping)
+    warned(console, noticed)
+    bench = make_bench(dataset, jobs)
     task, report = _task(bench, fit, seconds, seed, say)
     stage = task.design.stage
     if not stage.open_loop:

@@ -47,7 +47,7 @@ from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, held, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
 from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
-from nfc_gym.measured.telling import teller
+from nfc_gym.measured.telling import teller, warned
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.untimed import untimed
 
@@ -111,10 +111,7 @@ def close_loop(
         mujoco.set_mju_user_warning(lambda message: None)
         dataset, noticed = require(mapping)
         bench = make_bench(dataset, jobs)
-        bench.warned = tuple(f for f in noticed if f.severity == "warning")
-        if console:
-            for warning in bench.warned:
-                console.print(Text.assemble(("warning", "bold yellow"), f"  {warning}"))
+        bench.warned = warned(console, noticed)
         if posterior is not None:
             bench.belief, bench.compare = read_belief(posterior, bench.plant.space, seed), compare
         if witness is not None:

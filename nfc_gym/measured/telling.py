@@ -4,11 +4,13 @@ They quote names of models and files, in which `:x:` and `[a]` are no emoji and 
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol, TypeVar
 
 from rich.console import Console
 from rich.text import Text
+
+from nfc_gym.measured.findings import Finding
 
 
 class Tell(Protocol):
@@ -30,6 +32,15 @@ def paced(say: Callable[[str], object], items: Sequence[_Item]) -> Iterator[_Ite
             say(f"{done} of {len(items)} so far")
             last = time.monotonic()
         yield item
+
+
+def warned(console: Console | None, noticed: Iterable[Finding]) -> tuple[Finding, ...]:
+    """What `check` warns of, shown as well where there is a console."""
+    found = tuple(f for f in noticed if f.severity == "warning")
+    if console:
+        for warning in found:
+            console.print(Text.assemble(("warning", "bold yellow"), f"  {warning}"))
+    return found
 
 
 def teller(console: Console | None, began: float) -> Tell:
