@@ -53,7 +53,8 @@ def optimise(
       points: how often they are judged, at equal distances, the last time at the end.
 
     Returns:
-      `imagined_before` and `imagined_after`, mean returns of the first and the last episodes that ended; of a choice
+      `imagined_before`, the mean return of each world's first episode, during which learning has begun already, and
+      `imagined_after`, of the last episodes that ended, both None where not each world has ended one; of a choice
       `chosen`, the mean return of the best; where the loss came apart `diverged`, why.
     """
     if not isinstance(worlds, VectorSight | RayWorlds):
@@ -62,7 +63,7 @@ def optimise(
     actor = agent.actor if pi_h is None else widened(agent.actor, pi_h)
     learner = agent.learner(actor, size)
     kept = [(m, copy.deepcopy(m.state_dict())) for m in (learner.loss, actor)]
-    record, episodes, first, done, judged = record or Record(None, None), Episodes(), {}, 0, 0
+    record, episodes, done, judged = record or Record(None, None), Episodes(), 0, 0
     torch.manual_seed(mixed(seed, 0))
     if isinstance(worlds, RayWorlds):
         worlds.restarted = episodes.forget
@@ -75,10 +76,10 @@ def optimise(
                 values = learner.learn(batch)
                 episodes.see(batch)
                 done += batch.numel()
-                found = episodes.means()
-                first = first or found
+                found = {} if episodes.first is None else episodes.means()
                 record.scalars(before + done, {f"worlds/{k}": v for k, v in (values | found).items()})
-                said = f"{done:,}/{steps:,} steps in {worlds.num_envs} worlds  {in_words(found)}"
+                shown = in_words(found) or "their first episodes have not all ended"
+                said = f"{done:,}/{steps:,} steps in {worlds.num_envs} worlds  {shown}"
                 record.line(said, done >= steps)
                 if choice is not None and done * points >= (judged + 1) * steps:
                     record.scalars(before + done, {"worlds/judged": choice.judge()})
@@ -87,5 +88,7 @@ def optimise(
         for module, state in kept:
             module.load_state_dict(state)
         return {"diverged": str(e)}
-    told = {"imagined_before": first.get("return"), "imagined_after": episodes.means().get("return")}
+    first = episodes.first
+    after = None if first is None else episodes.means().get("return")
+    told = {"imagined_before": first, "imagined_after": after}
     return told if choice is None else told | {"chosen": choice.best}

@@ -1,5 +1,6 @@
 """A policy as one safetensors file: actor, critic and the scale of observations, and in the metadata all about it."""
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -24,6 +25,7 @@ from nfc_gym.simulate.policy import Perceptron
 
 FORMAT = "nfc_gym-policy-1"
 SUFFIX = ".safetensors"
+_MEASURED = ("steps", "seconds", "nominal", "command", "device", "weights")  # that are of some weights and no others
 
 
 @dataclass
@@ -33,7 +35,8 @@ class Policy:
     Attributes:
       sight: what it looks at, and of which environment it is.
       network: actor and critic.
-      about: plain values kept beside it: seed, command, versions, steps, returns.
+      about: plain values kept beside it: seed, command, versions, steps, returns, and the digest of the weights that
+        they are of; where others are saved, what was said of these stands under `before`.
     """
 
     sight: Sight
@@ -100,11 +103,28 @@ class Policy:
         versions = {
             "nfc_gym": __version__, "torch": str(torch.__version__), "torchrl": str(torchrl.__version__),
         }  # fmt: skip
-        about = {**self.about, "sight": self.sight.to_dict(), "sizes": asdict(self.network.sizes), "versions": versions}
         tensors = {k: t.detach().cpu().contiguous().clone() for k, t in unique(self.network.state_dict()).items()}
+        about = _of_weights(self.about, _digest(tensors))
+        about |= {"sight": self.sight.to_dict(), "sizes": asdict(self.network.sizes), "versions": versions}
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as part:
             save_file(tensors, part, {"format": FORMAT, "about": json.dumps(about)})
+
+
+def _digest(tensors: dict[str, torch.Tensor]) -> str:
+    """What tells these weights from others."""
+    found = hashlib.sha256()
+    for name in sorted(tensors):
+        found.update(name.encode() + tensors[name].numpy().tobytes())
+    return found.hexdigest()
+
+
+def _of_weights(about: dict[str, Any], digest: str) -> dict[str, Any]:
+    """What may be said of the weights with this digest: steps and returns of others were theirs."""
+    if about.get("weights", digest) == digest:
+        return {**about, "weights": digest}
+    kept = {k: v for k, v in about.items() if k not in _MEASURED}
+    return {**kept, "weights": digest, "before": {k: about[k] for k in _MEASURED if k in about}}
 
 
 def taught(network: ActorCritic, sight: Sight, by: Policy) -> int:
@@ -192,6 +212,7 @@ def load_policy(source: str | Path, device: str | torch.device = "cpu") -> Polic
         network = ActorCritic(Sizes(**{**sizes, "hidden": tuple(sizes["hidden"])}))
         sight = Sight.from_dict(about.pop("sight"))
         restore(network, tensors)
+        about.setdefault("weights", _digest(tensors))
     except (KeyError, TypeError, ValueError, RuntimeError) as e:
         raise InputError(f"{path}: its metadata and weights are no policy that this version knows ({e})") from None
     return Policy(sight, network.to(device).eval(), about)

@@ -23,6 +23,7 @@ class Episodes:
 
     def __init__(self) -> None:
         self._sums: torch.Tensor | None = None
+        self._first: torch.Tensor | None = None
         self._recent: deque[tuple[float, float, float]] = deque(maxlen=_RECENT)
         self.goals = False
         self.count = 0
@@ -36,14 +37,21 @@ class Episodes:
         parts = torch.stack([reward, torch.ones_like(reward), reached.to(reward.dtype)]).cpu()
         done = done.cpu()
         sums = torch.zeros(3, len(done)) if self._sums is None else self._sums
+        first = torch.full((len(done),), torch.nan) if self._first is None else self._first
         for t in range(done.shape[1]):
             sums = sums + parts[:, :, t]
             over = done[:, t]
             if over.any():
                 self._recent.extend((r, n, float(s > 0)) for r, n, s in sums[:, over].T.tolist())
                 self.count += int(over.sum())
+                first = torch.where(over & first.isnan(), sums[0], first)
                 sums = torch.where(over, 0.0, sums)
-        self._sums = sums
+        self._sums, self._first = sums, first
+
+    @property
+    def first(self) -> float | None:
+        """Mean return of each simulation's first episode; None before all have ended: what has is the short ones."""
+        return None if self._first is None or self._first.isnan().any() else float(self._first.mean())
 
     def forget(self, rows: slice) -> None:
         """The running episodes of some simulations, which begin anew without having ended."""

@@ -190,3 +190,23 @@ def test_episodes_are_counted_across_batches() -> None:
         episodes.see(TensorDict({"next": after}, [2, 3]))
     assert episodes.means() == {"return": 5.0, "length": 5.0, "success": 1.0}
     assert episodes.count == 1
+    assert episodes.first is None, "the other simulation's first episode has not ended"
+    done = torch.ones(2, 1, 1, dtype=torch.bool)
+    after = TensorDict({"reward": torch.ones(2, 1, 1), "done": done, "success": done[..., 0]}, [2, 1])
+    episodes.see(TensorDict({"next": after}, [2, 1]))
+    assert episodes.first == (5.0 + 7.0) / 2
+
+
+def test_what_was_measured_of_other_weights_is_not_said_of_these(tmp_path: Path) -> None:
+    policy = load_policy("nfc_gym/JackalFlat-v0")
+    policy.save(tmp_path / "same.safetensors")
+    same = load_policy(tmp_path / "same.safetensors").about
+    assert (same["nominal"], same["steps"]) == (policy.about["nominal"], policy.about["steps"])
+    with torch.no_grad():
+        next(policy.network.parameters()).add_(0.01)
+    policy.save(tmp_path / "other.safetensors")
+    other = load_policy(tmp_path / "other.safetensors").about
+    assert not {"nominal", "steps"} & other.keys()
+    assert other["before"]["nominal"] == same["nominal"]
+    assert other["before"]["weights"] == same["weights"] != other["weights"]
+    assert other["training"] == same["training"]
