@@ -87,6 +87,24 @@ class WindowDetector:
         scores = self.scorer.score(*checked(self.scorer, states, actions))
         return WindowDetector(self.scorer, threshold_at(scores, rate), self.every)
 
+    def require(self, observations: Any, actions: Any) -> None:
+        """Refuse an environment whose transitions cannot be scored.
+
+        Args:
+          observations, actions: Gymnasium's spaces of one simulation.
+
+        Raises:
+          InputError: `proprio` or actions of another size, or a scorer that they do not suffice for.
+        """
+        spaces = _proprio(observations), actions  # a space of several is a mapping
+        wanted = self.scorer.states, self.scorer.actions
+        for name, space, width in zip(("observation", "action"), spaces, wanted, strict=True):
+            if space.shape != (width,):
+                raise InputError(f"detector: an {name} must have {width} entries, and here it has shape {space.shape}")
+        suffices = getattr(self.scorer, "require_observed", None)
+        if suffices is not None:
+            suffices()
+
     def _empty(self) -> None:
         self._states: Array | None = None
 
@@ -157,6 +175,12 @@ class Either:
         if not limits or any(t is None or not t > 0 for t in limits):
             raise InputError(f"Either: want detectors whose thresholds are above 0, got thresholds {limits}")
         self.detectors, self.limits = tuple(detectors), tuple(float(t) for t in limits if t is not None)
+
+    def require(self, observations: Any, actions: Any) -> None:
+        """Refuse an environment that one of them refuses."""
+        for detector in self.detectors:
+            if (ask := getattr(detector, "require", None)) is not None:
+                ask(observations, actions)
 
     def reset(self, rows: NDArray[np.bool_] | None = None) -> None:
         """Of all of them."""

@@ -99,6 +99,10 @@ class Replay:
         self._residuals: Residuals
         self._sims: Simulations | None = None
 
+    def require_observed(self) -> None:
+        """Raises `InputError` for a robot whose `proprio` does not tell its state: windows then need a `start`."""
+        observed(self.machine, np.zeros((0, self.states)))
+
     def under(self, scale: Array, lacks: tuple[Effect, Array] | None = None) -> "Replay":
         """The same draws for a machine with a fault.
 

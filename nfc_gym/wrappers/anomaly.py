@@ -1,6 +1,7 @@
 """`MonitorAnomaly`: a detector that watches the transitions, and what it thinks of them in `info`."""
 
 import os
+from collections.abc import Callable
 from numbers import Real
 from typing import Any, Protocol, runtime_checkable
 
@@ -78,10 +79,15 @@ def _numbers(score: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _updated(env: Any, detector: Detector, obs: Any, action: Any, next_obs: Any) -> Any:
+    return _blaming_goals(env, isinstance(next_obs, dict), lambda: detector.update(obs, action, next_obs))
+
+
+def _blaming_goals(env: Any, apart: bool, call: Callable[[], Any]) -> Any:
+    """What a detector returns; its error says so where goals are in the way, in observations that are not `apart`."""
     try:
-        return detector.update(obs, action, next_obs)
+        return call()
     except InputError as e:
-        if isinstance(next_obs, dict) or not getattr(getattr(env.unwrapped, "robot", None), "goal_size", 0):
+        if apart or not getattr(getattr(env.unwrapped, "robot", None), "goal_size", 0):
             raise
         raise InputError(
             f"{e}; with context=[] an observation is `proprio` and the goal in one: make the environment with "
@@ -89,12 +95,31 @@ def _updated(env: Any, detector: Detector, obs: Any, action: Any, next_obs: Any)
         ) from None
 
 
+def require_fit(env: Any, detector: Detector) -> None:
+    """Refuse a detector that says before the first transition that it cannot score those of an environment.
+
+    Args:
+      env: one, or a vector environment.
+      detector: with `require(observation_space, action_space)` of one simulation, or without.
+
+    Raises:
+      InputError: the detector's own.
+    """
+    ask = getattr(detector, "require", None)
+    if ask is not None:
+        spaces = (getattr(env, f"single_{kind}_space", None) or getattr(env, f"{kind}_space")
+                  for kind in ("observation", "action"))  # fmt: skip
+        observations, actions = spaces
+        _blaming_goals(env, isinstance(observations, gym.spaces.Dict), lambda: ask(observations, actions))
+
+
 class MonitorAnomaly(EnvWrapper):
     """Adds `anomaly` (bool) and `anomaly_score` (float) to every `info`; at a reset False and 0.
 
     Args:
       env: any environment.
-      detector: a `Detector`, or the path of a file that a registered loader opens as one.
+      detector: a `Detector`, or the path of a file that a registered loader opens as one; one with `require` is asked
+        first whether it can score what this environment observes.
       threshold: from which score on a transition counts as an anomaly; default the detector's own `threshold`.
     """
 
@@ -103,6 +128,7 @@ class MonitorAnomaly(EnvWrapper):
     ) -> None:
         super().__init__(env, detector=detector, threshold=threshold)
         self.detector, self.threshold = opened(detector, threshold)
+        require_fit(env, self.detector)
         self._last: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -134,6 +160,7 @@ class VectorMonitorAnomaly(VectorEnvWrapper):
     ) -> None:
         super().__init__(env, detector=detector, threshold=threshold)
         self.detector, self.threshold = opened(detector, threshold)
+        require_fit(env, self.detector)
         self.rows = Rows(env)
         self._last: Any = None
 

@@ -145,6 +145,20 @@ def test_bad_input_is_refused(machine: Machine, replay: Replay) -> None:
         replay.score(np.zeros((1, 51, 15)), np.zeros((1, 50, 2)), np.zeros((1, 3)))
 
 
+@pytest.mark.parametrize("vector", [False, True])
+def test_a_monitor_is_refused_before_the_first_step(replay: Replay, vector: bool) -> None:
+    make_, monitor = (gymnasium.make_vec, VectorMonitorAnomaly) if vector else (gymnasium.make, MonitorAnomaly)
+    ant = Replay("nfc_gym/AntFlat-v0", draws=2)
+    for name, context, scorer, message in (
+        ("AntFlat", ["psi"], ant, "does not determine its state"),
+        ("QuadcopterFlat", ["psi"], replay, r"an observation must have 15 entries, and here it has shape \(21,\)"),
+        ("JackalFlat", [], replay, 'make the environment with context=\\["psi"\\]'),
+    ):
+        with pytest.raises(InputError, match=message):
+            monitor(make_(f"nfc_gym/{name}-v0", context=context), WindowDetector(scorer), threshold=1.0)
+    monitor(make_(JACKAL, context=["psi"]), WindowDetector(replay), threshold=1.0)
+
+
 def test_every_row_of_a_vector_environment_is_replayed_on_its_own_ground() -> None:
     """Two Jackals on two maps: nothing unusual where each is replayed on its own, much where the maps change places."""
     env = gymnasium.make_vec("nfc_gym/JackalRough-v0", num_envs=2, context=["psi"], terrain_pool=2)
