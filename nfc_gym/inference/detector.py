@@ -96,7 +96,9 @@ class WindowDetector:
         Raises:
           InputError: `proprio` or actions of another size, or a scorer that they do not suffice for.
         """
-        spaces = _proprio(observations), actions  # a space of several is a mapping
+        if isinstance(observations, Mapping):  # a space of several, in which `in` asks for samples
+            observations = dict(observations.items())
+        spaces = _proprio(observations), actions
         wanted = self.scorer.states, self.scorer.actions
         for name, space, width in zip(("observation", "action"), spaces, wanted, strict=True):
             if space.shape != (width,):
