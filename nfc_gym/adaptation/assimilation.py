@@ -95,6 +95,8 @@ class Assimilation:
             raise InputError(f"assimilation: {self.environment} is a plane and has no `ground`")
         if not 0 <= self.map_error < 1:
             raise InputError(f"assimilation: map_error is {self.map_error!r}, want metres from 0 up to 1")
+        if self.memory < 0:
+            raise InputError(f"assimilation: memory is {self.memory!r}, want 0 or more earlier trajectories")
         self.structure = structure_of(machine) if self.effects else Structure()
         space = machine.space
         beyond = self.reach * (space.high - space.low)

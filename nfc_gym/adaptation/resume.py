@@ -75,7 +75,7 @@ def load(
     differ = list(differences(told["of"], wanted))
     if differ:
         raise InputError(
-            f"{path} is of another run ({'; '.join(differ)}): remove it to begin anew, or use another --out"
+            f"{path} is of another run ({'; '.join(differ)}): remove it to begin anew, or choose another folder"
         )
     for name, module in modules.items():
         prefix = f"{name}/"

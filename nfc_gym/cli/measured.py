@@ -143,7 +143,8 @@ def predict(
     single column makes a vector (rows,).
 
     A rollout begins at the measured state of a log's first row (with `split: {by: time}`, of each part's), and with
-    --restart anew every S seconds. With `by: rotate` each log is predicted by the fit that did not see its group.
+    --restart anew every S seconds, with what the machine remembers of before. With `by: rotate` each log is predicted
+    by the fit that did not see its group.
 
     Example: nfc-gym predict mapping.yaml --fit result --out predictions.npz
     """

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,39 @@ class Channel:
 
 
 @dataclass(frozen=True)
+class Inputs:
+    """What drove a robot along a stretch of time: of a log all but its measurements.
+
+    Attributes:
+      time: (T,) s, strictly increasing; below 0 before the log itself begins.
+      controls, exogenous, known, servo: as of a `Log`.
+    """
+
+    time: Array
+    controls: Mapping[str, Array]
+    exogenous: Mapping[str, Array]
+    known: Mapping[str, Array]
+    servo: Mapping[str, Mapping[str, Array]]
+
+    def first(self, count: int, zero: float) -> "Inputs":
+        """The first rows, at times that are counted from `zero`, s."""
+        cut = lambda rows: {k: v[:count] for k, v in rows.items()}  # noqa: E731
+        servo = {k: cut(terms) for k, terms in self.servo.items()}
+        return Inputs(self.time[:count] - zero, cut(self.controls), cut(self.exogenous), cut(self.known), servo)
+
+    def then(self, later: "Inputs") -> "Inputs":
+        """These rows and later ones, which hold the same keys."""
+        join = lambda a, b: {k: np.concatenate([a[k], v]) for k, v in b.items()}  # noqa: E731
+        return Inputs(
+            np.concatenate([self.time, later.time]),
+            join(self.controls, later.controls),
+            join(self.exogenous, later.exogenous),
+            join(self.known, later.known),
+            {k: join(self.servo[k], terms) for k, terms in later.servo.items()},
+        )
+
+
+@dataclass(frozen=True)
 class Log:
     """A stretch of a robot's motion: commands in, measurements out.
 
@@ -49,6 +83,8 @@ class Log:
       servo: `ctrl:<actuator>` -> {"gain" | "supply" | "damping": (T,)} of a firmware servo's law.
       group: logs of one group are never split between fitting and verifying where the split is `by: group` or `rotate`.
       condition: label of what the day was like (a wind, a floor); logs of one label share it.
+      before: of a part of a longer log, what drove the robot until the part begins; hidden states are made from it.
+        What was measured then is left out: it may belong to another split.
     """
 
     name: str
@@ -60,6 +96,7 @@ class Log:
     servo: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
     group: str = ""
     condition: str = ""
+    before: Inputs | None = None
 
     def __post_init__(self) -> None:
         if self.time.ndim != 1 or len(self.time) < 2:
@@ -91,9 +128,16 @@ class Log:
         """Median time between samples, s."""
         return float(np.median(np.diff(self.time)))
 
+    @cached_property
+    def inputs(self) -> Inputs:
+        """What drove the robot, from before the log on."""
+        own = Inputs(self.time, self.controls, self.exogenous, self.known, self.servo)
+        return own if self.before is None else self.before.then(own)
+
     def part(self, start: int, stop: int, name: str) -> "Log":
-        """Rows `start:stop` as a log of their own, whose time begins at 0."""
+        """Rows `start:stop` as a log of their own, whose time begins at 0 and which knows what drove it before."""
         rows = slice(start, stop)
+        earlier = len(self.inputs.time) - len(self) + start
 
         def cut(channel: Channel) -> Channel:
             mask = None if channel.mask is None else channel.mask[rows]
@@ -109,4 +153,5 @@ class Log:
             servo={k: {n: v[rows] for n, v in terms.items()} for k, terms in self.servo.items()},
             group=self.group,
             condition=self.condition,
+            before=self.inputs.first(earlier, float(self.time[start])) if earlier else None,
         )

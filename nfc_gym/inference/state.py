@@ -65,6 +65,8 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     Raises:
       InputError: it is truncated, or no such file.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
     try:
         with safe_open(path, "pt") as file:
             return {k: file.get_tensor(k) for k in file.keys()}, file.metadata() or {}  # noqa: SIM118 (no dict)

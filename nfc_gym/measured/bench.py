@@ -12,6 +12,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured import foresight
 from nfc_gym.measured.belief import Belief
+from nfc_gym.measured.buffers import make_room, set_step
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.forward import ForwardProblem
@@ -67,7 +68,8 @@ class Bench:
         states = [self.states[log.name] for log in logs]
         if self.mode != "rollout":
             kind = InverseProblem if self.mode == "inverse" else ForwardProblem
-            return kind(model, logs, states, segments.length, max(1, -(-sum(map(len, self.dataset.logs)) // _SAMPLES)))
+            stride = max(1, -(-sum(map(len, self.dataset.logs)) // _SAMPLES))
+            return kind(model, logs, states, segments.length, stride, self.dataset.mapping.straight)
         return self.rollouts(logs, states, most)
 
     def searched(self, logs: Sequence[Log], most: int | None = None) -> Problem:
@@ -132,12 +134,10 @@ class Bench:
     ) -> RolloutProblem:
         segments, model = self.dataset.mapping.segments, self.plant.model
         length, horizons = (segments.length, segments.horizons) if horizons is None else (horizons[-1], horizons)
-        controls = self.dataset.mapping.controls
-        laws = {k: (c.servo.joint, c.servo.limit) for k, c in controls.items() if c.servo is not None}
-        linear = frozenset(k for k, c in controls.items() if c.hold == "linear")
         layout = Layout(length, segments.history, horizons, length, model.opt.timestep, put_off)
+        laws, straight = self.dataset.mapping.servo_laws, self.dataset.mapping.straight
         return RolloutProblem(
-            model, logs, states, layout, servos(model, laws), linear, settle=segments.start == "settled"
+            model, logs, states, layout, servos(model, laws), straight, settle=segments.start == "settled"
         )
 
 
@@ -149,7 +149,7 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
     """
     spec = read_spec(dataset.mapping.model_file, dataset.folder)
     if dataset.mapping.segments.timestep is not None:
-        spec.option.timestep = dataset.mapping.segments.timestep
+        set_step(spec, dataset.mapping.segments.timestep)
     complete_inertia(spec)  # centres of mass must be free to move: psi and effects shift them
     declared = list(dataset.mapping.declared)
     robot = registered(dataset.mapping.model_file)
@@ -157,7 +157,9 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
         declared = parameters_from_toml(assets.path(robot).with_name("psi.toml"))
     compile_model(spec, dataset.mapping.model_file)  # an error speaks of the model as it was given
     named = {name for entry in (*declared, *dataset.mapping.known) for name in entry.of}
-    model = compile_model(bare(spec, named), dataset.mapping.model_file)
+    moving = bare(spec, named)
+    make_room(moving)
+    model = compile_model(moving, dataset.mapping.model_file)
     known = actuator_names(model)
     for control in dataset.mapping.controls:
         if control.removeprefix("ctrl:") not in known:
@@ -284,8 +286,8 @@ def candidates(bench: Bench, logs: Sequence[Log]) -> list[Effect]:
     found = propose(bench.plant.model, scales(bench, logs), only=choice.only, exclude=choice.exclude)
     if bench.mode == "inverse":
         # Forces are predicted from motion: an effect on commands shows only if it can say what it would ask for.
-        hidden = lambda e: (overrides(e, "action") and not overrides(e, "demand")) or overrides(e, "sense")  # noqa: E731
-        found = [e for e in found if not hidden(e)]
+        hidden = lambda e: overrides(e, "action") and not overrides(e, "demand")  # noqa: E731
+        found = [e for e in found if not (e.driven or hidden(e) or overrides(e, "sense"))]
     if bench.mode != "rollout":  # these change how the next step is made, not what a moment shows
         found = [e for e in found if not overrides(e, "modulate")]
     available = set(logs[0].exogenous)

@@ -101,11 +101,11 @@ def _instant_traces(v: Verified, models: Models) -> list[dict[str, Any]]:
     i = int(problem.log_of[0])
     t = problem.tracks[i]
     curves = {
-        stage: problem.smoothed(problem.evaluate(p, x[None], [t])[0][0])
+        stage: problem.smoothed(problem.evaluate(p, x[None], [t])[0][0], t.mask)
         for stage, p, x in models.items()
         if stage != "nominal"
     }
-    measured = problem.smoothed(np.nan_to_num(t.measured))
+    measured = problem.smoothed(t.measured, t.mask)
     good = np.flatnonzero(t.mask.any(1))
     rows = good[: 3 * _POINTS : max(1, len(good[: 3 * _POINTS]) // _POINTS)]
     what = list(dict.fromkeys(zip(problem.columns.place, problem.columns.unit, strict=True)))

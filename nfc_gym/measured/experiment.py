@@ -103,7 +103,7 @@ class Stage:
             a = actuator_names(model).index(name.removeprefix("ctrl:"))
             for row in range(count):
                 ctrl[row, :, a] = commanded(self.time, commands[row, :, i], at, dt, laws[name].hold == "linear")
-        bound = servos(model, {k: (c.servo.joint, c.servo.limit) for k, c in laws.items() if c.servo is not None})
+        bound = servos(model, self.bench.dataset.mapping.servo_laws)
         hold = lambda v: np.full((count, len(at)), float(np.median(v)))  # noqa: E731
         known = {}
         for key, values in log.known.items():

@@ -85,7 +85,9 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None =
     effects = [copy.deepcopy(e) for e in plant.effects]  # the plant's own are bound to its model
     whole = Plant(model, ParameterSpace(model, plant.space.parameters), effects)
     psi, thetas = whole.split(x)
-    hulls = {b: hull(model, b) for e in effects if isinstance(e, Moved) for b in body_ids(model, e.where).tolist()}
+    # What is not in the model finds these there as it found them in the nominal one.
+    marks = {name: at for e in effects for name, at in e.marks(model).items()}
+    hulls, centres = [hull(model, b) for b in range(model.nbody)], model.body_ipos.copy()
     pairs = list(zip(effects, thetas, strict=True))
     by_fields = [(e, t) for e, t in pairs if _edits_fields_alone(e) and not _moves_frame(e, spec)]
     fields = ModelFields(model, copy.copy(model))
@@ -94,6 +96,9 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None =
         effect.model(fields, theta)
     _soften(fields, whole, x)
     fields.commit()
+    moved = {b for e in effects if isinstance(e, Moved) for b in body_ids(model, e.where).tolist()}
+    moved |= set(np.flatnonzero((model.body_ipos != centres).any(1)).tolist())  # by psi
+    marks |= {hull_mark(model.body(b).name): hulls[b] for b in moved}
     spec.copy_back(model)
     for body in spec.bodies:  # which MuJoCo does not copy
         body.gravcomp = model.body_gravcomp[body.id]
@@ -103,9 +108,8 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None =
     if not any(e.family in READ_COMMANDS for e in outside):
         spec, on_commands = _on_commands(spec, [(e, t) for e, t in pairs if e.on_command])
         carried += on_commands
-    for body, at in hulls.items():  # what is not in the model finds them here, as it found them in the nominal one
-        mark = hull_mark(model.body(body).name)
-        numeric = next((n for n in spec.numerics if n.name == mark), None) or spec.add_numeric(name=mark, size=3)
+    for mark, at in marks.items():
+        numeric = next((n for n in spec.numerics if n.name == mark), None) or spec.add_numeric(name=mark, size=len(at))
         numeric.data = at
     told = mend(spec, model)
     _settle_keys(spec, spec.compile(), keys)

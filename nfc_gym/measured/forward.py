@@ -1,8 +1,6 @@
 """Forward problems: what sensors read at the measured states and commands."""
 
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import mujoco
@@ -12,10 +10,11 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
+from nfc_gym.measured.delivered import Delivered, delivered
 from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.physics.acting import Acting
-from nfc_gym.physics.activations import Activations, delayed, fill_delays, longest_delay
+from nfc_gym.physics.activations import fill_delays, longest_delay
 from nfc_gym.physics.effects.base import overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.rollout import Plant
@@ -48,7 +47,7 @@ class ForwardProblem(InstantProblem):
         ]
         return [np.concatenate([p[i] for p in parts]) for i in range(len(tracks))]
 
-    def _turn(self, plant: Plant, x: Array, tracks: Sequence[Track], commands: Sequence["Delivered"]) -> list[Array]:
+    def _turn(self, plant: Plant, x: Array, tracks: Sequence[Track], commands: Sequence[Delivered]) -> list[Array]:
         count = len(x)
         lengths = [len(t.time) for t in tracks]
         samples = sum(lengths)
@@ -109,64 +108,3 @@ def _written(batch: Batch, plant: Plant, x: Array) -> ModelFields:
         if values is not None:
             batch.expand(name)[...] = np.repeat(values, batch.nsim // len(x), 0)
     return ModelFields(batch, plant.model)
-
-
-@dataclass(frozen=True)
-class Delivered:
-    """What reaches the actuators at the samples of a track, for each of P parameter vectors.
-
-    Attributes:
-      ctrl: (P, T, nu) commands after the effects on them.
-      passed: (P, T, nu) what the actuators' own delays let through of them.
-      act: (P, T, na) activations when a sample's command comes, which they have not felt yet.
-    """
-
-    ctrl: Array
-    passed: Array
-    act: Array
-
-    def of(self, some: slice) -> "Delivered":
-        """The same for some of the parameter vectors."""
-        return Delivered(self.ctrl[some], self.passed[some], self.act[some])
-
-
-def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Delivered]:
-    """What reaches the actuators along each track at parameter vectors (P, size).
-
-    Commands are held from sample to sample; what remembers them goes on in steps of the physics in between.
-    """
-    commanding = [i for i, e in enumerate(plant.effects) if overrides(e, "action")]
-    model, count, longest = plant.model, len(x), max(len(t.time) for t in tracks)
-    pad = lambda a: np.concatenate([a, np.repeat(a[-1:], longest - len(a), 0)])  # noqa: E731
-    held = np.stack([pad(t.held) for t in tracks])
-    rows, dt = held.shape[2], tracks[0].dt
-    exogenous = {k: np.stack([pad(t.exogenous[k]) for t in tracks]) for k in tracks[0].exogenous}
-    thetas = [np.repeat(th, len(tracks), 0).reshape(count, len(tracks), -1) for th in plant.split(x)[1]]
-    out = np.broadcast_to(held[:, :, 0], (count, *held[:, :, 0].shape)).copy()
-    passed, act = out, np.zeros((*out.shape[:-1], model.na))
-    late = longest_delay(model)
-    if commanding or model.na or late:
-        start = out[:, :, 0].copy()
-        # Steps of the physics from one row of the log to the next.
-        parts = max(1, round(dt / rows / model.opt.timestep))
-        step = dt / (rows * parts)
-        memories = {i: plant.effects[i].state0(start.shape[:-1], start, thetas[i], step) for i in commanding}
-        if not late and all(m is None for m in memories.values()):
-            parts, step = 1, dt / rows  # where activations get to under a command that is held is known at once
-        passed = out.copy() if late else out
-        activations, state = Activations(model, step), np.zeros((*start.shape[:-1], model.na))
-        recent = deque[Array](maxlen=late + 1)
-        for k in range(longest):
-            signals = {n: np.broadcast_to(s[:, k], start.shape[:-1]) for n, s in exogenous.items()}
-            for part in range(rows * parts):
-                u = np.broadcast_to(held[:, k, part // parts], start.shape)
-                for i in commanding:
-                    u, memories[i] = plant.effects[i].action(u, thetas[i], memories[i], signals, step)
-                recent.append(u)
-                through = delayed(model, recent, step)
-                if part == 0:
-                    if k == 0:
-                        activations.advance(through, state, settle=True)
-                    out[:, :, k], passed[:, :, k], act[:, :, k] = u, through, state
-                activations.advance(through, state)
-    return [Delivered(*(a[:, i, : len(t.time)] for a in (out, passed, act))) for i, t in enumerate(tracks)]

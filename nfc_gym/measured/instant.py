@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.problem import Columns, Problem
-from nfc_gym.measured.smoothing import moving_average
+from nfc_gym.measured.smoothing import covered, moving_average
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import Context, actuator_names
 from nfc_gym.physics.effects.conditions import Conditioned
@@ -31,7 +31,8 @@ class Track:
     """One log thinned to every `stride`-th sample: what the model is evaluated at, and what it is compared with.
 
     `wanted` (T,) says at which samples a prediction is asked for; None is all, and a problem may give more. `held`
-    (T, stride, nu) are the commands from each sample on until the next, those of the rows between them among these.
+    (T, stride, nu) are the commands from each sample on until the next, those of the rows between them among these;
+    `linear` (nu,) says of which of them the ways from row to row are straight, and not steps.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Track:
     qvel: Array
     qacc: Array
     held: Array
+    linear: NDArray[np.bool_]
     exogenous: dict[str, Array]
     known: dict[tuple[str, tuple[str, ...]], Array]
     measured: Array
@@ -55,9 +57,21 @@ class Track:
         return self.held[:, 0]
 
 
-def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[str], stride: int) -> Track:
-    """Thin a log; measured columns of all channels are set side by side."""
+def track(
+    model: mujoco.MjModel,
+    log: Log,
+    states: States,
+    channels: Sequence[str],
+    stride: int,
+    linear: frozenset[str] = frozenset(),
+) -> Track:
+    """Thin a log; measured columns of all channels are set side by side.
+
+    Args:
+      linear: names of commands that go straight from row to row (`ctrl:<actuator>`); all others are held.
+    """
     rows = slice(None, None, stride)
+    straight = np.array([f"ctrl:{name}" in linear for name in actuator_names(model)], bool)
     ctrl = np.zeros((-(-len(log) // stride) * stride, model.nu))
     for key, values in log.controls.items():
         a = actuator_names(model).index(key.removeprefix("ctrl:"))
@@ -75,7 +89,7 @@ def track(model: mujoco.MjModel, log: Log, states: States, channels: Sequence[st
         noise += [channel_noise(log, name)] * values.shape[1]
     return Track(
         log.name, log.time[rows], log.interval * stride,
-        states.qpos[rows], states.qvel[rows], states.qacc[rows], ctrl.reshape(-1, stride, model.nu),
+        states.qpos[rows], states.qvel[rows], states.qacc[rows], ctrl.reshape(-1, stride, model.nu), straight,
         {k: v[rows] for k, v in log.exogenous.items()}, known,
         np.concatenate(columns, 1)[rows], np.concatenate(masks, 1)[rows], np.array(noise), log.condition,
     )  # fmt: skip
@@ -91,15 +105,29 @@ def still(model: mujoco.MjModel, dt: float, q: Array, v: Array, ctrl: Array, exo
 
 
 class InstantProblem(Problem):
-    """Blocks of consecutive samples; a subclass says what is predicted along a whole track."""
+    """Blocks of consecutive samples; a subclass says what is predicted along a whole track.
+
+    Args:
+      states: along each of the logs.
+      length: s, of a block.
+      stride: rows of a log from sample to sample.
+      linear: see `track`.
+    """
 
     def __init__(
-        self, model: mujoco.MjModel, logs: Sequence[Log], states: Sequence[States], length: float, stride: int = 1
+        self,
+        model: mujoco.MjModel,
+        logs: Sequence[Log],
+        states: Sequence[States],
+        length: float,
+        stride: int = 1,
+        linear: frozenset[str] = frozenset(),
     ) -> None:
         self.channels = self.compared(model, logs[0])
         self.smooth = max(logs[0].channels[c].smooth for c in self.channels)
         self.stride = stride if self.smooth == 1 else min(stride, max(1, self.smooth // 3))
-        self.tracks = [track(model, log, s, self.channels, self.stride) for log, s in zip(logs, states, strict=True)]
+        kept = self.channels, self.stride, linear
+        self.tracks = [track(model, log, s, *kept) for log, s in zip(logs, states, strict=True)]
         self.names = tuple(log.name for log in logs)
         self._layout(model, length)
 
@@ -139,9 +167,14 @@ class InstantProblem(Problem):
             tuple(w[0] for w in what), tuple(w[1] for w in what), np.zeros(len(what)), tuple(w[2] for w in what)
         )
 
-    def smoothed(self, values: Array) -> Array:
-        """Moving average (T, C) over the samples that remain of the declared width."""
-        return moving_average(values, max(1, self.smooth // self.stride))
+    @property
+    def window(self) -> int:
+        """Samples that remain of the declared width of the moving average."""
+        return max(1, self.smooth // self.stride)
+
+    def smoothed(self, values: Array, mask: NDArray[np.bool_]) -> Array:
+        """Moving average (T, C) of the values that count."""
+        return moving_average(values, self.window, mask)
 
     def turns(self, count: int, tracks: Sequence[Track]) -> list[slice]:
         """Parameter vectors that are evaluated together, so that memory stays bounded whatever their number."""
@@ -169,13 +202,13 @@ class InstantProblem(Problem):
             t = self.tracks[i]
             where = np.flatnonzero(self.log_of == i)
             for p in range(len(x)):
-                error = self.smoothed(np.where(np.isfinite(t.measured), t.measured, 0) - values[p])
+                error = self.smoothed(t.measured - values[p], t.mask)
                 out[p, where] = error[self.rows[where]].reshape(len(where), -1)
         return np.where(self.mask, out, 0.0)
 
     def _wanted(self, log: int) -> NDArray[np.bool_]:
         """Samples of a track that its blocks are smoothed from."""
-        reach = max(1, self.smooth // self.stride)
+        reach = self.window
         read = np.zeros(len(self.tracks[log].time))
         read[self.rows[self.log_of == log]] = 1.0
         return np.convolve(read, np.ones(2 * reach + 1))[reach : reach + len(read)] > 0.5
@@ -183,10 +216,13 @@ class InstantProblem(Problem):
     def covariance(self, plant: Plant, x: Array) -> Array:
         """Sensor noise alone: what the differentiated motion adds is unknown and lands in the unexplained variance."""
         width = self.mask.shape[1]
-        kernel = max(1, self.smooth // self.stride)
         noise = np.stack([np.tile(self.tracks[i].noise, width // len(self.tracks[i].noise)) for i in self.log_of])
+        # A mean of the few samples at an end, or beside masked ones, has more noise than one of a whole window.
+        share = {i: covered(self.tracks[i].mask, self.window) for i in np.unique(self.log_of)}
+        held = np.stack([share[i][r].ravel() for i, r in zip(self.log_of, self.rows, strict=True)])
         sigma = np.zeros((len(self), width, width))
-        sigma[:, np.arange(width), np.arange(width)] = np.maximum(noise, 1e-9) ** 2 / kernel
+        variance = np.maximum(noise, 1e-9) ** 2 / self.window / np.where(self.mask, held, 1.0)
+        sigma[:, np.arange(width), np.arange(width)] = variance
         return sigma
 
     def motion(self, model: mujoco.MjModel) -> Context:

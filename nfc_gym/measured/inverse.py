@@ -203,12 +203,13 @@ class _Needed:
 
     def actuation(self) -> Array:
         """(T, nu) forces of the actuators, effects on these included."""
-        model, t = self.motion.model, self.motion.track
-        out = self.force @ np.linalg.pinv(levers(model))
+        motion, t = self.motion, self.motion.track
+        out = self.force @ np.linalg.pinv(levers(motion.model))
         # From the force back to the command: what acts last on the way there is undone first.
-        for effect, theta in reversed(list(zip(self.plant.effects, self._thetas, strict=True))):
-            if overrides(effect, "demand"):
-                out = effect.demand(out, theta, t.exogenous, t.dt)
+        pairs = [(e, th) for e, th in zip(self.plant.effects, self._thetas, strict=True) if overrides(e, "demand")]
+        ctx = Context(motion.model, t.dt, t.qpos, t.qvel, t.ctrl, t.exogenous, self.data, motion.nominal)
+        for effect, theta in reversed(sorted(pairs, key=lambda pair: pair[0].on_command)):
+            out = effect.demand(out, theta, ctx)
         return out
 
 

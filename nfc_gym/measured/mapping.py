@@ -66,6 +66,16 @@ class Mapping(Strict):
     segments: Segments = Segments()
     effects: EffectChoice = EffectChoice()
 
+    @property
+    def straight(self) -> frozenset[str]:
+        """Commands that go straight from row to row; all others are held."""
+        return frozenset(name for name, c in self.controls.items() if c.hold == "linear")
+
+    @property
+    def servo_laws(self) -> dict[str, tuple[str, float]]:
+        """Joint and limit of the firmware servo of each command that has one."""
+        return {name: (c.servo.joint, c.servo.limit) for name, c in self.controls.items() if c.servo is not None}
+
     @field_validator("channels")
     @classmethod
     def _channels(cls, value: dict[str, Measured]) -> dict[str, Measured]:

@@ -1,8 +1,8 @@
 """`predict`: what the nominal, calibrated or extended model says of every log, one array a log."""
 
+import itertools
 import json
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,12 +17,14 @@ from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.export import unpack
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
-from nfc_gym.measured.segments import Layout, servos
+from nfc_gym.measured.segments import Cut, Layout, servos
 from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.measured.splits import find_logs
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
+_HISTORY = 5.0  # s, at least, of the past that hidden states are led through: ten times the longest lag of a drive
+_ABREAST = 256  # pieces, at most: their histories must fit in memory
 
 
 def predict(
@@ -130,14 +132,14 @@ def _predict(
         return {log.name: _roll(bench, plant, x, log, restart, of) for log in logs}
     kind = InverseProblem if mode == "inverse" else ForwardProblem
     states = [bench.states[log.name] for log in logs]
-    problem = kind(bench.plant.model, logs, states, bench.dataset.mapping.segments.length)
+    mapping = bench.dataset.mapping
+    problem = kind(bench.plant.model, logs, states, mapping.segments.length, linear=mapping.straight)
     values = problem.along(plant, x[None], problem.tracks)
     return {log.name: v[0][:, 0] if v.shape[-1] == 1 else v[0] for log, v in zip(logs, values, strict=True)}
 
 
 def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None, of: str) -> Array:
     """One open-loop roll-out of a log by the model `of`, or pieces of `restart` seconds, at the log's own samples."""
-    mapping = bench.dataset.mapping
     dt = float(plant.model.opt.timestep)
     if restart is not None and not restart >= max(dt, log.interval):
         raise InputError(
@@ -147,36 +149,49 @@ def _roll(bench: Bench, plant: Plant, x: Array, log: Log, restart: float | None,
     length = min(restart, log.duration) if restart else log.duration
     starts = np.searchsorted(log.time, np.arange(0.0, log.duration, length) - 1e-9) if restart else np.array([0])
     starts = np.unique(starts[starts < len(log) - 1])  # a last row alone is the end of the piece before it
-    laws = servos(
-        plant.model, {k: (c.servo.joint, c.servo.limit) for k, c in mapping.controls.items() if c.servo is not None}
-    )
-    linear = frozenset(k for k, c in mapping.controls.items() if c.hold == "linear")
-    pieces = []
-    for i, begin in enumerate(starts):
-        end = int(starts[i + 1]) if i + 1 < len(starts) else len(log)
-        part = log.part(int(begin), max(end, int(begin) + 2), log.name)
-        states = _slice(bench.states[log.name], int(begin), max(end, int(begin) + 2))
-        layout = Layout(part.duration, 0.0, (part.duration,), part.duration + 1, dt)
-        problem = RolloutProblem(
-            plant.model, [part], [states], layout, laws, linear, settle=mapping.segments.start == "settled"
-        )
+    ends = np.append(starts[1:], len(log))
+    pieces: list[Array] = []
+    for some in _alike(log, starts):
+        problem = _begun(bench, plant, log, starts[some], np.maximum(ends[some] - 1, starts[some] + 1))
         values, traj = problem.predict(plant, x[None], problem.segments, problem.observers)
         if not traj.stable.all():
             raise InputError(
                 f"log {log.name!r}: the simulation is unstable with {of}; shorten segments.timestep or use --restart"
             )
-        step = (part.time / dt)[None]
-        columns = [interpolate(v, step, o.quaternion)[0, 0] for v, o in zip(values, problem.observers, strict=True)]
-        pieces.append(np.concatenate(columns, -1)[: end - begin])
+        for i, (begin, end) in enumerate(zip(starts[some], ends[some], strict=True)):
+            step = ((log.time[begin:end] - log.time[begin]) / dt)[None]
+            pairs = zip(values, problem.observers, strict=True)
+            columns = [interpolate(v[:, i : i + 1], step, o.quaternion)[0, 0] for v, o in pairs]
+            pieces.append(np.concatenate(columns, -1))
     out = np.concatenate(pieces)
     return out[:, 0] if out.shape[1] == 1 else out
 
 
-def _slice(states: Any, start: int, stop: int) -> Any:
-    from dataclasses import replace
+def _alike(log: Log, starts: NDArray[np.intp]) -> list[slice]:
+    """Pieces that are rolled out side by side: all but a first one that nothing came before, and the last one.
 
-    keys = ("qpos", "qvel", "qacc", "qpos_sd", "qvel_sd")
-    return replace(states, **{k: getattr(states, k)[start:stop] for k in keys})
+    Of these the one needs no history, and the other may end far sooner: under commands held beyond the log's end it
+    might come apart.
+    """
+    last = len(starts) - 1
+    edges = {0, *range(0 if log.before else 1, last, _ABREAST), last, last + 1}
+    return [slice(a, b) for a, b in itertools.pairwise(sorted(edges))]
+
+
+def _begun(bench: Bench, plant: Plant, log: Log, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> RolloutProblem:
+    """Roll-outs of a log from rows to rows (S,); what remembers is led along what the log shows before them."""
+    mapping, dt = bench.dataset.mapping, float(plant.model.opt.timestep)
+    known = log.time[starts[0]] - log.inputs.time[0]  # s before the first of them
+    history = max(mapping.segments.history, _HISTORY) if known > 0 else 0.0
+    length = float(np.max(log.time[ends] - log.time[starts]))
+    layout = Layout(length, history, (length,), length, dt)
+    where = Cut(
+        np.zeros(len(starts), np.intp), starts, ends[:, None], ((log.time[ends] - log.time[starts]) / dt)[:, None]
+    )
+    return RolloutProblem(
+        plant.model, [log], [bench.states[log.name]], layout, servos(plant.model, mapping.servo_laws), mapping.straight,
+        settle=mapping.segments.start == "settled", where=where,
+    )  # fmt: skip
 
 
 def _join(results: dict[str, Array], files: frozenset[str]) -> dict[str, Array]:

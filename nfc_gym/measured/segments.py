@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.core.log import Log
+from nfc_gym.core.log import Inputs, Log
 from nfc_gym.measured.states import States
 from nfc_gym.physics.effects.base import TIME
 from nfc_gym.physics.past import Before, Past
 from nfc_gym.physics.segments import Segments, Servo
 
 Array = NDArray[np.float64]
-_LEAD = 200  # steps that a log's commands before the history are thinned to
+# A log's commands before the history are thinned to as many steps as numbers of all starts together have room for.
+_LEAD, _LEAST, _ROOM = 4000, 200, 1_000_000
 _STEP, _SHARE = 8.0, 0.02  # times its usual change from row to row, and of its range, from which a command steps
 _AROUND = 3  # rows on either side of a start from which its state is estimated
 _SETTLED = 0.05  # s after a step in which late drives may still pass it on
@@ -182,6 +183,20 @@ def _integral(time: Array, values: Array, at: Array) -> Array:
     return np.interp(at, time, total) + beyond
 
 
+def _thinned(time: Array, values: Array, edges: Array) -> Array:
+    """A held command (T,) as slow effects may take it: in n steps of equal length, n even, between times (..., n + 1).
+
+    Of every two steps the mean and the mean square are kept, and not each one's own mean: what heats a drive is the
+    square of its command, and one that changes faster than the steps must not look like rest.
+    """
+    shape = *edges.shape[:-1], -1, 2
+    means, squares = ((np.diff(_integral(time, v, edges)) / np.diff(edges)).reshape(shape) for v in (values, values**2))
+    middle = means.mean(-1)
+    spread = np.sqrt(np.maximum(squares.mean(-1) - middle**2, 0.0))
+    spread *= np.where(middle < 0, -1.0, 1.0) * np.where(squares[..., 0] > squares[..., 1], 1.0, -1.0)  # hotter first
+    return np.stack([middle + spread, middle - spread], -1).reshape(*edges.shape[:-1], -1)
+
+
 def servos(model: mujoco.MjModel, laws: Mapping[str, tuple[str, float]]) -> dict[str, Servo]:
     """`ctrl:<actuator>` -> (joint, limit) bound to the model's addresses."""
     out = {}
@@ -212,9 +227,9 @@ def lay(
     offsets = np.arange(-before, after) * layout.dt
     starts = [logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)]
 
-    def lane(series: Callable[[Log], Array], law: Callable[[Array, Array, Array], Array]) -> Array:
+    def lane(series: Callable[[Inputs], Array], law: Callable[[Array, Array, Array], Array]) -> Array:
         along = zip(where.log, starts, strict=True)
-        return np.stack([law(logs[i].time, series(logs[i]), t + offsets) for i, t in along])
+        return np.stack([law(logs[i].inputs.time, series(logs[i].inputs), t + offsets) for i, t in along])
 
     held, straight = partial(resample, linear=False), partial(resample, linear=True)
     ctrl = np.zeros((len(where.log), len(offsets), model.nu))
@@ -241,7 +256,7 @@ def lay(
         known=known,
         servo=servo,
         condition=np.array([logs[i].condition for i in where.log]),
-        past=Past(_Backwards(model, tuple(logs), tuple(states), where, layout), np.arange(len(where.log))),
+        past=Past(_Backwards(model, tuple(logs), tuple(states), where, layout, linear), np.arange(len(where.log))),
         channels=frozenset(logs[0].channels),
     )
 
@@ -289,6 +304,7 @@ class _Backwards:
     states: tuple[States, ...]
     where: Cut
     layout: Layout
+    linear: frozenset[str]
 
     def __call__(self, index: NDArray[np.intp]) -> Before:
         dt = self.layout.dt
@@ -298,17 +314,34 @@ class _Backwards:
             for i, s in zip(self.where.log[index], self.where.start[index], strict=True)
         ]
         motion = [_motion(log, states, log.time[s] + offsets) for log, states, s in of]
-        lengths = np.array([log.time[s] + offsets[0] - log.time[0] for log, _, s in of])
-        longest = max(float(lengths.max(initial=0.0)), 0.0)
-        count = min(_LEAD, int(np.ceil(longest / dt)))
-        step = longest / count if count else 0.0
-        lead = np.zeros((len(index), count, self.model.nu))
-        for row, (log, _, s) in enumerate(of):
-            at = log.time[s] + offsets[0] - (np.arange(count, 0, -1) - 0.5) * step
-            for key, values in log.controls.items():
-                a = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, key.removeprefix("ctrl:"))
-                lead[row, :, a] = resample(log.time, values, at, False)
+        lead, step = self._lead(index, float(offsets[0]))
         return Before(np.stack([q for q, _ in motion]), np.stack([v for _, v in motion]), lead, step)
+
+    def _lead(self, index: NDArray[np.intp], begin: float) -> tuple[Array, float]:
+        """(n, B, nu) commands up to where histories `begin`, s after the starts, and the length of their steps, s.
+
+        B is that of all of the cut's starts, whichever are asked for: parts of a problem predict what the whole does.
+        """
+        model, where = self.model, self.where
+        starts = np.array([self.logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)]) + begin
+        longest = float(np.max(starts - np.array([log.inputs.time[0] for log in self.logs])[where.log]))
+        whole = max(int(np.ceil(longest / self.layout.dt - 1e-6)), 0)
+        most = int(np.clip(_ROOM // max(len(starts) * model.nu, 1), _LEAST, _LEAD)) // 2 * 2
+        count = min(whole, most)
+        lead, step = np.zeros((len(index), count, model.nu)), longest / count if count else 0.0
+        for i in np.unique(where.log[index]) if count else ():
+            rows, inputs = np.flatnonzero(where.log[index] == i), self.logs[i].inputs
+            edges = starts[index[rows], None] - np.arange(count, -1, -1) * step
+            for key, values in inputs.controls.items():
+                a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, key.removeprefix("ctrl:"))
+                linear = key in self.linear
+                if count == whole:
+                    made = commanded(inputs.time, values, edges[:, :-1].ravel(), step, linear).reshape(len(rows), count)
+                else:  # a roll-out holds through each of its steps what is interpolated too
+                    time = np.arange(inputs.time[0], inputs.time[-1], self.layout.dt) if linear else inputs.time
+                    made = _thinned(time, resample(inputs.time, values, time, linear), edges)
+                lead[rows, :, a] = made
+        return lead, step
 
 
 def _motion(log: Log, states: States, at: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.log import Log
+from nfc_gym.measured.buffers import require_room
 from nfc_gym.measured.draws import across
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.measured.problem import Columns, Problem
@@ -68,7 +69,14 @@ class _Kit:
 
 
 class RolloutProblem(Problem):
-    """Segments that start at measured states; states are compared at several horizons."""
+    """Segments that start at measured states; states are compared at several horizons.
+
+    Args:
+      states: along each of the logs.
+      servos, linear: see `lay`.
+      settle: hold the first command before each start (`Segments.settle`).
+      where: the segments, in place of those that `cut` places by the layout.
+    """
 
     def __init__(
         self,
@@ -79,8 +87,9 @@ class RolloutProblem(Problem):
         servos: Mapping[str, Servo] | None = None,
         linear: frozenset[str] = frozenset(),
         settle: bool = False,
+        where: Cut | None = None,
     ) -> None:
-        where = cut(logs, layout)
+        where = cut(logs, layout) if where is None else where
         self._kit = _Kit(model, tuple(logs), tuple(states), layout, servos or {}, linear, settle)
         self._observers = [o for key, c in logs[0].channels.items() if (o := observer(model, key, c.axes)) is not None]
         self.names = tuple(log.name for log in logs)
@@ -377,7 +386,11 @@ class RolloutProblem(Problem):
 
 
 def finer(plant: Plant) -> Plant:
-    """The same plant with half the physics step."""
+    """The same plant with half the physics step.
+
+    Raises:
+      InputError: a native delay of the model would be shorter (see `buffers`).
+    """
     return Plant(_stepped(plant.model, 0.5), plant.space, plant.effects, plant.nthread)
 
 
@@ -391,4 +404,5 @@ def _stepped(model: mujoco.MjModel, times: float) -> mujoco.MjModel:
     """The model at so many times its step; one and the same for who asks again, so that a residual is known again."""
     model = copy.copy(model)
     model.opt.timestep *= times
+    require_room(model, model.opt.timestep)
     return model

@@ -14,7 +14,7 @@ from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
 from nfc_gym.measured.speed_checks import DEGREES, TURN, explained, rate_ratio, ratio, strangers, too_fast
 from nfc_gym.measured.start_checks import open_loops
-from nfc_gym.physics.effects.drive import command_unit
+from nfc_gym.physics.effects.drive import command_unit, is_position
 
 Array = NDArray[np.float64]
 
@@ -230,7 +230,7 @@ def _position_commands(joint: str, log: Log, model: mujoco.MjModel | None) -> It
         return
     for name, values in log.controls.items():
         a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name.removeprefix("ctrl:"))
-        if a < 0 or (model.actuator_biasprm[a, 1] == 0 and name not in log.servo):
+        if a < 0 or not (is_position(model, a) or name in log.servo):
             continue
         if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, int(model.actuator_trnid[a, 0])) == joint:
             yield values

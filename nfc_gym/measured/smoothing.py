@@ -1,4 +1,4 @@
-"""Local polynomial regression of a sampled signal: value, slope, curvature, their noise gain; noise level."""
+"""Local polynomial regression of a sampled signal: value, slope, curvature, their noise gain; noise level; means."""
 
 from dataclasses import dataclass
 
@@ -78,11 +78,42 @@ def estimate_noise(values: Array) -> float:
     return float(max(noise, quantum))
 
 
-def moving_average(values: Array, samples: int) -> Array:
-    """Centred moving average along the first axis; the ends are zero-padded as by `numpy.convolve(..., "same")`."""
+def moving_average(values: Array, samples: int, mask: NDArray[np.bool_] | None = None) -> Array:
+    """Mean over a centred window along the first axis, of the samples that there are: fewer at the ends.
+
+    Args:
+      values: (T, ...).
+      samples: width of the window.
+      mask: (T, ...) which values count, whatever stands in the others; None is all. Where none in the window does, 0.
+    """
+    if mask is not None:
+        values = np.where(mask, values, 0.0)
+    elif samples <= 1:
+        return values
+    share = covered(np.ones(values.shape, bool) if mask is None else mask, samples)
+    return _windowed(values, samples) / np.where(share > 0, share, 1.0)
+
+
+def centred_average(values: Array, samples: int) -> Array:
+    """The same (T,), but narrower at the ends, so that a window reaches as far to either side: no slope moves it."""
+    out, size = moving_average(values, samples).copy(), len(values)
+    for k in range(min(samples // 2, size)):
+        for at in (k, size - 1 - k):
+            reach = min(at, size - 1 - at)
+            out[at] = values[at - reach : at + reach + 1].mean()
+    return out
+
+
+def covered(mask: NDArray[np.bool_], samples: int) -> Array:
+    """Share of a centred window of so many samples that counts, (T, ...) as the mask; exactly 1 where all do."""
+    return np.rint(_windowed(mask.astype(float), samples) * samples) / samples
+
+
+def _windowed(values: Array, samples: int) -> Array:
+    """Sums over the window divided by its width, with zeros beyond the ends."""
     if samples <= 1:
         return values
     kernel = np.ones(samples) / samples
-    columns = values.reshape(len(values), -1)
-    out = np.stack([np.convolve(c, kernel, "same") for c in columns.T], -1)
+    columns, cut = values.reshape(len(values), -1), (samples - 1) // 2
+    out = np.stack([np.convolve(c, kernel)[cut : cut + len(c)] for c in columns.T], -1)
     return out.reshape(values.shape)

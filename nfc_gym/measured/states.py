@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Channel, Log
 from nfc_gym.measured.channels import parse_channel
-from nfc_gym.measured.smoothing import Local, estimate_noise, fresh_samples, local_polynomial, moving_average
+from nfc_gym.measured.smoothing import Local, centred_average, estimate_noise, fresh_samples, local_polynomial
 from nfc_gym.physics.effects.sensors import RATES, SPEEDS
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back, vector_to_quat
 
@@ -71,6 +71,14 @@ def _smooth(log: Log, channel: Channel, values: Array, points: int, raw: bool) -
     return replace(fit, value=value)
 
 
+def _averaged(log: Log, channel: Channel) -> Array:
+    """(T,) a channel's moving average of the declared width; rows that are masked take the course between others."""
+    values = channel.values
+    if channel.mask is not None and not channel.mask.all() and channel.mask.any():
+        values = np.interp(log.time, log.time[channel.mask], values[channel.mask])
+    return centred_average(values, channel.smooth)
+
+
 class _Builder:
     def __init__(self, model: mujoco.MjModel, log: Log, points: int, raw: bool) -> None:
         self.model, self.log, self.points, self.raw = model, log, points, raw
@@ -109,7 +117,7 @@ class _Builder:
                 steps = np.diff(self.log.time) * (self.qvel[1:, v] + self.qvel[:-1, v]) / 2
                 self.qpos[:, q] = self.model.qpos0[q] + np.concatenate([[0], np.cumsum(steps)])
         if acceleration is not None:
-            self.qacc[:, v] = moving_average(acceleration[1].values, acceleration[1].smooth)
+            self.qacc[:, v] = _averaged(self.log, acceleration[1])
 
     def free(self, body: str, q: int, v: int) -> None:
         """A free joint: position and world velocity, quaternion and body-frame rates."""

@@ -1,6 +1,6 @@
 """What MuJoCo keeps of past commands, made for roll-outs that start in the middle of a log."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import mujoco
@@ -9,6 +9,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.recurrence import chased
 
 Array = NDArray[np.float64]
 _INTEGRATOR, _AFFINE = int(mujoco.mjtDyn.mjDYN_INTEGRATOR), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -47,7 +48,7 @@ class Activations:
         self._clip, self._bound = (_ends(model, self._of, kind) for kind in ("ctrl", "act"))
         self._keep = np.exp(-dt / np.maximum(model.actuator_dynprm[filters, 0], 1e-9))
         self._carried, self._reach = _carried(model, self._servos), _ends(model, self._servos, "act")
-        self._targets = model.actuator_actadr[self._servos]
+        self._targets, self._count = model.actuator_actadr[self._servos], model.na
 
     def __bool__(self) -> bool:
         """Whether the model has any."""
@@ -67,6 +68,26 @@ class Activations:
             new[..., :cut] += self._keep * (old[..., :cut] - wish[..., :cut])
         new[..., cut:] = old[..., cut:] if settle else old[..., cut:] + self._dt * wish[..., cut:]
         act[..., self._at] = np.clip(new, *self._bound)
+
+    def course(self, ctrl: Array) -> Array:
+        """States (..., T, na) as each of the commands (..., T, nu) comes: settled at the first, then by `advance`."""
+        out = np.zeros((*ctrl.shape[:-1], self._count))
+        if not self:
+            return out
+        self.advance(ctrl[..., 0, :], out[..., 0, :], settle=True)
+        wish, cut, at = np.clip(ctrl[..., :-1, self._of], *self._clip), self._filters, self._at
+        start = out[..., 0, at]
+        sums = np.cumsum(np.concatenate([start[..., None, cut:], self._dt * wish[..., cut:]], -2), -2)
+        filtered = chased(wish[..., :cut], np.broadcast_to(self._keep, start[..., :cut].shape), start[..., :cut])
+        led = np.concatenate([filtered, sums[..., 1:, :]], -1)
+        low, high = self._bound
+        if (led >= low).all() and (led <= high).all():
+            out[..., 1:, at] = led
+            return out
+        for k in range(ctrl.shape[-2] - 1):  # a bound holds one back, and it goes on from there
+            out[..., k + 1, :] = out[..., k, :]
+            self.advance(ctrl[..., k, :], out[..., k + 1, :])
+        return out
 
     def begin(self, batch: Batch, fields: ModelFields) -> None:
         """Bring the integrators of servos to where their joints show them to be, in every simulation of a batch.
@@ -132,15 +153,29 @@ def longest_delay(model: mujoco.MjModel) -> int:
 def delayed(model: mujoco.MjModel, commands: Sequence[Array], dt: float) -> Array:
     """The command (..., nu) that MuJoCo's native delays let through of `commands`, the latest last."""
     latest = out = commands[-1]
-    for i in np.flatnonzero((model.actuator_history[:, 0] > 0) & (model.actuator_delay > 0)):
+    for i, share, ages in _lateness(model, dt):
         if out is latest:
             out = latest.copy()
-        steps = float(model.actuator_delay[i]) / dt
-        older = int(np.ceil(steps - 1e-9))
-        share = older - steps if model.actuator_history[i, 1] else 0.0  # of the younger sample; else held
-        old, young = (commands[max(len(commands) - 1 - age, 0)][..., i] for age in (older, older - 1))
+        old, young = (commands[max(len(commands) - 1 - age, 0)][..., i] for age in ages)
         out[..., i] = old + share * (young - old)
     return out
+
+
+def delayed_course(model: mujoco.MjModel, ctrl: Array, dt: float) -> Array:
+    """What `delayed` lets through along a whole course of commands (..., T, nu); the first was held since ever."""
+    out, at = ctrl.copy(), np.arange(ctrl.shape[-2])
+    for i, share, ages in _lateness(model, dt):
+        old, young = (ctrl[..., np.maximum(at - age, 0), i] for age in ages)
+        out[..., i] = old + share * (young - old)
+    return out
+
+
+def _lateness(model: mujoco.MjModel, dt: float) -> Iterator[tuple[int, float, tuple[int, int]]]:
+    """Actuators that delay their commands, the younger sample's share, and ages in steps of the older and younger."""
+    for i in np.flatnonzero((model.actuator_history[:, 0] > 0) & (model.actuator_delay > 0)):
+        steps = float(model.actuator_delay[i]) / dt
+        older = int(np.ceil(steps - 1e-9))
+        yield int(i), older - steps if model.actuator_history[i, 1] else 0.0, (older, older - 1)  # else held
 
 
 def fill_delays(model: mujoco.MjModel, commands: Sequence[Array], history: Array) -> None:

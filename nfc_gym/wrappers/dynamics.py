@@ -108,11 +108,15 @@ def noise_root(covariance: ArrayLike | None, size: int) -> Array:
         raise InputError(
             f"ResidualDynamics: covariance must be finite, ({size}, {size}) or ({size},) variances, got {matrix.shape}"
         )
-    values, vectors = np.linalg.eigh(matrix)
-    if not np.allclose(matrix, matrix.T) or values.min() < -1e-9 * max(abs(values).max(), 1e-300):
+    if not np.allclose(matrix, matrix.T):
+        i, k = np.unravel_index(np.abs(matrix - matrix.T).argmax(), matrix.shape)
         raise InputError(
-            f"ResidualDynamics: covariance has the eigenvalue {values.min():g}; want symmetric, none below 0"
+            f"ResidualDynamics: covariance is not symmetric: [{i}, {k}] is {matrix[i, k]:g}, and [{k}, {i}] is "
+            f"{matrix[k, i]:g}"
         )
+    values, vectors = np.linalg.eigh(matrix)
+    if values.min() < -1e-9 * max(abs(values).max(), 1e-300):
+        raise InputError(f"ResidualDynamics: covariance has the eigenvalue {values.min():g}; want none below 0")
     keep = values > 0
     return vectors[:, keep] * np.sqrt(values[keep])
 

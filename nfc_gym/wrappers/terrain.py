@@ -44,11 +44,11 @@ class Ground:
         model = sim.model
         names = names_of(model, mujoco.mjtObj.mjOBJ_HFIELD, model.nhfield)
         if len(names) != 1 or not names[0]:
-            found = (
-                f"its model has {len(names)} of them: {', '.join(map(repr, names))}" if names else "it stands on none"
-            )
+            told = getattr(env, "spec", None)
+            which = told.id if told is not None else type(base).__name__
+            found = f"has {len(names)}: {', '.join(map(repr, names))}" if names else "has none"
             raise InputError(
-                f"{who} needs an environment on one named heightfield, and {type(base).__name__} is none: {found}"
+                f"{who} needs an environment on one named heightfield, and the model of {which} {found}"
                 + ("; use its Rough variant" if hasattr(base, "psi_space") and not names else "")
             )
         self.name = names[0]

@@ -45,6 +45,24 @@ def test_a_part_is_those_rows_with_time_from_zero(rows: int, data: st.DataObject
     np.testing.assert_array_equal(ours.mask, theirs.mask[start:stop])
 
 
+@given(st.integers(4, 50), st.data())
+def test_a_part_keeps_what_drove_the_robot_before_it_and_nothing_else(rows: int, data: st.DataObject) -> None:
+    start = data.draw(st.integers(0, rows - 2))
+    again = data.draw(st.integers(0, rows - start - 2))
+    whole = log(rows)
+    part = whole.part(start, rows, "run@part").part(again, rows - start, "run@part@part")
+    inputs = part.inputs
+    assert (part.before is None) == (start + again == 0)
+    assert not hasattr(inputs, "channels")
+    np.testing.assert_allclose(inputs.time, whole.time - whole.time[start + again], atol=1e-12)
+    np.testing.assert_array_equal(inputs.controls["ctrl:a"], whole.controls["ctrl:a"])
+    np.testing.assert_array_equal(inputs.exogenous["exo:volts"], whole.exogenous["exo:volts"])
+    np.testing.assert_array_equal(inputs.known["body_mass:b"], whole.known["body_mass:b"])
+    np.testing.assert_array_equal(inputs.servo["ctrl:a"]["gain"], whole.servo["ctrl:a"]["gain"])
+    if part.before is not None:
+        assert (part.before.time < 0).all()
+
+
 def test_duration_and_interval() -> None:
     assert log(11).duration == pytest.approx(1.0)
     assert log(11).interval == pytest.approx(0.1)

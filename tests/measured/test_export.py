@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,13 @@ SPRING, ROTOR = ("spring_offset", "j", {"stiffness": 3.0, "rest": 0.5}), ("armat
 STOUT = ("inertia", "a", {"x": 1.1, "y": 0.95, "z": 1.0})
 SHIFT, WIDE = ("com_shift", "a", {"x": 0.05, "y": 0.0, "z": 0.0}), 'range="-90 90"'
 TIP = {"x": 0.3, "y": 0.0, "z": 0.1}
+LINE, PLAY = ("torque_speed", "m", {"fall": 0.8}), ("backlash", "j", {"gap": 0.1, "rotor": 0.001})
+BACK = ("offset", "m", {"offset": -0.9})  # a drive that turns round
+YIELD = ("hysteresis", "j", {"level": 1.0, "transition": 1e-4})
+BOUNDED = '<motor name="m" joint="j" gear="2" forcerange="-0.8 0.8"/>'
+STRENGTH = Parameter("strength", "actuator_gainprm[0]", ("m",), "1", 0.1, 5.0)
+CENTRE = Parameter("centre", "body_ipos[0]", ("a",), "m", -1.0, 1.0)
+DRAG = ("drag_linear", "a", {"x": 2.0, "y": 2.0, "z": 2.0})
 CASES: dict[str, tuple[Any, ...]] = {
     # a servo's damping, given as a ratio, is that of the nominal model
     "dampratio, gain": (arm(SERVO, joint=WIDE), [gain(0.5)]),
@@ -154,6 +162,19 @@ CASES: dict[str, tuple[Any, ...]] = {
     "coulomb, stribeck": (arm(), [DRY, RISE]),
     "soft friction, coulomb": (arm(joint='frictionloss="0.05"'), [DRY], (level(0.3),)),
     "gravcomp, payload": (arm().replace('<body name="a"', '<body name="a" gravcomp="1"'), [PAYLOAD]),
+    # laws outside of the model that read what is in it
+    "loss, torque_speed": (arm(BOUNDED), [("loss", "m", {"fraction": 0.5}), LINE]),
+    **{
+        f"{e[0]} {', '.join(e[2])}, torque_speed": (arm(LIMITED), [e, LINE])
+        for e in (gain(0.6), OFFSET, LAG, CUT, FORCE)
+    },
+    "strength, torque_speed": (arm(LIMITED), [LINE], ((STRENGTH, 0.6),)),
+    "gear, torque_speed": (arm(LIMITED), [LINE], ((replace(STRENGTH, field="actuator_gear[0]"), 1.5),)),
+    "saturation, backlash": (arm(BOUNDED), [("saturation", "m", {"inverse_limit": 10.0}), BACK, PLAY]),
+    "gear, backlash": (arm(BOUNDED), [BACK, PLAY], ((replace(STRENGTH, field="actuator_gear[0]"), 1.5),)),
+    "mass, hysteresis": (arm(), [YIELD], (mass(3.0),)),
+    "armature, hysteresis": (arm(), [ROTOR, YIELD]),
+    "centre, drag_linear": (arm(), [DRAG], ((CENTRE, 0.3),)),
     "springs": (arm(joint='stiffness="2" springref="20"'), [SPRING, SPRING]),
 }  # fmt: skip
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
+from nfc_gym.measured import segments
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.instant import track
 from nfc_gym.measured.inverse import actuator_forces
@@ -16,6 +17,7 @@ from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
+from nfc_gym.physics.segments import Segments
 
 DT, EVERY, LEVEL, TRANSITION = 0.005, 2, 0.25, 0.15
 SD_Q, SD_V = 5e-4, 5e-3
@@ -96,6 +98,72 @@ def test_the_past_before_a_log_begins_is_rest() -> None:
     np.testing.assert_array_equal(q[0], estimate_states(MODEL, LOGS[0]).qpos[0])
     lead, step = past.lead
     assert lead.shape[1] * step == pytest.approx(_problem().time_of.max() - 0.5)
+
+
+THERMAL = build("thermal", "motor", {"fade": 0.4, "time_constant": 3.0, "reference": 0.6})
+
+
+@pytest.fixture(scope="module")
+def warm() -> Plant:
+    return Plant(MODEL, ParameterSpace(MODEL, []), [THERMAL[0]], nthread=1)
+
+
+def warmed(plant: Plant, seconds: float, linear: bool = False) -> Log:
+    """What a drive that fades does in a log: commands of up to 8 Hz, louder and softer, and no noise."""
+    t = np.arange(round(seconds / DT / EVERY)) * DT * EVERY
+    loud = 0.5 + 0.5 * np.sin(0.4 * t) ** 2
+    u = loud * (0.2 + 0.6 * np.sin(2 * np.pi * 2.3 * t) + 0.5 * np.sin(2 * np.pi * 8 * t + 1))
+    fine = np.arange(EVERY * len(t)) * DT
+    ctrl = np.interp(fine, t, u) if linear else np.repeat(u, EVERY)
+    still = np.zeros((1, 1))
+    motion = plant.shoot(THERMAL[1][None], Segments(DT, 0, still, still, ctrl[None, :, None], channels=frozenset()))
+    q, v = (a[0, 0, : EVERY * len(t) : EVERY, 0] for a in (motion.qpos, motion.qvel))
+    channels = {"joint:hinge:pos": Channel(q, "rad", 1e-6), "joint:hinge:vel": Channel(v, "rad/s", 1e-5)}
+    return Log("warm", t, {"ctrl:motor": u}, channels, {"exo:time": t})
+
+
+def _off(plant: Plant, log: Log, linear: bool = False) -> float:
+    """Largest error of the true model, rad, in segments of 0.2 s."""
+    kinds = frozenset({"ctrl:motor"}) if linear else frozenset()
+    states, layout = estimate_states(MODEL, log, raw=True), Layout(0.2, 0.5, (0.2,), 0.2, DT, put_off=False)
+    problem = RolloutProblem(MODEL, [log], [states], layout, linear=kinds)
+    return float(np.abs(problem.residual(plant, THERMAL[1][None])[0][:, 0]).max())
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_drive_is_as_warm_as_all_of_a_long_log_made_it(
+    warm: Plant, linear: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Commands are thinned by what heats; at 200 steps of 0.3 s it is off by a 30th of what samples would make it."""
+    log = warmed(warm, 60.0, linear)
+    assert _off(warm, log, linear) < 1e-5
+    monkeypatch.setattr(segments, "_ROOM", 0)
+    assert _off(warm, log, linear) < 1.5e-3
+
+
+def test_thinned_commands_keep_what_laws_need() -> None:
+    """Of every two steps mean and mean square, against sums over a fine grid; beyond a log's ends its values hold."""
+    rng = np.random.default_rng(3)
+    time, values = np.cumsum(rng.uniform(0.5, 1.5, 40)), rng.normal(size=40)
+    edges = np.stack([np.linspace(-5.0, 31.0, 13), np.linspace(20.0, 50.0, 13)])
+    share = (np.arange(120_000) + 0.5) / 120_000
+    for steps, (first, last) in zip(segments._thinned(time, values, edges), edges[:, [0, -1]], strict=True):
+        along = segments.resample(time, values, first + (last - first) * share, linear=False)
+        for power in (1, 2):
+            means = [(a**power).reshape(6, -1).mean(1) for a in (steps, along)]
+            np.testing.assert_allclose(*means, atol=1e-3)
+
+
+def test_a_part_of_a_log_knows_what_was_commanded_before_it(warm: Plant) -> None:
+    """But not what was measured: that of another part changes nothing."""
+    log = warmed(warm, 12.0)
+    part = log.part(700, len(log), "warm@select")
+    assert _off(warm, part) < 1e-5
+    assert _off(warm, replace(part, before=None)) > 1e-3
+    after = np.arange(len(log)) >= 700
+    unlike = {k: replace(c, values=np.where(after, c.values, 9.0)) for k, c in log.channels.items()}
+    other = replace(log, channels=unlike)
+    assert _off(warm, other.part(700, len(log), "warm@select")) == _off(warm, part)
 
 
 def test_inverse_problems_lead_hidden_states_along_the_log(plant: Plant) -> None:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nfc_gym.core import Channel, Log
-from nfc_gym.measured.smoothing import estimate_noise, fresh_samples, local_polynomial, moving_average
+from nfc_gym.measured.smoothing import covered, estimate_noise, fresh_samples, local_polynomial, moving_average
 from nfc_gym.measured.states import channel_noise, estimate_states
 from nfc_gym.physics.state import quat_multiply, vector_to_quat
 
@@ -110,6 +110,23 @@ def test_moving_average(samples: int) -> None:
     for k in (half, 30, 59 - half):
         np.testing.assert_allclose(out[k], values[k - half : k + half + 1].mean(0))
     np.testing.assert_allclose(moving_average(values[:, 0], samples), out[:, 0])
+
+
+@pytest.mark.parametrize("samples", [1, 4, 9, 80])
+def test_means_are_of_the_samples_that_there_are(samples: int) -> None:
+    """At the ends, beside masked rows, and in windows longer than the signal."""
+    rng = np.random.default_rng(7)
+    values, mask = rng.normal(size=(60, 2)), rng.random((60, 2)) > 0.4
+    found = moving_average(np.where(mask, values, np.nan), samples, mask)
+    whole = moving_average(values, samples)
+    share = covered(mask, samples)
+    for k in range(60):
+        at = slice(max(k - samples // 2, 0), k + (samples - 1) // 2 + 1)
+        np.testing.assert_allclose(whole[k], values[at].mean(0))
+        for c in range(2):
+            kept = values[at, c][mask[at, c]]
+            np.testing.assert_allclose(found[k, c], kept.mean() if len(kept) else 0.0, atol=1e-12)
+            assert share[k, c] == len(kept) / samples
 
 
 def test_the_noise_of_an_attitude_is_estimated_as_an_angle() -> None:

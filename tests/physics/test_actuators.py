@@ -1,6 +1,7 @@
 """Effects on commands and on what actuators make of them, against closed forms."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from machines import make, plant_of, run
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects import Effect, Scales, build, propose
+from nfc_gym.physics.effects import Context, Effect, Scales, build, propose
 from nfc_gym.physics.effects.each import each
 from nfc_gym.physics.segments import Segments
 
@@ -191,6 +192,12 @@ def test_supply_sag_without_a_voltage_says_so() -> None:
         _made("supply_sag", {"exponent": 2.0, "reference": 12.0}, NOISE)
 
 
+def _moment(model: mujoco.MjModel, signals: dict[str, np.ndarray]) -> Context:
+    """What `demand` reads of a log whose state does not matter."""
+    nothing, nominal = np.zeros(0), partial(getattr, model)
+    return Context(model, DT, nothing, nothing, nothing, signals, nominal, nominal)
+
+
 @pytest.mark.parametrize(
     ("family", "parameters"),
     [
@@ -209,8 +216,9 @@ def test_demand_inverts_the_effect(family: str, parameters: dict[str, float]) ->
     volts = 12.6 - time
     made = _made(family, parameters, ctrl, exogenous={"exo:supply": volts})
     effect, theta = make(family, "push", parameters)
-    effect.bind(mujoco.MjModel.from_xml_string(RAIL))
-    back = effect.demand(made[:, None], theta, {"exo:supply": volts}, DT)[:, 0]
+    model = mujoco.MjModel.from_xml_string(RAIL)
+    effect.bind(model)
+    back = effect.demand(made[:, None], theta, _moment(model, {"exo:supply": volts}))[:, 0]
     np.testing.assert_allclose(back[50:-50], ctrl[50:-50], atol=0.02)
 
 
@@ -245,7 +253,8 @@ def test_wires_that_are_swapped_turn_the_force_and_its_limits_round() -> None:
     np.testing.assert_allclose(
         run(spec.compile(), None, [], 60, ctrl=NOISE[:, None]).sensordata[0, 0, :-1, 0], expected
     )
-    np.testing.assert_allclose(effect.demand(expected[:, None], theta, {}, DT)[:, 0], -expected)
+    back = effect.demand(expected[:, None], theta, _moment(mujoco.MjModel.from_xml_string(text), {}))
+    np.testing.assert_allclose(back[:, 0], -expected)
 
 
 def test_a_dead_motor_with_a_limit_is_native() -> None:
@@ -371,3 +380,45 @@ def test_a_limit_is_not_looked_for_where_nothing_pushes() -> None:
     for push, found in ((0.0, 0), (2.0, 1)):
         proposed = propose(model, Scales(one, one, one, push * one, 0.01), only=("saturation",), generic=False)
         assert len(proposed) == found
+
+
+@pytest.mark.parametrize(
+    ("family", "parameters"),
+    [
+        ("offset", {"offset": 0.3}),
+        ("dead_zone", {"width": 0.4}),
+        ("supply_sag", {"exponent": 1.5, "reference": 12.0}),
+        ("lag", {"time_constant": 0.02}),
+        ("lag", {"time_constant": 0.0}),
+        ("delay", {"delay": 0.0107}),
+        ("thermal", {"fade": 0.3, "time_constant": 0.05, "reference": 2.0}),
+    ],
+)
+def test_a_course_of_commands_is_what_walking_along_it_makes(family: str, parameters: dict[str, float]) -> None:
+    """Of two parameter vectors and three logs at once; where a command rests, to the bit."""
+    effect, theta = make(family, "push", parameters)
+    effect.bind(mujoco.MjModel.from_xml_string(RAIL))
+    rng = np.random.default_rng(0)
+    ctrl = np.cumsum(rng.normal(size=(2, 3, 300, 1)), -2) / 5
+    ctrl[..., :20, :] = ctrl[..., :1, :]
+    thetas = np.stack([theta, 0.7 * theta])[:, None].repeat(3, 1)
+    volts = {"exo:supply": rng.uniform(9, 12, (2, 3, 300))}
+    found = effect.course(ctrl, thetas, volts, DT)
+    memory = effect.state0((2, 3), ctrl[..., 0, :], thetas, DT)
+    for k in range(300):
+        now = {name: v[..., k] for name, v in volts.items()}
+        walked, memory = effect.action(ctrl[..., k, :], thetas, memory, now, DT)
+        np.testing.assert_allclose(found[..., k, :], walked, rtol=1e-13, atol=1e-14)
+        if k < 20:
+            np.testing.assert_array_equal(found[..., k, :], walked)
+
+
+def test_a_limit_that_is_none_gives_a_motor_no_torque_speed_line() -> None:
+    text = _with('<motor name="push" joint="rail" gear="2"/>')
+    model, moved = mujoco.MjModel.from_xml_string(text), []
+    for rows in ([], [("torque_speed", {"fall": 0.5}), ("saturation", {"inverse_limit": 0.0})]):
+        pairs = [build(family, "push", given) for family, given in rows]
+        segments = Segments(DT, 0, np.zeros((1, 1)), np.ones((1, 1)), np.full((1, 60, 1), 3.0))
+        x = np.concatenate([np.zeros(0), *(theta for _, theta in pairs)])
+        moved.append(plant_of(model, *(e for e, _ in pairs)).shoot(x[None], segments).qvel)
+    np.testing.assert_array_equal(*moved)

@@ -1,5 +1,7 @@
 """Joints that remember, against closed forms: a spring that yields, play between drive and joint."""
 
+from functools import partial
+
 import mujoco
 import numpy as np
 import pytest
@@ -22,7 +24,8 @@ def _loop(level: float, transition: float, reach: float, count: int) -> float:
     effect, theta = make("hysteresis", "rail", {"level": level, "transition": transition})
     effect.bind(MODEL)
     x = reach * np.sin(np.linspace(0, 6 * np.pi, 3 * count + 1))
-    ctx = Context(MODEL, DT, np.zeros(1), np.zeros(1), np.zeros(1), {}, None, None)  # type: ignore[arg-type]
+    nominal = partial(getattr, MODEL)
+    ctx = Context(MODEL, DT, np.zeros(1), np.zeros(1), np.zeros(1), {}, None, nominal)  # type: ignore[arg-type]
     memory, forces = effect.rest(ctx, theta), []
     for step in np.diff(x):
         ctx.v = np.array([step / DT])

@@ -20,6 +20,7 @@ from nfc_gym.physics.effects.base import (
     actuator_names,
     index,
     joint_dofs,
+    limited,
 )
 from nfc_gym.physics.effects.drive import on_scalar, plain
 from nfc_gym.physics.effects.hysteresis import excursion
@@ -43,7 +44,7 @@ def drives(model: mujoco.MjModel) -> dict[str, int]:
 
 
 class Drive:
-    """The torque of joints' actuators from command and motion, as MuJoCo computes it.
+    """The torque of joints' actuators from command and motion, as MuJoCo computes it in the simulation at hand.
 
     Args:
       model: the nominal model.
@@ -57,23 +58,21 @@ class Drive:
             index(model.jnt_qposadr[joints].astype(np.intp)),
             index(model.jnt_dofadr[joints].astype(np.intp)),
         )
-        self.gear = model.actuator_gear[actuators, 0].copy()
-        self.low, self.high = (
-            np.where(model.actuator_ctrllimited[actuators].astype(bool), end, far)
-            for end, far in zip(model.actuator_ctrlrange[actuators].T, (-np.inf, np.inf), strict=True)
-        )
-        self.weak, self.strong = (
-            np.where(model.actuator_forcelimited[actuators].astype(bool), end, far)
-            for end, far in zip(model.actuator_forcerange[actuators].T, (-np.inf, np.inf), strict=True)
-        )
 
     def torque(self, ctx: Context) -> Array:
         """(..., n) N m or N at the joints."""
-        gain, bias = (ctx.nominal(f"actuator_{n}prm")[..., self.rows, :3] for n in ("gain", "bias"))
-        length, speed = self.gear * ctx.q[..., self.q], self.gear * ctx.v[..., self.v]
+        its = lambda name: ctx.nominal(f"actuator_{name}")[..., self.rows, :]  # noqa: E731
+        gain, bias, gear = its("gainprm"), its("biasprm"), its("gear")[..., 0]
+        length, speed = gear * ctx.q[..., self.q], gear * ctx.v[..., self.v]
         law = lambda p: p[..., 0] + p[..., 1] * length + p[..., 2] * speed  # noqa: E731
-        wish = np.minimum(np.maximum(ctx.ctrl[..., self.rows], self.low), self.high)
-        return self.gear * np.minimum(np.maximum(law(gain) * wish + law(bias), self.weak), self.strong)
+        wish = limited(ctx.ctrl[..., self.rows], *self._ends(ctx, "ctrl"))
+        return gear * limited(law(gain) * wish + law(bias), *self._ends(ctx, "force"))
+
+    def _ends(self, ctx: Context, kind: str) -> tuple[Array, Array]:
+        """(low, high) of the actuators' `ctrl` or `force` ranges, infinite where there are none."""
+        bounded = ctx.nominal(f"actuator_{kind}limited")[..., self.rows] != 0
+        ends = ctx.nominal(f"actuator_{kind}range")[..., self.rows, :]
+        return np.where(bounded, ends[..., 0], -np.inf), np.where(bounded, ends[..., 1], np.inf)
 
 
 class Backlash(Effect):

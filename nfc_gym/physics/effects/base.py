@@ -188,6 +188,9 @@ class Effect(ABC):
     kin: ClassVar[tuple[str, ...]] = ()
     # Whether values of its own at each of several places make sense.
     divisible: ClassVar[bool] = True
+    # Whether its force follows those that the actuators make of commands (`actuator_force`). Inverse problems, which
+    # know only what a motion needs of them, cannot show it.
+    driven: ClassVar[bool] = False
     # Whether it sits at one place alone, and not with the same values at several.
     lone: ClassVar[bool] = False
     # Whether it may sit on a ball joint, and then acts alike along all three of its degrees of freedom.
@@ -300,6 +303,13 @@ class Effect(ABC):
         """
         return False
 
+    def marks(self, model: mujoco.MjModel) -> dict[str, Array]:
+        """Numbers of the nominal model that `bind` wants and a corrected one no longer says: by name, (n,) each.
+
+        Where the effect stays outside of a model that is saved, they go along in it as `numeric` elements.
+        """
+        return {}
+
     def model(self, fields: ModelFields, theta: Array) -> None:  # noqa: B027 (a hook: does nothing by design)
         """Edit model fields in place, starting from what is there (nominal, or psi's value)."""
 
@@ -312,6 +322,20 @@ class Effect(ABC):
     ) -> tuple[Array, Any]:
         """Command (..., nu) -> what the actuators receive, and the new hidden state."""
         return ctrl, memory
+
+    def course(self, ctrl: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        """What `action` makes of a whole course of commands (..., T, nu) in steps of dt, settled at the first.
+
+        theta is (..., k), signals are (..., T). A law with a memory may know how to do so without walking.
+        """
+        memory = self.state0(ctrl.shape[:-2], ctrl[..., 0, :], theta, dt)
+        if memory is None:
+            return self.action(ctrl, theta[..., None, :], None, exogenous, dt)[0]
+        out = np.empty(ctrl.shape)
+        for t in range(ctrl.shape[-2]):
+            signals = {name: values[..., t] for name, values in exogenous.items()}
+            out[..., t, :], memory = self.action(ctrl[..., t, :], theta, memory, signals, dt)
+        return out
 
     def friction(self, ctx: Context, theta: Array) -> tuple[Rows, Array]:
         """Dry friction to add: (n dofs, level (..., n) >= 0 in N or N m). MuJoCo's constraint solver applies it."""
@@ -335,8 +359,12 @@ class Effect(ABC):
         """Change the fields of `MODULATES`, (..., *shape), in place for the coming step, from what is there."""
         raise NotImplementedError
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
-        """Inverse mode: forces (T, nu) that a motion needs of the actuators -> those commanded. theta (k,)."""
+    def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
+        """Inverse mode: forces (T, nu) that a motion needs of the actuators -> those commanded.
+
+        theta is (k,), and ctx is of (T, ...). What acts on commands is undone first, under the gains that effects on
+        these made, and then those gains are.
+        """
         return force
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:

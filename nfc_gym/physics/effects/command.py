@@ -9,8 +9,18 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names, index, limited
-from nfc_gym.physics.effects.drive import actuator_places, command_unit, is_position, plain
+from nfc_gym.physics.effects.base import (
+    Array,
+    Context,
+    Effect,
+    Param,
+    Scales,
+    actuator_ids,
+    actuator_names,
+    index,
+    limited,
+)
+from nfc_gym.physics.effects.drive import ENDLESS, actuator_places, command_unit, is_position, plain
 from nfc_gym.physics.effects.places import sized, with_units
 from nfc_gym.physics.effects.ranges import narrow_ranges, shift_range
 from nfc_gym.physics.fields import ModelFields
@@ -21,7 +31,7 @@ _FIXED_GAIN, _AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain
 _FOLLOWS = tuple(
     int(d) for d in (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
 )
-_ENDLESS, _IDLE = 1e12, 1e-9  # N or N m: a force that no actuator reaches, and one that is none
+_IDLE = 1e-9  # N or N m: a force that is none
 
 
 class _OnCommand(Effect):
@@ -42,10 +52,6 @@ class Offset(_OnCommand):
     summary = "Constant offset of the command"
     PARAMS = (Param("offset", "1", -1e3, 1e3, probes=(0.05,)),)
 
-    def bind(self, model: mujoco.MjModel) -> None:
-        super().bind(model)
-        self.gain = model.actuator_gainprm[self.rows, 0].copy()
-
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
@@ -53,9 +59,9 @@ class Offset(_OnCommand):
         out[..., self.rows] += theta[..., :1]
         return out, memory
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+    def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
         out = np.array(force)
-        out[..., self.rows] -= self.gain * theta[..., :1]
+        out[..., self.rows] -= ctx.nominal("actuator_gainprm")[..., self.rows, 0] * theta[..., :1]
         return out
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
@@ -167,18 +173,18 @@ class Saturation(_OnCommand):
     def model(self, fields: ModelFields, theta: Array) -> None:
         if not self.on_force:
             return
-        limit = 1 / np.maximum(theta[..., :1], 1 / _ENDLESS)
+        limit = 1 / np.maximum(theta[..., :1], 1 / ENDLESS)
         bounded, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
         free = bounded[..., self.rows] == 0
-        low = np.where(free, -_ENDLESS, ranges[..., self.rows, 0])
-        high = np.where(free, _ENDLESS, ranges[..., self.rows, 1])
+        low = np.where(free, -ENDLESS, ranges[..., self.rows, 0])
+        high = np.where(free, ENDLESS, ranges[..., self.rows, 1])
         ranges[..., self.rows, 0], ranges[..., self.rows, 1] = limited(low, -limit, limit), limited(high, -limit, limit)
         bounded[..., self.rows] = True
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
         kind, low, high = "ctrl", *self._limits(theta)
         if self.on_force:
-            high = np.full(len(self.where), 1 / max(float(theta[0]), 1 / _ENDLESS))
+            high = np.full(len(self.where), 1 / max(float(theta[0]), 1 / ENDLESS))
             kind, low = "force", -high
         return narrow_ranges(spec, self.where, kind, low, high)
 
@@ -247,9 +253,9 @@ class SupplySag(_OnCommand):
         out[..., self.rows] *= self._factor(theta, exogenous)
         return out, memory
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+    def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
         out = np.array(force)
-        out[..., self.rows] /= self._factor(theta, exogenous)
+        out[..., self.rows] /= self._factor(theta, ctx.exogenous)
         return out
 
     @classmethod

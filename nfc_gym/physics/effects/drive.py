@@ -2,7 +2,8 @@
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -25,9 +26,11 @@ from nfc_gym.physics.fields import ModelFields
 
 _FIXED, _AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
 _NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+_INTEGRATOR = int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
 _JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+ENDLESS = 1e12  # N or N m: a force that no actuator reaches, as good as no limit
 
 
 def plain(model: mujoco.MjModel) -> list[str]:
@@ -41,16 +44,36 @@ def plain(model: mujoco.MjModel) -> list[str]:
 
 
 def is_position(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether the command is a position servo's goal; one that integrates its command (`intvelocity`) wants a speed."""
+    return _holds(model, actuator) and not _integrates(model, actuator)
+
+
+def _holds(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether the actuator's force falls with its own position, as a position servo's does."""
     return int(model.actuator_biastype[actuator]) == _AFFINE_BIAS and model.actuator_biasprm[actuator, 1] != 0
 
 
+def _integrates(model: mujoco.MjModel, actuator: int) -> bool:
+    return int(model.actuator_dyntype[actuator]) == _INTEGRATOR
+
+
 def command_unit(model: mujoco.MjModel, actuator: int) -> str:
-    """Unit of an actuator's command, read from its law: a position, a speed, or a share of its force."""
+    """Unit of an actuator's command, read from its law: a position, a speed, or a share of its force.
+
+    Of one that integrates its command it is that of the integral, per second.
+    """
+    unit = _input_unit(model, actuator)
+    if not _integrates(model, actuator):
+        return unit
+    return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+
+
+def _input_unit(model: mujoco.MjModel, actuator: int) -> str:
+    """Unit of what an actuator's gain multiplies."""
     slides = _slides(model, actuator)
     if slides is None:
         return "1"
-    if is_position(model, actuator):
+    if _holds(model, actuator):
         return "m" if slides else "rad"
     # A motor on volts has back-EMF: a force that falls with speed too, but not as its gain times that speed.
     pull, drag = model.actuator_gainprm[actuator, 0], -model.actuator_biasprm[actuator, 2]
@@ -126,7 +149,7 @@ class Gain(Effect):
         _scale_spec(spec, self.where, float(self.factor(theta)))
         return True
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+    def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
         out = np.array(force)
         factor = self.factor(theta)
         out[..., self.rows] /= np.copysign(np.maximum(np.abs(factor), 1e-6), factor)[..., None]
@@ -158,14 +181,15 @@ class Loss(Gain):
 class TorqueSpeed(Effect):
     """Force limit that falls with speed in the driving direction: |force| <= peak (1 - fall * speed).
 
-    `peak` is what the model allows at rest (its force range, else the command range times the gain); `fall` is the
-    share of it that is gone for each rad/s (m/s) of the joint or fixed tendon that the actuator moves, the inverse of
-    the no-load speed. What exceeds the line, by the force of the substep before, is taken off there. Braking is not
-    limited.
+    `peak` is what the model allows at rest (its force range, else the command range times the gain), as its parameters
+    and other effects have it: a motor that lost half its force lost half its peak. `fall` is the share of it that is
+    gone for each rad/s (m/s) of the joint or fixed tendon that the actuator moves, the inverse of the no-load speed.
+    What exceeds the line, by the force of the substep before, is taken off there. Braking is not limited.
     """
 
     family = "torque_speed"
     summary = "Force limit that falls with speed"
+    driven = True
     PARAMS = (Param("fall", "s/rad", 0.0, 10.0, probes=(0.02, 0.1)),)
 
     def bind(self, model: mujoco.MjModel) -> None:
@@ -179,20 +203,27 @@ class TorqueSpeed(Effect):
                     f"actuators that do: {', '.join(fit) or 'none'}"
                 )
         self.arms = np.array(arms)
-        self.gear = model.actuator_gear[self.rows, 0].copy()
-        self.peak = np.array([_peak(model, int(r)) for r in self.rows])
+        self.reach = np.array([_reach(model, int(r)) for r in self.rows])
+
+    def marks(self, model: mujoco.MjModel) -> dict[str, Array]:
+        ends = (_reach(model, int(r)) for r in actuator_ids(model, self.where))
+        return {_reach_mark(n): np.array([end]) for n, end in zip(self.where, ends, strict=True) if end > 0}
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         made = ctx.data("actuator_force")[..., self.rows]
-        driving = np.maximum(0.0, np.sign(made * self.gear) * (ctx.v @ self.arms.T))
-        lost = np.minimum(theta[..., :1] * driving, 1.0) * self.peak
-        excess = np.clip(np.abs(made) - (self.peak - lost), 0.0, lost)
-        out.qfrc[...] -= (np.sign(made) * excess * self.gear) @ self.arms
+        gear = ctx.nominal("actuator_gear")[..., self.rows, 0]
+        peak = _peak(ctx.nominal, self.rows, self.reach)
+        driving = np.maximum(0.0, np.sign(made * gear) * (ctx.v @ self.arms.T))
+        lost = np.minimum(theta[..., :1] * driving, 1.0) * peak
+        excess = np.clip(np.abs(made) - (peak - lost), 0.0, lost)
+        out.qfrc[...] -= (np.sign(made) * excess * gear) @ self.arms
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         known = actuator_names(model)
-        fit = [n for n in plain(model) if _peak(model, known.index(n)) > 0]
+        rows = np.arange(model.nu)
+        peaks = _peak(partial(getattr, model), rows, np.array([_reach(model, int(r)) for r in rows]))
+        fit = [n for n in plain(model) if peaks[known.index(n)] > 0]
         arms = {n: arm for n in fit if (arm := arm_of(model, known.index(n))) is not None}
         out: list[Effect] = []
         for where in actuator_places(model, list(arms)):
@@ -226,10 +257,33 @@ def arm_of(model: mujoco.MjModel, actuator: int) -> Array | None:
     return found
 
 
-def _peak(model: mujoco.MjModel, actuator: int) -> float:
-    """Largest force that the model allows the actuator, 0 where it sets no limit."""
-    if model.actuator_forcelimited[actuator]:
-        return float(np.abs(model.actuator_forcerange[actuator]).max())
-    if model.actuator_ctrllimited[actuator] and int(model.actuator_biastype[actuator]) == _NO_BIAS:
-        return float(np.abs(model.actuator_ctrlrange[actuator]).max() * abs(model.actuator_gainprm[actuator, 0]))
-    return 0.0
+def _reach_mark(name: str) -> str:
+    """Name of the number by which a model says which command ruled an actuator's force before effects changed that."""
+    return f"reach:{name}"
+
+
+def _reach(model: mujoco.MjModel, actuator: int) -> float:
+    """Largest input of an actuator whose force the range of its command alone limits, or of its integral; else 0."""
+    mark = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, _reach_mark(actuator_names(model)[actuator]))
+    if mark >= 0:
+        return float(model.numeric_data[model.numeric_adr[mark]])
+    if model.actuator_forcelimited[actuator] or int(model.actuator_biastype[actuator]) != _NO_BIAS:
+        return 0.0
+    kind = "act" if _integrates(model, actuator) else "ctrl"
+    bounded = getattr(model, f"actuator_{kind}limited")[actuator]
+    return float(np.abs(getattr(model, f"actuator_{kind}range")[actuator]).max()) if bounded else 0.0
+
+
+def _peak(field: Callable[[str], Array], rows: NDArray[np.intp], reach: Array) -> Array:
+    """Largest force (..., n) that a model allows actuators, 0 where it sets no limit.
+
+    Args:
+      field: the model's fields by name, (..., nu, *shape).
+      rows: (n,) ids.
+      reach: (n,) see `_reach`.
+    """
+    limited = field("actuator_forcelimited")[..., rows] != 0
+    by_range = np.where(limited, np.abs(field("actuator_forcerange")[..., rows, :]).max(-1), ENDLESS)
+    by_command = np.where(reach > 0, reach * np.abs(field("actuator_gainprm")[..., rows, 0]), ENDLESS)
+    peak = np.minimum(by_range, by_command)
+    return np.where(peak < ENDLESS, peak, 0.0)

@@ -20,7 +20,7 @@ _HOOKS = (
     "spec", "model", "action", "rest", "follow", "friction", "modulate", "force", "demand", "sense", "unsense", "chart",
     "unchart",
 )  # fmt: skip
-_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "slow")
+_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "slow", "driven")
 
 
 class Each(Effect):
@@ -76,6 +76,10 @@ class Each(Effect):
         tried = spec.copy()
         return all(m.spec(tried, t) for m, t in parts) and all([m.spec(spec, t) for m, t in parts])
 
+    def marks(self, model: mujoco.MjModel) -> dict[str, Array]:
+        """See `Effect`."""
+        return {name: at for m in self.members for name, at in m.marks(model).items()}
+
     def model(self, fields: ModelFields, theta: Array) -> None:
         """See `Effect`."""
         for m, t in zip(self.members, self._theta(theta), strict=True):
@@ -94,6 +98,12 @@ class Each(Effect):
             ctrl, new = m.action(ctrl, t, old, exogenous, dt)
             kept.append(new)
         return ctrl, kept
+
+    def course(self, ctrl: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        """See `Effect`."""
+        for m, t in self.apart(theta):
+            ctrl = m.course(ctrl, t, exogenous, dt)
+        return ctrl
 
     def friction(self, ctx: Context, theta: Array) -> tuple[Rows, Array]:
         """See `Effect`."""
@@ -125,10 +135,10 @@ class Each(Effect):
             ctx.memory = memory
             yield m, t
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+    def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
         """See `Effect`."""
         for m, t in zip(self.members, self._theta(theta), strict=True):
-            force = m.demand(force, t, exogenous, dt)
+            force = m.demand(force, t, ctx)
         return force
 
     def sense(self, channel: str, values: Array, theta: Array, dt: float) -> Array:

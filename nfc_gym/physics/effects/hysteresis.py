@@ -58,14 +58,14 @@ class Hysteresis(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         dofs = joint_dofs(model, self.where)
-        self.dofs, self.mobility = index(dofs), model.dof_invweight0[dofs]
-        self.params = with_joint_units(self.params, model, dofs)
+        self.dofs, self.params = index(dofs), with_joint_units(self.params, model, dofs)
 
     def rest(self, ctx: Context, theta: Array) -> Any:
         return np.zeros_like(ctx.v[..., self.dofs])
 
     def follow(self, ctx: Context, theta: Array, memory: Any) -> Any:
-        shortest = theta[..., 0:1] * (self.mobility * ctx.dt**2 / _STIFFEST)
+        mobility = ctx.nominal("dof_invweight0")[..., self.dofs]
+        shortest = theta[..., 0:1] * (mobility * ctx.dt**2 / _STIFFEST)
         return dahl(memory, ctx.v[..., self.dofs] * ctx.dt, np.maximum(theta[..., 1:2], shortest))
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:

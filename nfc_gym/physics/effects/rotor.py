@@ -42,6 +42,7 @@ class _Rotor(Effect):
     """What both share: the total thrust along its common axis, from the actuators' forces one substep before."""
 
     lone = True
+    driven = True
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.motion = BodyMotion(model, int(body_ids(model, self.where)[0]))

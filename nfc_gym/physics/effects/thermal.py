@@ -11,6 +11,7 @@ import numpy as np
 from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names, index
 from nfc_gym.physics.effects.drive import actuator_places, plain
 from nfc_gym.physics.effects.places import sized
+from nfc_gym.physics.recurrence import chased
 
 
 class Thermal(Effect):
@@ -40,12 +41,19 @@ class Thermal(Effect):
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
-        wish = ctrl[..., self.rows]
-        target = (wish / theta[..., 2:3]) ** 2
+        target = self.state0((), ctrl, theta, dt)
         heat = target + np.exp(-dt / theta[..., 1:2]) * (memory - target)
+        return self._faded(ctrl, theta, heat), heat
+
+    def course(self, ctrl: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        each = theta[..., None, :]
+        target = self.state0((), ctrl, each, dt)
+        return self._faded(ctrl, each, chased(target, np.exp(-dt / theta[..., 1:2]), target[..., 0, :]))
+
+    def _faded(self, ctrl: Array, theta: Array, heat: Array) -> Array:
         out = np.array(ctrl)
-        out[..., self.rows] = wish * (1 - theta[..., 0:1] * heat)
-        return out, heat
+        out[..., self.rows] *= 1 - theta[..., 0:1] * heat
+        return out
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from nfc_gym.physics.effects.base import (
     Array,
+    Context,
     Effect,
     Param,
     Rows,
@@ -24,6 +25,7 @@ from nfc_gym.physics.effects.base import (
 from nfc_gym.physics.effects.drive import actuator_places
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.effects.ranges import narrow_ranges, range_of
+from nfc_gym.physics.recurrence import chased
 
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
 
@@ -79,15 +81,23 @@ class Lag(_Late):
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
         wish = self._commands(ctrl)
-        tau = theta[..., :1]
-        keep = np.where(tau > 0, np.exp(-dt / np.maximum(tau, 1e-12)), 0.0)
-        made = wish + keep * (memory - wish)
+        made = wish + self._keep(theta, dt) * (memory - wish)
         return self._replace(ctrl, made), made
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+    def course(self, ctrl: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        wish = self._commands(ctrl)
+        return self._replace(ctrl, chased(wish, self._keep(theta, dt), wish[..., 0, :]))
+
+    @staticmethod
+    def _keep(theta: Array, dt: float) -> Array:
+        """(..., 1) share that a step leaves of what is still to come."""
+        tau = theta[..., :1]
+        return np.where(tau > 0, np.exp(-dt / np.maximum(tau, 1e-12)), 0.0)
+
+    def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
         # u = y + tau dy/dt, exactly; the rate by central differences
         out = np.array(force)
-        out[:, self.rows] += theta[0] * np.gradient(force[:, self.rows], dt, axis=0)
+        out[:, self.rows] += theta[0] * np.gradient(force[:, self.rows], ctx.dt, axis=0)
         return out
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
@@ -115,12 +125,18 @@ class Delay(_Late):
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         """What each past command weighs, None for one that no simulation looks back to, and those commands."""
+        weights = self._weights(theta, dt)
+        return weights, [self._commands(ctrl)] * len(weights)
+
+    @staticmethod
+    def _weights(theta: Array, dt: float) -> list[Array | None]:
+        """(..., 1) of each past command, the latest first."""
         steps = theta[..., :1] / dt
         whole = np.rint(steps)
         steps = np.where(np.abs(steps - whole) < 1e-9, whole, steps)
         ages = range(int(np.ceil(np.max(steps, initial=0.0))) + 1)
         weights = [np.maximum(0.0, 1.0 - np.abs(steps - age)) for age in ages]
-        return [w if w.any() else None for w in weights], [self._commands(ctrl)] * len(ages)
+        return [w if w.any() else None for w in weights]
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
@@ -130,8 +146,13 @@ class Delay(_Late):
         made = reduce(add, [w * values for w, values in zip(weights, past, strict=True) if w is not None])
         return self._replace(ctrl, made), (weights, past)
 
-    def demand(self, force: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
-        out, time = np.array(force), np.arange(len(force)) * dt
+    def course(self, ctrl: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        wish, at = self._commands(ctrl), np.arange(ctrl.shape[-2])
+        weighed = ((age, w[..., None, :]) for age, w in enumerate(self._weights(theta, dt)) if w is not None)
+        return self._replace(ctrl, reduce(add, [w * wish[..., np.maximum(at - age, 0), :] for age, w in weighed]))
+
+    def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
+        out, time = np.array(force), np.arange(len(force)) * ctx.dt
         for a in np.arange(force.shape[1])[self.rows]:  # u(t) = y(t + delay); the last value is held
             out[:, a] = np.interp(time + theta[0], time, force[:, a])
         return out
