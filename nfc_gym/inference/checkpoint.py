@@ -17,6 +17,7 @@ from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.state import read, require_format
 
 FORMAT = "nfc_gym-posterior-1"
+FRAME = "window"  # in which the network has delta_s; files that say none have it in the world's
 GIVEN = "given/"  # before the names of the encoded window's tensors, in the file of a posterior that was given one
 
 
@@ -33,7 +34,7 @@ def save(path: Path, network: Network, *, given: Encoded | None = None, notes: d
         raise InputError(f"{path}: a posterior is kept in a file that ends in .safetensors")
     about = {
         "nfc_gym": __version__, "torch": str(torch.__version__), "network": network.config.to_dict(),
-        "sizes": asdict(network.sizes), "prior": network.prior.to_dict(), "notes": notes or {},
+        "sizes": asdict(network.sizes), "prior": network.prior.to_dict(), "notes": notes or {}, "frame": FRAME,
     }  # fmt: skip
     tensors = {k: t.detach().cpu().contiguous().clone() for k, t in network.state_dict().items()}
     if given is not None:
@@ -61,9 +62,15 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
         config, sizes = NetworkConfig(**about["network"]), Sizes(**about["sizes"])
     except (KeyError, TypeError, ValueError) as e:
         raise InputError(f"{path}: its metadata describe no network that this version knows ({e})") from None
+    if config.delta_s and sizes.place and about.get("frame") != FRAME:
+        raise InputError(
+            f"{path}: of an earlier version: its delta_s is in the world's frame, of which windows do not tell; "
+            "train it again"
+        )
     if prior is not None:
         prior.require_same(own, str(path))
-    kept = {k.removeprefix(GIVEN): tensors.pop(k) for k in list(tensors) if k.startswith(GIVEN)}
+    kept = {"facing": torch.tensor([[1.0, 0.0, 1.0]])} if any(k.startswith(GIVEN) for k in tensors) else {}
+    kept |= {k.removeprefix(GIVEN): tensors.pop(k) for k in list(tensors) if k.startswith(GIVEN)}
     network = Network(config, sizes, own)
     try:
         network.load_state_dict(tensors)

@@ -29,11 +29,13 @@ _CHUNK = 1024  # windows whose fixed features are computed at once
 class Encoded(NamedTuple):
     """What a network keeps of B windows: `features` (B, F), and the linear base's `mean` (B, D), else zeros.
 
-    `elevation` (B, 128, 128) is the scaled map, where delta_e is inferred.
+    `facing` (B, 3) says how the window lies in the world (`Place`), in whose frame delta_s is; `elevation`
+    (B, 128, 128) is the scaled map, where delta_e is inferred.
     """
 
     features: Tensor
     mean: Tensor
+    facing: Tensor
     elevation: Tensor | None = None
 
 
@@ -95,6 +97,8 @@ class Network(Learner):
           InputError: the windows are of other sizes than the network, or lack what it infers.
         """
         self.require(batch)
+        if self.config.delta_s:
+            batch = batch | {"delta_s": self.faced(batch["delta_s"], self.facing(batch["states"]))}
         batch = batch | {"states": self.place(batch["states"])}
         self.encoder.fit(batch["states"], batch["actions"], batch.get("map"))
         if self.config.delta_s:
@@ -139,17 +143,34 @@ class Network(Learner):
             if name in batch and batch[name].shape[1:] != (CELLS, CELLS):
                 raise InputError(f"windows: {name} has shape {tuple(batch[name].shape)}, want (n, {CELLS}, {CELLS})")
 
+    def facing(self, states: Tensor) -> Tensor:
+        """(B, 3) how windows as logged lie in the world, see `Place`; ahead where their place is not told."""
+        if isinstance(self.place, Place):
+            return self.place.facing(states)
+        ahead = states.new_zeros(len(states), 3)
+        ahead[:, ::2] = 1
+        return ahead
+
+    def faced(self, delta_s: Tensor, facing: Tensor, back: bool = False) -> Tensor:
+        """delta_s (..., s) in the frame that the encoder sees its window in, or back in the world's.
+
+        A window looks the same wherever it happens: what in the world's frame depends on its heading, as the direction
+        in which a push moves the robot does, could not be told from it.
+        """
+        return self.place.turned(delta_s, facing, back) if isinstance(self.place, Place) else delta_s
+
     def encode(self, states: Tensor, actions: Tensor, elevation: Tensor | None = None) -> Encoded:
         """What is kept of windows as logged."""
+        facing = self.facing(states)
         states = self.place(states)
         features = self.project(self.encoder(states, actions, elevation))
         seen = None
         if self.map_scale is not None and elevation is not None:
             seen = self.map_scale(elevation[..., None])[..., 0].clamp(-10, 10)
         if self.base is None:
-            return Encoded(features, states.new_zeros(len(states), self.density.width(None)), seen)
+            return Encoded(features, states.new_zeros(len(states), self.density.width(None)), facing, seen)
         with torch.autocast(states.device.type, enabled=False):  # a narrow posterior's mean needs all its digits
-            return Encoded(features, self.base(self.encoder.fixed(states, actions)), seen)
+            return Encoded(features, self.base(self.encoder.fixed(states, actions)), facing, seen)
 
     def sample(self, n: int, given: Encoded, blocks: int | None = None, **how: Any) -> Tensor:
         """(B, n, width of the first `blocks` blocks) draws of what `targets` are; `how` goes to the density."""
@@ -171,13 +192,13 @@ class Network(Learner):
         return self.density.log_prob(y, given.features, blocks, **how) - self.base.log_scale(x.shape[-1])
 
     def targets(self, batch: Batch) -> Tensor:
-        """(B, D) what the density is over: z of the free psi, then delta_s on its tamed scale.
+        """(B, D) what the density is over: z of the free psi, then delta_s in its window's frame on its tamed scale.
 
         Entries of delta_s that never vary in training are N(0, 1) noise here, and come back as the constant they are.
         """
         parts = [torch.special.ndtri(batch["psi"][:, self.free].clamp(EDGE, 1 - EDGE))]
         if self.config.delta_s:
-            scaled = self.delta_scale(batch["delta_s"])
+            scaled = self.delta_scale(self.faced(batch["delta_s"], self.facing(batch["states"])))
             parts.append(torch.where(self.varies, scaled, torch.randn_like(scaled)))
         return torch.cat(parts, 1)
 

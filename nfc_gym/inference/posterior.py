@@ -144,7 +144,8 @@ class NeuralPosterior:
         psi, delta = self.prior.from_z(drawn[:, : self.prior.size].double().cpu().numpy()), None
         if blocks == 2:
             y = torch.where(self.network.varies, drawn[:, self.prior.size :], 0.0)
-            delta = self.network.delta_scale.inverse(y).double().cpu().numpy()
+            seen = self.network.delta_scale.inverse(y)
+            delta = self.network.faced(seen, kept.facing, back=True).double().cpu().numpy()
         return Fidelity(psi, delta, maps)
 
     @torch.no_grad()
@@ -172,7 +173,8 @@ class NeuralPosterior:
         points = [torch.as_tensor(z, dtype=torch.float32, device=kept.mean.device)]
         if x.delta_s is not None:
             scale, varies = self.network.delta_scale, self.network.varies
-            delta = torch.as_tensor(np.atleast_2d(x.delta_s), dtype=torch.float32, device=kept.mean.device)
+            given = torch.as_tensor(np.atleast_2d(x.delta_s), dtype=torch.float32, device=kept.mean.device)
+            delta = self.network.faced(given, kept.facing)  # at right angles: densities are the same
             points.append(torch.where(varies, scale(delta), 0.0))
             # a constant entry is N(0, 1) noise to the network, taken out at 0 again
             slope = torch.where(varies, scale.log_slope(delta), np.log(2 * np.pi) / 2).sum(1)
@@ -198,7 +200,7 @@ class NeuralPosterior:
         kept = self.kept
         if kept is not None:
             seen = None if kept.elevation is None else kept.elevation.to(device)
-            kept = Encoded(kept.features.to(device), kept.mean.to(device), seen)
+            kept = Encoded(kept.features.to(device), kept.mean.to(device), kept.facing.to(device), seen)
         return NeuralPosterior(self.network.to(device), kept, self.notes, self.parts)
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -91,12 +91,13 @@ class Passes:
     def sample(self, n: int, given: Encoded, blocks: int, **how: Any) -> Tensor:
         """See `Network.sample`."""
 
-        def run(features: Tensor, mean: Tensor) -> tuple[Tensor, ...]:
-            return (self.network.sample(n, Encoded(features, mean), blocks, **how),)
+        def run(*x: Tensor) -> tuple[Tensor, ...]:
+            return (self.network.sample(n, Encoded(*x), blocks, **how),)
 
+        seen = given.features, given.mean, given.facing
         if n > _MOST or not isinstance(self.network.density, Score):
-            return run(given.features, given.mean)[0]
-        return self._replayed(("sample", n, blocks, *sorted(how.items())), run, given.features, given.mean)[0]
+            return run(*seen)[0]
+        return self._replayed(("sample", n, blocks, *sorted(how.items())), run, *seen)[0]
 
     def _replayed(self, key: Hashable, run: Pass, *given: Tensor) -> tuple[Tensor, ...]:
         if not given[0].is_cuda:

@@ -186,6 +186,23 @@ def test_a_window_looks_the_same_wherever_it_happens() -> None:
     torch.testing.assert_close(seen[..., 7:9].norm(dim=-1), states[..., 7:9].norm(dim=-1))
 
 
+def test_changes_of_states_turn_as_the_window_does_and_back() -> None:
+    from nfc_gym.inference.encoders.place import Place, place_of
+
+    place = Place(place_of(NAMES))
+    states = torch.randn(5, 1, len(NAMES), dtype=torch.float64) + 0.01 * torch.randn(5, 7, len(NAMES))
+    states[..., :4] = torch.nn.functional.normalize(states[..., :4], dim=-1)
+    states[2] = moved(states[2], 3.0, (1.0, 0.0))
+    facing, change = place.facing(states), states[:, 3] - states[:, 2]
+    turned = place.turned(change, facing)
+    seen = place(states)
+    torch.testing.assert_close(turned, seen[:, 3] - seen[:, 2])
+    torch.testing.assert_close(place.turned(turned, facing, back=True), change)
+    elsewhere = moved(states, 2.0, (3.0, -1.0))
+    again = place.turned(elsewhere[:, 3] - elsewhere[:, 2], place.facing(elsewhere))
+    torch.testing.assert_close(again, turned)
+
+
 def test_states_without_a_place_have_none() -> None:
     from nfc_gym.inference.encoders.place import place_of
 

@@ -1,5 +1,6 @@
 """`NeuralPosterior`: core's protocol, densities in physical units, checkpoints and what is refused."""
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -7,14 +8,17 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from problems import box, gaussian, linear_windows, motion_windows, network
+from problems import SMALL, box, gaussian, linear_windows, motion_windows, network
 from safetensors.torch import save_file
 
 import nfc_gym  # noqa: F401 (registers the loader and the environments)
 from nfc_gym.core import Fidelity, InputError, Posterior, load_source
 from nfc_gym.inference import checkpoint
+from nfc_gym.inference.config import NetworkConfig, Sizes
+from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 from nfc_gym.inference.space import PriorBox
+from nfc_gym.inference.state import read
 from nfc_gym.wrappers import RandomizePsi
 
 
@@ -48,6 +52,42 @@ def test_it_is_a_posterior_of_the_core(density: str) -> None:
     assert (given.sample(50, np.random.default_rng(4)).psi != drawn.psi).any()
     assert given.log_prob(drawn).shape == given.log_prob(Fidelity(drawn.psi)).shape == (50,)
     assert sum(given.families().values()) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_delta_s_turns_with_the_world(linear: bool, tmp_path: Path) -> None:
+    """A window says how it lies in the world and nothing of where: draws turn with it, and are as likely."""
+    from test_encoders import NAMES, moved
+
+    from nfc_gym.inference.encoders.place import place_of
+
+    g = torch.Generator().manual_seed(1)
+    states = torch.randn(60, 11, len(NAMES), generator=g)
+    states[..., :4] = torch.nn.functional.normalize(states[..., :4], dim=-1)
+    batch = {"states": states, "actions": torch.randn(60, 10, 1, generator=g), "psi": torch.rand(60, 2, generator=g),
+             "delta_s": states[:, 1] - states[:, 0]}  # fmt: skip
+    sizes = Sizes(10, len(NAMES), 1, place=place_of(NAMES))
+    net = Network(NetworkConfig(**{**SMALL, "density": "mixture", "delta_s": True, "linear": linear}), sizes, box(2))
+    net.fit_scales(batch)
+    shaken(net)
+    there = moved(states[:1], 2.0, (3.0, -1.0))
+    one, other = (
+        NeuralPosterior(net).given(Window(s[0].numpy(), batch["actions"][0].numpy())) for s in (states[:1], there)
+    )
+    drawn, turned = one.sample(40, rng()), other.sample(40, rng())
+    np.testing.assert_allclose(turned.psi, drawn.psi, rtol=1e-4)
+    expected = moved(torch.from_numpy(drawn.delta_s), 2.0, (0.0, 0.0)).numpy()
+    np.testing.assert_allclose(turned.delta_s, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+    assert np.abs(turned.delta_s - drawn.delta_s).max() > 0.1 * np.abs(drawn.delta_s).max()
+    np.testing.assert_allclose(other.log_prob(turned), one.log_prob(drawn), rtol=1e-3, atol=1e-2)
+    other.save(tmp_path / "p.safetensors")
+    np.testing.assert_array_equal(load(tmp_path / "p.safetensors").sample(40, rng()).delta_s, turned.delta_s)
+    tensors, metadata = read(tmp_path / "p.safetensors")
+    about = json.loads(metadata["about"])
+    del about["frame"]  # as files had none while delta_s was in the world's
+    save_file(tensors, tmp_path / "old.safetensors", metadata | {"about": json.dumps(about)})
+    with pytest.raises(InputError, match=r"its delta_s is in the world's frame.*train it again"):
+        load(tmp_path / "old.safetensors")
 
 
 def test_what_was_given_moves_along_to_another_device() -> None:

@@ -39,11 +39,44 @@ class Place(nn.Module):
         super().__init__()
         self.quat, self.pos, self.pairs = list(entries["quat"]), list(entries["pos"]), list(entries["turned"])
 
+    def _heading(self, states: Tensor) -> Tensor:
+        """(B,) rad, of the first states."""
+        w, x, y, z = (states[:, 0, i] for i in self.quat)
+        return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y.square() + z.square()))
+
+    def facing(self, states: Tensor) -> Tensor:
+        """(B, 3) how windows as logged face: cosine and sine of half the heading, and the quaternion's sign."""
+        half = self._heading(states) / 2
+        c, s = half.cos(), half.sin()
+        scalar = c * states[:, 0, self.quat[0]] + s * states[:, 0, self.quat[3]]
+        return torch.stack([c, s, torch.where(scalar < 0, -1.0, 1.0)], -1)
+
+    def turned(self, change: Tensor, facing: Tensor, back: bool = False) -> Tensor:
+        """Changes of states (..., s) from the world's frame into that of the window, or back.
+
+        Args:
+          facing: (..., 3), see `facing`.
+        """
+        c, s, sign = facing.unbind(-1)
+        s = -s if back else s
+        columns = list(change.unbind(-1))
+        w, x, y, z = (sign * columns[i] for i in self.quat)
+        for i, part in zip(self.quat, (c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w), strict=True):
+            columns[i] = part
+        c, s = c.square() - s.square(), 2 * c * s
+        for a, b in self._horizontal:
+            columns[a], columns[b] = c * columns[a] + s * columns[b], c * columns[b] - s * columns[a]
+        return torch.stack(columns, -1)
+
+    @property
+    def _horizontal(self) -> list[list[int]]:
+        return [*([self.pos] if self.pos else []), *self.pairs]
+
     def forward(self, states: Tensor) -> Tensor:
         """The same shape."""
         columns = list(states.unbind(-1))
         w, x, y, z = (columns[i] for i in self.quat)
-        heading = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y.square() + z.square()))[:, :1]
+        heading = self._heading(states)[:, None]
         c, s = (heading / 2).cos(), (heading / 2).sin()
         turned = (c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w)
         sign = torch.where(turned[0] < 0, -1.0, 1.0)
@@ -52,6 +85,6 @@ class Place(nn.Module):
         for a in self.pos:
             columns[a] = columns[a] - columns[a][:, :1]
         c, s = heading.cos(), heading.sin()
-        for a, b in (*([self.pos] if self.pos else []), *self.pairs):
+        for a, b in self._horizontal:
             columns[a], columns[b] = c * columns[a] + s * columns[b], c * columns[b] - s * columns[a]
         return torch.stack(columns, -1)
