@@ -65,7 +65,7 @@ An effect is one physical law that a model may lack, with a place and a few numb
 all of them in logs, and `ApplyEffects` puts them into the simulation of any MuJoCo environment. This page is made
 from the code (`python docs/library.py`), and [effects.md](effects.md) says how to write one more.
 
-As a row, as `ApplyEffects` takes it and `effects.yaml` holds it:
+As a row, as `ApplyEffects` takes it and `effects.yaml` holds it, with a value of every parameter of the family:
 
 ```yaml
 {family: coulomb, where: shoulder, parameters: {level: 0.2}}   # N m; where: a name, a list of names, or all
