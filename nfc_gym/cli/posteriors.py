@@ -151,7 +151,20 @@ def train(
             said = f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
         else:
             said = "nothing that was learned held on the windows held out: simulate more of them"
-        say_written(out, f"{said} ({done.seconds:.0f} s)")
+        say_written(out, f"{said} ({done.seconds:.0f} s){'' if structure else _told(out)}")
+
+
+def _told(posterior: Path) -> str:
+    """What a window tells of psi, by the notes of a posterior that was just trained."""
+    from nfc_gym.inference import checkpoint
+
+    told = checkpoint.load(posterior)[2]["told"]
+    mean, error = told["mean"], told["error"]
+    more = "" if mean > 2 * error else ", no more than the prior: simulate more windows, or motion that shows it"
+    return (
+        f"; of psi a window tells {mean:.3f} nats a parameter (standard error {error:.3f}, {told['windows']} windows "
+        f"held out){more}"
+    )
 
 
 def infer(

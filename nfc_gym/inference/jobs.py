@@ -17,6 +17,7 @@ from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import StoredWindows
 from nfc_gym.inference.encoders.place import place_of
+from nfc_gym.inference.gains import gains
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import Window, load
 from nfc_gym.inference.progress import Report, quiet
@@ -26,6 +27,7 @@ from nfc_gym.inference.windows import Windows
 
 Array = NDArray[np.float64]
 HELD_OUT = 0.05  # of the windows, by which epochs are compared
+JUDGED = 256  # of these, at most, by which the posterior is judged at the end
 _LEVEL = 0.9
 AS_WIDE = 0.9  # of the prior's own 90 % interval: told little or nothing
 
@@ -49,6 +51,8 @@ def train_posterior(
     report: Report = quiet, noise: float = 1.0,
 ) -> Outcome:  # fmt: skip
     """Train a network on a folder of windows into a checkpoint; a run that was stopped goes on.
+
+    Its notes say as `told` what windows held out tell of psi, in nats a parameter over the prior (`gains`).
 
     Args:
       folder: what `nfc-gym simulate` wrote.
@@ -80,11 +84,14 @@ def train_posterior(
     state = out.with_name(out.name + ".training")
     state.mkdir(parents=True, exist_ok=True)
     outcome = train(network, first, held_out, training, folder=state, device=device_of(device), report=report)
+    judged = gains(network, next(held_out.batches(JUDGED, 0)))
     notes = {
         "environment": about.environment, "states": list(about.state_names), "windows": len(stored),
         "best": outcome.best, "stopped": outcome.stopped,
         "seconds": outcome.seconds, "held_out": outcome.held_out, "start": outcome.start,
         "noise": [noise * sd for sd in about.state_noise],
+        "told": {"mean": float(judged.mean()), "error": float(judged.std() / np.sqrt(len(judged))),
+                 "windows": len(judged)},
     }  # fmt: skip
     checkpoint.save(out, network.cpu(), notes=notes)
     return outcome

@@ -83,7 +83,7 @@ def test_the_command_trains_and_the_other_tells(windows: Path, motion: Path, tmp
     made = run.invoke(app, ["train", str(windows), "--out", str(file), "--encoder", "none", "--epochs", "1",
                             "--no-delta-s", "--device", "cpu"])  # fmt: skip
     assert made.exit_code == 0, made.output
-    assert "held" in made.output
+    assert "of psi a window tells" in made.output
     found = run.invoke(app, ["infer", str(file), str(motion), "--samples", "50"])
     assert found.exit_code == 0, found.output
     assert "base_mass" in found.output

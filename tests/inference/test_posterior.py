@@ -15,6 +15,7 @@ import nfc_gym  # noqa: F401 (registers the loader and the environments)
 from nfc_gym.core import Fidelity, InputError, Posterior, load_source
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
+from nfc_gym.inference.gains import gains
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 from nfc_gym.inference.space import PriorBox
@@ -88,6 +89,19 @@ def test_delta_s_turns_with_the_world(linear: bool, tmp_path: Path) -> None:
     save_file(tensors, tmp_path / "old.safetensors", metadata | {"about": json.dumps(about)})
     with pytest.raises(InputError, match=r"its delta_s is in the world's frame.*train it again"):
         load(tmp_path / "old.safetensors")
+
+
+@pytest.mark.parametrize("density", ["score", "mixture"])
+def test_what_windows_tell_is_the_density_over_the_priors(density: str) -> None:
+    windows = motion_windows(6)
+    net = shaken(network(windows, delta_s=True, density=density))
+    found = gains(net, windows.tensors)
+    posterior, psi = NeuralPosterior(net), windows.tensors["psi"].double().numpy()
+    low, high = np.array(posterior.prior.low), np.array(posterior.prior.high)
+    for k in range(6):
+        given = posterior.given(Window(*(windows.tensors[n][k].numpy() for n in ("states", "actions"))))
+        own = given.log_prob(Fidelity(low + psi[k] * (high - low)))[0] + posterior.prior.log_volume
+        assert found[k] == pytest.approx(own / 2, abs=1e-3)
 
 
 def test_what_was_given_moves_along_to_another_device() -> None:
