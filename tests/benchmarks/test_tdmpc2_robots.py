@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,16 @@ def model_file(folder: Path, place: str = "JackalFlat") -> str:
     path, sight = folder / f"{place}.safetensors", Sight.of(env)
     Agent(tiny(sight.size, env.unwrapped.robot.action_size), 0.99, sight).save(path)
     return str(path)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judged in 150 control steps: planning takes its time."""
+    from tdmpc2 import pretraining
+    from worlds.world import World
+
+    monkeypatch.setitem(World.make.__kwdefaults__, "max_episode_steps", 150)
+    monkeypatch.setattr(pretraining, "vector_env", partial(pretraining.vector_env, episode=150))
 
 
 def pretrained(folder: Path, steps: int) -> Any:
