@@ -37,17 +37,20 @@ def require_room(model: mujoco.MjModel, step: float) -> None:
     Raises:
       InputError: naming the actuator or sensor, and what to do.
     """
+    for short in too_short(model, step):
+        raise InputError(
+            f"{short}; compile the model after nfc_gym.measured.buffers.make_room, or give it a longer nsample"
+        )
+
+
+def too_short(model: mujoco.MjModel, step: float) -> Iterator[str]:
+    """Which actuators and sensors are less late than they say at a physics step, s, in words."""
     for kind in ("actuator", "sensor"):
         count, delay = getattr(model, f"{kind}_history")[:, 0], getattr(model, f"{kind}_delay")
         every = model.sensor_interval[:, 0] if kind == "sensor" else np.zeros(model.nu)
-        short = np.flatnonzero((count > 0) & (count * np.maximum(step, every) < delay * (1 - _HAIR)))
-        if short.size:
-            i = int(short[0])
-            name = getattr(model, kind)(i).name or str(i)
-            raise InputError(
-                f"{kind} {name}: {count[i]} samples hold no delay of {delay[i]:g} s at a step of {step:g} s; compile "
-                "the model after nfc_gym.measured.buffers.make_room, or give it a longer nsample"
-            )
+        for i in np.flatnonzero((count > 0) & (count * np.maximum(step, every) < delay * (1 - _HAIR))):
+            name = getattr(model, kind)(int(i)).name or str(i)
+            yield f"{kind} {name}: {count[i]} samples hold no delay of {delay[i]:g} s at a step of {step:g} s"
 
 
 def _buffered(spec: mujoco.MjSpec) -> Iterator:

@@ -7,6 +7,7 @@ from difflib import get_close_matches
 import mujoco
 
 from nfc_gym.core import InputError
+from nfc_gym.measured.buffers import too_short
 from nfc_gym.measured.channels import ChannelName, parse_channel
 from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.mapping import Mapping
@@ -55,6 +56,10 @@ def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]
     yield from unmeasured(mapping, model)
     yield from _fields(mapping, model)
     yield from _steps(mapping, model)
+    for short in too_short(model, float(model.opt.timestep)):
+        yield Finding(
+            "warning", "model", short, "MuJoCo delays by what they hold, without a word: give it more nsample"
+        )
     yield from _unused(mapping)
     yield from _integrating(mapping, model)
     if mapping.segments.mode == "rollout":

@@ -10,7 +10,7 @@ import pytest
 from nfc_gym import InputError
 from nfc_gym.measured.bench import make_bench
 from nfc_gym.measured.buffers import make_room, require_room, set_step
-from nfc_gym.measured.checks import require
+from nfc_gym.measured.checks import check, require
 from nfc_gym.measured.shooting import finer
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
@@ -101,3 +101,15 @@ def test_a_bench_delays_as_its_model_says(build: Callable[..., Path], machine: s
     for plant in (bench.plant, finer(bench.plant)):
         assert late(plant) == pytest.approx(0.04, abs=1e-9)
     assert bench.spec.actuators[0].nsample * bench.spec.option.timestep >= 0.04 - 1e-9
+
+
+def test_a_buffer_that_is_too_short_for_its_delay_is_told(build: Callable[..., Path], machine: str) -> None:
+    found = {}
+    for count in (20, 12):
+        servo = PENDULUM_DELAY.replace('nsample="20"', f'nsample="{count}"')
+        findings = check(build(model=machine.replace('<position name="servo" joint="hinge" kp="10" ', servo)))
+        found[count] = [f for f in findings if "samples hold no delay" in f.message]
+    assert not found[20]
+    (warning,) = found[12]
+    assert warning.severity == "warning"
+    assert "actuator servo: 12 samples hold no delay of 0.04 s at a step of 0.002 s" in warning.message
