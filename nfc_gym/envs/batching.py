@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
@@ -23,6 +24,15 @@ def vector_options(options: Mapping[str, Any] | None, rough: bool, more: tuple[s
         if key in given:
             raise InputError(f"option {key!r}: a vector environment takes maps by set_terrains(maps, perceived)")
     return given
+
+
+def autoreset_of(mode: Any) -> AutoresetMode:
+    """A mode, or that of a value; what is neither raises `InputError` with the values that there are."""
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        values = ", ".join(each.value for each in AutoresetMode)
+        raise InputError(f"autoreset_mode is {mode!r}, want one of: {values}") from None
 
 
 def ids_of(mask: Any, n: int) -> Ids:

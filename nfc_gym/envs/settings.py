@@ -27,6 +27,7 @@ class Settings:
       elevation_hz: how often the elevation map is renewed; None is every control step (50 Hz).
       difficulty: of the terrain, in [0, 1].
       terrain_seed, terrain_pool, terrain_kind: the pool of maps that episodes draw from; None is the robot's kind.
+        Flat ground takes them, and `difficulty`, without effect, so that the same arguments serve all ids.
       width, height: of pictures, in pixels.
       camera: name of a camera of the robot's file, or a free one (`render.camera_of`).
 

@@ -1,6 +1,6 @@
 """`Simulations`: a batch of a robot's simulations, each with its own psi, terrain, generator and task memory."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -68,19 +68,40 @@ class Simulations:
         """Of `maps` or `perceived`, each simulation's own."""
         return [maps[int(k)] for k in self.chosen] if maps else [FLAT] * self.n
 
-    def begin(self, ids: Ids, given: Mapping[str, Any]) -> None:
+    def checked(self, k: int, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Reset options of k simulations, those that are given, as arrays of leading shape (k,).
+
+        Raises:
+          InputError: another shape, values that are not finite or physically impossible, a map that there is not.
+        """
+        checked = dict(given)
+        for name in ("psi", "psi_belief"):
+            if name in given:
+                checked[name] = psi_of(self.space, given[name], (k,), name)
+        if "psi" in given:
+            self.space.require_possible(checked["psi"])
+        if "terrain_id" in given:
+            checked["terrain_id"] = terrain_ids(given["terrain_id"], k, len(self.maps))
+        return checked
+
+    def begin(self, ids: Ids, given: Mapping[str, Any], edits: Sequence[Callable[[ModelFields], Any]] = ()) -> None:
         """Begin an episode in some simulations, (k,) ascending; `view.now` is left to the caller.
 
         Args:
           ids: which.
           given: reset options, leading shape (k,); what is left out is nominal, or drawn from each one's generator.
+          edits: called with their model fields, psi being written.
+
+        Raises:
+          InputError: as `checked`; nothing is changed then.
         """
         k = len(ids)
+        given = self.checked(k, given)
         u = np.array([self.generators[i].random(1 + self.robot.draws) for i in ids])
-        self._write_psi(ids, given)
+        self._write_psi(ids, given, edits)
         if self._dataid is not None:
             drawn = (u[:, 0] * len(self.maps)).astype(np.intp)
-            self.chosen[ids] = terrain_ids(given.get("terrain_id", drawn), k, len(self.maps))
+            self.chosen[ids] = given.get("terrain_id", drawn)
             self._dataid[ids] = self.chosen[ids]
         self.still(ids, mujoco.mjtStage.mjSTAGE_NONE)
         start = self.robot.begin(u[:, 1:], lambda xy: self.ground(xy, self.chosen[ids]))
@@ -98,13 +119,13 @@ class Simulations:
         self.batch.reset(ids, self.rest, stage=stage.value)
         self.batch.warning[ids[:, None], UNSTABLE, 1] = 1
 
-    def _write_psi(self, ids: Ids, given: Mapping[str, Any]) -> None:
-        shape = (len(ids),)
-        psi = psi_of(self.space, given.get("psi"), shape)
-        self.space.require_possible(psi)
-        belief = psi_of(self.space, given["psi_belief"], shape, "psi_belief") if "psi_belief" in given else psi
+    def _write_psi(self, ids: Ids, given: Mapping[str, Any], edits: Sequence[Callable[[ModelFields], Any]]) -> None:
+        psi = given["psi"] if "psi" in given else np.tile(self.space.nominal, (len(ids), 1))
+        belief = given.get("psi_belief", psi)
         fields = self.fields if len(ids) == self.n else self.fields.rows(ids)
         fields.restore()
         self.space.write(fields, psi)
+        for edit in edits:
+            edit(fields)
         fields.commit()
         self.psi[ids], self.seen[ids] = psi, seen_psi(self.space, belief)

@@ -53,6 +53,8 @@ class RobotEnv(gymnasium.Env):
       control_hooks: called with this environment before a control step's first physics step, its command being set.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
       after_hooks: called with this environment after the last physics step, before anything is observed.
+      edit_hooks: called with `fields` at every reset, once psi is written and before anything is computed: what they
+        write through them holds for the episode.
       screen: what renders; its `camera` may be changed between pictures.
     """
 
@@ -82,13 +84,14 @@ class RobotEnv(gymnasium.Env):
         self.control_hooks: list[Callable[[RobotEnv], None]] = []
         self.substep_hooks: list[Callable[[RobotEnv], None]] = []
         self.after_hooks: list[Callable[[RobotEnv], None]] = []
+        self.edit_hooks: list[Callable[[ModelFields], Any]] = []
 
         self._pool = given.pool
         self._terrain = self._perceived = FLAT
         self._observe = Observer(self.robot, len(self.psi_space), given.context)
         self._period = given.refresh_period(self.metadata["render_fps"])
         self._map: NDArray[np.float32] | None = None
-        self._age = 0
+        self._age, self._closed = 0, False
         self.observation_space = self._observe.space
         self.action_space = box(kind.action_size, bound=1.0)
 
@@ -109,6 +112,13 @@ class RobotEnv(gymnasium.Env):
     def psi(self) -> NDArray[np.float64]:
         """(d,) psi of the simulation in physical units."""
         return self._psi.copy()
+
+    def note_psi(self, psi: NDArray[np.float64]) -> None:
+        """Say what `psi` is: for whoever has written another one, (d,), through `fields` into the running episode.
+
+        What the observation shows stays.
+        """
+        self._psi = np.array(psi, float)
 
     @property
     def proprio_components(self) -> list[str]:
@@ -145,12 +155,12 @@ class RobotEnv(gymnasium.Env):
         Raises:
           InputError: an unknown option or name, another shape, values that are not finite or physically impossible.
         """
+        given = self._checked(options)
         super().reset(seed=seed)
-        given = checked_options(options, self.rough)
         u = self.np_random.random(1 + self.robot.draws)
-        self._set_psi(given)
-        if self.rough:
+        if self.rough:  # first: a residual may lift the drawn map too high, and is then refused
             self._set_terrain(given, u[0])
+        self._set_psi(given)
         self._still()
         start = self.robot.begin(u[1:], self._ground)
         self.data.qpos[:], self.data.qvel[:] = start.qpos, start.qvel
@@ -172,6 +182,7 @@ class RobotEnv(gymnasium.Env):
         Raises:
           InputError: another shape, or an entry that is no finite number, which the message names.
           ResetNeeded: no episode was begun yet.
+          ClosedEnvironmentError: it was closed, and not reset since.
         """
         action = as_numbers(action)
         values = action.tolist()  # a handful of numbers: looked at faster one by one than by numpy
@@ -181,6 +192,8 @@ class RobotEnv(gymnasium.Env):
             action = np.clip(action, -1, 1)
         view = self._view
         if view.now is None:
+            if self._closed:
+                raise gymnasium.error.ClosedEnvironmentError("the environment was closed: reset it, or make another")
             raise gymnasium.error.ResetNeeded("the environment must be reset before its first step")
         view.ctrl[...] = self.robot.actuate(action, view)
         self._advance()
@@ -201,8 +214,9 @@ class RobotEnv(gymnasium.Env):
         return self.screen.render(self.model, self.data)
 
     def close(self) -> None:
-        """Free what rendering holds."""
+        """Free what rendering holds; a step then wants a reset."""
         self.screen.close()
+        self._view.now, self._closed = None, True
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 
@@ -213,24 +227,36 @@ class RobotEnv(gymnasium.Env):
             return np.zeros(xy.shape[:-1])
         return surface(self._terrain.heights, xy, self._terrain.resolution, self._terrain.origin)[0]
 
+    def _checked(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
+        """Reset options as they are used: refused, if at all, before anything has changed."""
+        given, space = checked_options(options, self.rough), self.psi_space
+        for name in ("psi", "psi_belief"):
+            if name in given:
+                given[name] = psi_of(space, given[name], (), name)
+        if "psi" in given:
+            space.require_possible(given["psi"])
+        for name in ("heightfield", "perceived"):
+            if name in given:
+                given[name] = scene.checked(given[name], name)
+        if "terrain_id" in given:
+            given["heightfield"] = self._pool.map(given["terrain_id"])
+        return given
+
     def _set_psi(self, given: Mapping[str, Any]) -> None:
         space = self.psi_space
-        psi = psi_of(space, given.get("psi"), ())
-        space.require_possible(psi)
-        belief = psi_of(space, given["psi_belief"], (), "psi_belief") if "psi_belief" in given else psi
+        psi = given["psi"] if "psi" in given else space.nominal.copy()
+        belief = given.get("psi_belief", psi)
         self.fields.restore()
         space.write(self.fields, psi)
+        for hook in self.edit_hooks:
+            hook(self.fields)
         self.fields.commit()
         self._psi, self._seen = psi, seen_psi(space, belief)
 
     def _set_terrain(self, given: Mapping[str, Any], u: float) -> None:
-        if "heightfield" in given:
-            self._terrain = scene.checked(given["heightfield"])
-        else:
-            self._terrain = self._pool.map(given.get("terrain_id", self._pool.draw(u)))
-        self._perceived = scene.checked(given["perceived"], "perceived") if "perceived" in given else self._terrain
-        if "terrain_residual" in given:
-            self._terrain = scene.risen(self._terrain, given["terrain_residual"])
+        terrain = given["heightfield"] if "heightfield" in given else self._pool.map(self._pool.draw(u))
+        risen = scene.risen(terrain, given["terrain_residual"]) if "terrain_residual" in given else terrain
+        self._terrain, self._perceived = risen, given.get("perceived", terrain)
         scene.write(self.model, 0, self._terrain.heights)
 
     def _advance(self) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.whole import require_whole
 from nfc_gym.envs import scene
-from nfc_gym.envs.batching import Ids, final_info, ids_of, masked, rows_of, seeds_of, vector_options
+from nfc_gym.envs.batching import Ids, autoreset_of, final_info, ids_of, masked, rows_of, seeds_of, vector_options
 from nfc_gym.envs.contract import (
     Observer,
     as_numbers,
@@ -61,6 +61,8 @@ class RobotVectorEnv(VectorEnv):
       after_hooks: called with this environment after the last physics step, before anything is observed.
       reset_hooks: called with the ids (k,) about to be reset, autoresets included; a returned dict of reset options,
         leading shape (k,), holds for those unless `reset` itself was given that option.
+      edit_hooks: called at every reset, autoresets included, with the `ModelFields` of the simulations that begin, once
+        psi is written and before anything is computed: what they write through them holds for the episode.
 
     It cannot be pickled or copied: `gymnasium.make_vec` makes another one.
 
@@ -84,11 +86,12 @@ class RobotVectorEnv(VectorEnv):
         self._given = Settings.of(self._kind, settings)
         self.screen = Screen(render_mode, (None, "rgb_array"), self._given)
         self.num_envs, self.rough, self.render_mode = require_whole("num_envs", num_envs, 1), bool(rough), render_mode
-        self.frame_skip, self.autoreset_mode = self._kind.frame_skip, AutoresetMode(autoreset_mode)
+        self.frame_skip, self.autoreset_mode = self._kind.frame_skip, autoreset_of(autoreset_mode)
         self.control_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.substep_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.after_hooks: list[Callable[[RobotVectorEnv], None]] = []
         self.reset_hooks: list[Callable[[Ids], Mapping[str, Any] | None]] = []
+        self.edit_hooks: list[Callable[[ModelFields], Any]] = []
         steps = EPISODE if max_episode_steps is None else max_episode_steps
         endless = steps == -1
         self._horizon = np.iinfo(np.int64).max if endless else require_whole("max_episode_steps", steps, 1)
@@ -153,6 +156,13 @@ class RobotVectorEnv(VectorEnv):
     def psi(self) -> NDArray[np.float64]:
         """(n, d) psi of every simulation in physical units."""
         return self._sims.psi.copy()
+
+    def note_psi(self, psi: NDArray[np.float64], ids: Ids) -> None:
+        """Say what `psi` of some simulations (k,) is: for whoever has written another one, (k, d), through `fields`.
+
+        What the observation shows stays.
+        """
+        self._sims.psi[ids] = psi
 
     @property
     def terrain_id(self) -> Ids:
@@ -220,18 +230,37 @@ class RobotVectorEnv(VectorEnv):
         Raises:
           InputError: as for `RobotEnv.reset`.
         """
+        ids, given, seeds = self.check_reset(seed, options)
+        for i, own in seeds.items():
+            self._sims.generators[i] = seeding.np_random(own)[0]
+        self._begin(ids, given)
+        info = nothing_yet(self.robot, self._view)
+        return self._observation(), masked(info, np.isin(np.arange(self.num_envs), ids))
+
+    def check_reset(
+        self, seed: int | Sequence[int | None] | None, options: Mapping[str, Any] | None
+    ) -> tuple[Ids, dict[str, Any], dict[int, int]]:
+        """Refuse what `reset` would refuse; nothing is changed.
+
+        Returns:
+          Ids (k,) of the environments to reset, their options of leading shape (k,), and the seeds of those that have
+          one.
+
+        Raises:
+          InputError: as `reset`.
+        """
         require_threads(self.batch)
         n = self.num_envs
         given = vector_options(options, self.rough, ("reset_mask",))
         ids = ids_of(given.pop("reset_mask", None), n)
         if self._fresh and len(ids) < n:
             raise InputError("reset_mask: the first reset must be of all environments")
-        for i, own in enumerate(seeds_of(seed, n)):
-            if own is not None and i in ids:
-                self._sims.generators[i] = seeding.np_random(own)[0]
-        self._begin(ids, {key: rows_of(value, ids, n, key) for key, value in given.items()})
-        info = nothing_yet(self.robot, self._view)
-        return self._observation(), masked(info, np.isin(np.arange(n), ids))
+        given = self._sims.checked(len(ids), {key: rows_of(value, ids, n, key) for key, value in given.items()})
+        each = seeds_of(seed, n)
+        seeds = {i: own for i in ids.tolist() if (own := each[i]) is not None}
+        if seeds and min(seeds.values()) < 0:
+            seeding.np_random(min(seeds.values()))  # Gymnasium's own error
+        return ids, given, seeds
 
     def step(self, actions: Any) -> tuple[Any, NDArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """One control step of every environment.
@@ -245,12 +274,15 @@ class RobotVectorEnv(VectorEnv):
         Raises:
           InputError: another shape, or an entry that is no finite number, which the message names.
           ResetNeeded: an environment was not reset (after its episode, where autoreset is off).
+          ClosedEnvironmentError: it was closed, and not reset since.
         """
         actions = as_numbers(actions)
         if actions.shape != self._limit.shape or not np.isfinite(actions).all():
             raise wrong_action(actions, self._limit.shape)
         resetting = self._waiting.copy() if self._waiting.any() else None
         if resetting is not None and (self._fresh or self.autoreset_mode is not AutoresetMode.NEXT_STEP):
+            if self._fresh and self.closed:
+                raise gymnasium.error.ClosedEnvironmentError("the environments were closed: reset them, or make others")
             raise gymnasium.error.ResetNeeded(f"environments {np.flatnonzero(resetting).tolist()} must be reset first")
         require_threads(self.batch)
         actions = np.minimum(np.maximum(actions, -self._limit), self._limit)
@@ -281,8 +313,9 @@ class RobotVectorEnv(VectorEnv):
         return tuple(self.screen.render(self.batch.get_model(i), self.batch.get_data(i)) for i in each)  # type: ignore[misc]
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free what rendering holds."""
+        """Free what rendering holds; a step then wants a reset."""
         self.screen.close()
+        self._waiting, self._fresh = np.ones_like(self._waiting), True
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
@@ -296,7 +329,7 @@ class RobotVectorEnv(VectorEnv):
         """Begin episodes with options of leading shape (k,), and what the hooks add to them."""
         for hook in self.reset_hooks:
             given = {**vector_options(hook(ids), self.rough), **given}
-        self._sims.begin(ids, given)
+        self._sims.begin(ids, given, self.edit_hooks)
         self._view.now = self.robot.derive(self._view)
         self._steps[ids] = 0
         self._waiting[ids] = False

@@ -126,6 +126,12 @@ class VectorEnvWrapper(_Common, VectorWrapper):
         self._open(env, arguments)
         VectorWrapper.__init__(self, env)
 
+    def vet(self, seed: Any, options: Any) -> None:
+        """Refuse what the environment would refuse of a reset, before anything is drawn or forgotten for it."""
+        check = getattr(self.env.unwrapped, "check_reset", None)
+        if check is not None:
+            check(seed, options)
+
     def own_seed(self, seed: Any) -> Any:
         """Of the rows' seeds the first that is given; what can be read only once is left for the environment."""
         several = isinstance(seed, Iterable) and not isinstance(seed, str | Iterator) and getattr(seed, "ndim", 1)

@@ -11,7 +11,7 @@ from nfc_gym.wrappers.hooks import Hooks
 from nfc_gym.wrappers.simulation import ATTRIBUTE, Simulation
 
 Array = NDArray[np.float64]
-_HOOKS = ("control_hooks", "substep_hooks", "after_hooks", "reset_hooks")
+_HOOKS = ("control_hooks", "substep_hooks", "after_hooks", "reset_hooks", "edit_hooks")
 
 
 class BatchSimulation(Simulation):
@@ -28,9 +28,9 @@ class BatchSimulation(Simulation):
         self.started = np.ones(self.shape, bool)
         self.on_reset = Hooks()
         self._bound: set[str] = set()
-        self._unedited = np.zeros(self.shape, bool)
         self._look()
         env.reset_hooks.append(self._resetting)
+        env.edit_hooks.append(self.apply)
 
     def _look(self) -> None:
         """Views of the batch; with other terrains an environment makes itself another one."""
@@ -69,23 +69,12 @@ class BatchSimulation(Simulation):
     def _resetting(self, ids: NDArray[np.intp]) -> dict[str, Any]:
         """Rows are about to begin an episode: the options of the wrappers for them."""
         self.look_again()
-        self.pending[ids] = self._unedited[ids] = True
+        self.pending[ids] = True
         options: dict[str, Any] = {}
         self.refresh()
         for hook in self.on_reset.live():
             options |= hook(ids) or {}
         return options
-
-    def edit_after(self) -> None:
-        """After a reset, or a step that has reset rows: edits on top of the psi that the environment wrote."""
-        ids = np.flatnonzero(self._unedited)
-        self._unedited[:] = False
-        edits = self.edits.live() if len(ids) else []
-        if edits:
-            fields = self.fields_of(ids)
-            for edit in edits:
-                edit(fields)
-            fields.commit()
 
     def fields_of(self, ids: NDArray[np.intp]) -> ModelFields:
         """Model fields of some simulations, ascending ids."""

@@ -75,6 +75,11 @@ class Belief:
         self.modes = left.T @ spread / np.where(scale > 0, scale, 1)[:, None]
         return left * scale
 
+    def __repr__(self) -> str:
+        parts = {"psi": self.psi_size, "modes": self.mode_count, "delta_s": self.step_size}
+        sizes = ", ".join(f"{name} {size}" for name, size in parts.items() if size)
+        return f"Belief({sizes}; held {self.held} of {self.size})"
+
     def held_part(self, h: Array, beta: float) -> Array:
         """What the held entries of h (..., held) alone make of delta_s, (..., s): see `lever`."""
         h = np.minimum(np.maximum(h, -1.0), 1.0)

@@ -245,6 +245,7 @@ class VectorResidualDynamics(_Observing, VectorEnvWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset; biases are drawn for the rows that are."""
+        self.vet(seed, options)
         self.injection.rng = self.stream(seed)
         observation, info = self.env.reset(seed=seed, options=options)
         return self._observed(observation), info

@@ -124,7 +124,8 @@ def own_values(effects: Sequence[Effect], each: Sequence[ArrayLike], shape: tupl
         want = (*shape, len(effect.params))
         if theta.shape != want or not np.isfinite(theta).all():
             raise InputError(f"ApplyEffects: values of {effect.id} must be finite, of shape {want}, got {theta.shape}")
-        for extreme in (theta.reshape(-1, theta.shape[-1]).min(0), theta.reshape(-1, theta.shape[-1]).max(0)):
+        over = tuple(range(len(shape)))
+        for extreme in (theta.min(over), theta.max(over)):
             effect.require_possible(extreme)
     return found
 
@@ -286,9 +287,7 @@ class ApplyEffects(EnvWrapper):
         """Edit the model from nominal, forget hidden states, reset."""
         self.sim.edit()
         self.sim.begin_episode()
-        result = self.env.reset(seed=seed, options=options)
-        self.sim.edit_after()
-        return result
+        return self.env.reset(seed=seed, options=options)
 
 
 class VectorApplyEffects(VectorEnvWrapper):
@@ -318,15 +317,3 @@ class VectorApplyEffects(VectorEnvWrapper):
         if name == "values":
             return None if value is None else [np.asarray(v, float).tolist() for v in value]
         return recorded(value) if name == "effects" else super().recorded(name, value)
-
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset, and edit the models of the rows that were."""
-        result = self.env.reset(seed=seed, options=options)
-        self.sim.edit_after()
-        return result
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step, and edit the models of the rows that were reset meanwhile."""
-        result = self.env.step(actions)
-        self.sim.edit_after()
-        return result

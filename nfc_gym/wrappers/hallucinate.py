@@ -133,6 +133,7 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         self.ground = Ground(env, sim, "Hallucinate") if self.belief.mode_count else None
         if self.ground is not None and self.belief.shape != self.ground.shape:
             raise InputError(f"Hallucinate: delta_e has shape {self.belief.shape}, the ground {self.ground.shape}")
+        sim.late_ground = sim.late_ground or self.ground is not None
         self.injection = injection_of(env, sim, self.belief, mode, components)
         self._h = np.zeros(self.belief.size)
         self._chosen, self._lever = False, self.belief.lever(self.beta)
@@ -169,10 +170,7 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         if self.injection is not None and world.delta_s is not None:
             self.injection.bias = self.injection.delta = world.delta_s
         self.sim.begin_episode()
-        result = self.env.reset(seed=seed, options=options)
-        if self.psi is not None:
-            self.psi.settle()
-        return result
+        return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step in the world that the action asks for."""
@@ -248,12 +246,6 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
         mean = self.belief.at(np.zeros((len(ids), self.belief.size)), self.beta).psi
         return {} if mean is None else {"psi": mean}
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin episodes in the posterior's mean."""
-        result = self.env.reset(seed=seed, options=options)
-        self.sim.edit_after()
-        return result
-
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step in the worlds that the actions ask for."""
         actions = finite(actions, self._wanted)
@@ -266,9 +258,7 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
             self._write(np.flatnonzero(first), self.fidelity.psi[first])
         if self.injection is not None and self.fidelity.delta_s is not None:
             self.injection.bias = self.fidelity.delta_s
-        result = self.env.step(actions[:, : self.own])
-        self.sim.edit_after()
-        return result
+        return self.env.step(actions[:, : self.own])
 
     def _write(self, ids: NDArray[np.intp], psi: Array) -> None:
         """Psi of episodes that have begun but not moved yet, with every other edit on top."""
@@ -276,7 +266,7 @@ class VectorHallucinate(_Hallucinating, VectorEnvWrapper):
         fields = self.sim.fields_of(ids)
         fields.restore()
         self.psi_space.write(fields, psi)
-        for edit in self.sim.edits.live():
-            edit(fields)
+        self.sim.apply(fields)
         fields.commit()
+        self.sim.env.note_psi(psi, ids)
         self.sim.forward(ids)

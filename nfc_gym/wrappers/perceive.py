@@ -143,6 +143,7 @@ class VectorPerceiveTerrain(VectorEnvWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Forget what the rows that are reset saw, and reset."""
+        self.vet(seed, options)
         self.stream(seed)
         self._stepping = False
         observation, info = self.env.reset(seed=seed, options=options)

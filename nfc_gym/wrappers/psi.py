@@ -162,7 +162,9 @@ class Psi:
         """
         if not isinstance(options, Mapping | None):
             raise InputError(f"reset: options is {options!r}, want a dict")
-        options = {"psi": value, **(more or {}), **(options or {})}
+        own = {"psi": value, **(more or {})}
+        # None of the caller's is not given, as the environment has it.
+        options = own | {k: v for k, v in (options or {}).items() if v is not None or k not in own}
         psi = self.space.vector(options["psi"])
         if psi.shape == self.space.nominal.shape:  # another one is refused where it is written
             self.space.require_possible(psi)
@@ -173,15 +175,12 @@ class Psi:
         self.sim.edit()
         return options or None
 
-    def settle(self) -> None:
-        """After a reset: psi that the environment has not written itself."""
-        if not self.own:
-            self.sim.edit_after()
-
     def write(self, value: Array) -> None:
         """Psi of an episode that has begun but not moved yet; derived quantities follow."""
         self.value = value
-        self.sim.edit_again(self._edit if self.own else None)
+        if self.own:
+            self.sim.env.note_psi(value)
+        self.sim.edit_again()
 
 
 class RandomizePsi(EnvWrapper):
@@ -223,9 +222,7 @@ class RandomizePsi(EnvWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw psi, then reset."""
         value = self.prior.draw(1, self.stream(seed))[0]
-        result = self.env.reset(seed=seed, options=self._psi.options(value, options, self._told))
-        self._psi.settle()
-        return result
+        return self.env.reset(seed=seed, options=self._psi.options(value, options, self._told))
 
 
 class VectorRandomizePsi(VectorEnvWrapper):
@@ -255,5 +252,6 @@ class VectorRandomizePsi(VectorEnvWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset; psi is drawn for the rows that are."""
+        self.vet(seed, options)
         self.stream(seed)
         return self.env.reset(seed=seed, options=options)

@@ -35,7 +35,7 @@ class _Recording:
     def _open(self, env: Any, arguments: dict[str, Any]) -> None:
         super()._open(env, arguments)  # type: ignore[misc]
         self.tapes = {}
-        self._physics_step = 0
+        self._physics_step, self._undescribed = 0, False
 
     def _wire(self, path: Path, model_file: Path | None) -> None:
         sim = self.sim
@@ -54,6 +54,9 @@ class _Recording:
 
     def _command(self) -> None:
         sim, self._physics_step = self.sim, 0
+        if self._undescribed:
+            self.log.describe()
+            self._undescribed = False
         time: Any = sim.bind("time")
         for row, tape in self.tapes.items():
             at = (row,) if sim.shape else ()
@@ -93,11 +96,13 @@ class RecordLog(_Recording, EnvWrapper):
 
     A folder holds one `model.xml`, and the ground is part of it. An environment on rough ground draws a map of its pool
     at each reset, so that the second episode would need another model: make it with `terrain_pool=1`, or reset it with
-    the same `options={"terrain_id": ...}` each time.
+    the same `options={"terrain_id": ...}` each time. Where a `Hallucinate` chooses the ground (delta_e), it is that of
+    the episode's first action, and a folder holds the episodes that have chosen the same.
 
     Raises:
       InputError: no MuJoCo environment, its MJCF is not at hand, another recorder beneath writes to the folder; at a
-        reset, the folder holds logs of another model or other ground.
+        reset (at the first step, where that is what chooses the ground), the folder holds logs of another model or
+        other ground.
       MissingExtra: Parquet or YAML cannot be written.
     """
 
@@ -111,7 +116,9 @@ class RecordLog(_Recording, EnvWrapper):
         self.flush()
         self.sim.begin_episode()
         result = self.env.reset(seed=seed, options=options)
-        self.log.describe()
+        self._undescribed = self.sim.late_ground
+        if not self._undescribed:
+            self.log.describe()
         self.tapes[0] = Tape()
         return result
 

@@ -81,7 +81,8 @@ class Channel:
         """Draw the biases of the episodes that begin: of all, or of the rows `first`; their past is forgotten."""
         if first is None:
             self.past.clear()
-        self.fresh = first
+        # Rows that began before, and of which nothing has gone in since, still wait for their first value.
+        self.fresh = first if first is None or self.fresh is None else self.fresh | first
         if self.drifting:
             drawn = self.bias + self.bias_sd * rng.standard_normal(self.shape)
             self.total = drawn if first is None else np.where(_rows(first, drawn), drawn, self.total)
@@ -219,6 +220,7 @@ class VectorPerturbSignals(_Perturbing, VectorEnvWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw the biases of the rows that are reset, and reset."""
+        self.vet(seed, options)
         self.stream(seed)
         new = self.rows.reset(options)
         self._begin(None if new.all() else new)

@@ -75,6 +75,7 @@ class Simulation:
       commanded: (..., nu) what the environment sent to the actuators in this control step, before any effect.
       started: which simulations are in the first control step of an episode: a bool, or (n,) bool.
       pushed: whether any hook applies forces, which are then taken back after each control step.
+      late_ground: whether it is the first action of an episode that says on what ground it runs.
       on_control: called once a control step, before its first physics step.
       on_substep: called before every physics step.
       on_after: called after the last physics step of a control step, before anything is observed.
@@ -97,7 +98,7 @@ class Simulation:
         self.on_control, self.on_substep, self.on_after = Hooks(), Hooks(), Hooks()
         self.edits, self.senses = Hooks(), Hooks()
         self.commanded = np.zeros(0)
-        self.pushed = False
+        self.pushed = self.late_ground = False
         self.attached = self.between = False
 
     def refresh(self) -> None:
@@ -111,6 +112,17 @@ class Simulation:
     def model(self) -> mujoco.MjModel:
         """The model that is simulated."""
         return self.env.model
+
+    def apply(self, fields: ModelFields) -> int:
+        """Every wrapper's edits, psi's first, to be committed; returns how many there are.
+
+        Args:
+          fields: of the model, or of those simulations of the batch that begin an episode.
+        """
+        edits = self.edits.live()
+        for edit in edits:
+            edit(fields)
+        return len(edits)
 
     def bind(self, name: str) -> Array:
         """A live field of `MjData`, (..., *shape)."""
@@ -145,15 +157,16 @@ class Simulation:
 class SingleSimulation(Simulation):
     """One environment with `model` and `data`.
 
-    An environment with `fields` (a `ModelFields` of its model, brought back to nominal at each of its resets) has its
-    own psi: edits are then made right after a reset. Any other's model is edited right before.
+    An environment with `fields` (a `ModelFields` of its model, brought back to nominal at each of its resets) and
+    `edit_hooks`, which it calls with them there, has its own psi, and every reset of it asks for the edits on top. Any
+    other's model is edited right before.
     """
 
     def __init__(self, env: Any, left: _Left | None = None) -> None:
         super().__init__(env)
         own, nominal = getattr(env, "fields", None), left.nominal if left else None
-        self.own_fields = isinstance(own, ModelFields)
-        self.fields = own if isinstance(own, ModelFields) else ModelFields(env.model, nominal or copy.copy(env.model))
+        self.own_fields = isinstance(own, ModelFields) and hasattr(env, "edit_hooks")
+        self.fields = own if self.own_fields else ModelFields(env.model, nominal or copy.copy(env.model))
         self.nominal = self.fields.nominal_model
         if left is not None and nominal is not None:
             for name in left.touched:
@@ -161,7 +174,9 @@ class SingleSimulation(Simulation):
             self.fields.restore()
             self.fields.commit()
         self._steps: tuple[Any, str] | None = stepper_of(env)
-        self._inside = self._unedited = False
+        if self.own_fields:
+            env.edit_hooks.append(self.apply)
+        self._inside = False
         self._calls = self._written = 0
         self._time = np.inf
         self.started = True
@@ -195,38 +210,20 @@ class SingleSimulation(Simulation):
     # ---- model edits ----------------------------------------------------------------------------------------------
 
     def edit(self) -> None:
-        """Before a reset: the nominal model with every wrapper's edits, psi's first; derived constants follow."""
-        self._unedited = True
+        """Before a reset of a model that no environment brings back to nominal: nominal, with every wrapper's edits."""
         if not self.own_fields:
             self.fields.restore()
-            self._write()
+            self._written = self.apply(self.fields)
+            self.fields.commit()
 
-    def edit_after(self) -> None:
-        """After a reset: the edits that come on top of the psi that the environment itself has written, once."""
-        if self.own_fields and self._unedited:
-            self._write()
-        self._unedited = False
-
-    def edit_again(self, write: Callable[[ModelFields], None] | None = None) -> None:
-        """In an episode that has not moved yet: the nominal model with psi and every edit; derived quantities follow.
-
-        Args:
-          write: writes psi, by default as no wrapper but perhaps the environment itself has it.
-        """
+    def edit_again(self) -> None:
+        """In an episode that has not moved yet: nominal, with psi and every edit; derived quantities follow."""
         self.fields.restore()
-        if write is not None:
-            write(self.fields)
-        elif self.own_fields:
+        if self.own_fields:
             self.env.psi_space.write(self.fields, self.env.psi)
-        self._write()
-        self.forward()
-
-    def _write(self) -> None:
-        edits = self.edits.live()
-        for edit in edits:
-            edit(self.fields)
+        self.apply(self.fields)
         self.fields.commit()
-        self._written = len(edits)
+        self.forward()
 
     # ---- stepping -------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from nfc_gym import terrain
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.physics.fields import names_of
+from nfc_gym.physics.parameters import numbers
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.simulation import SingleSimulation, simulation_of
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 _WRITTEN = (
     "hfield_data", "hfield_size", "geom_pos", "geom_sameframe", "geom_size", "geom_aabb", "geom_rbound", "bvh_aabb",
 )  # fmt: skip
+_TURN = 1e-6  # rad within which ground counts as not turned
 _FOOTPRINT = 1.0  # m around a start within which the ground must not rise into a robot
 
 
@@ -56,12 +58,25 @@ class Ground:
         self.own = hasattr(base, "heightfield")
         if not self.own:
             self.perceived = read_ground(model, who)
+            geom = int(np.flatnonzero(model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD))[0])
+            if model.geom_bodyid[geom] != 0:
+                raise InputError(f"{who}: {_geom(model, geom)}, the heightfield, must belong to the world body")
             self.start = getattr(sim.owner, "init_qpos", np.zeros(0)).copy()
             self._given = {name: getattr(model, name).copy() for name in _WRITTEN}
 
     def options(self, residual: Array, options: dict[str, Any] | None) -> dict[str, Any] | None:
-        """Reset options under which the coming episode runs on e + residual (rows, columns)."""
+        """Reset options under which the coming episode runs on e + residual (rows, columns), and the caller's own.
+
+        Raises:
+          InputError: the caller's `terrain_residual` has another shape, or is no array of numbers.
+        """
         if self.own:
+            own = None if options is None else options.get("terrain_residual")
+            if own is not None:
+                own = numbers(own, "terrain_residual")
+                if own.shape != self.shape:
+                    raise InputError(f"terrain_residual has shape {own.shape}, want {self.shape}")
+                residual = residual + own
             return {**(options or {}), "terrain_residual": residual}
         for name, value in self._given.items():
             getattr(self.sim.model, name)[...] = value
@@ -88,28 +103,48 @@ def read_ground(model: mujoco.MjModel, who: str) -> terrain.Heightfield:
     """The map that a model's only heightfield and its geom make in the world, or that of its level plane.
 
     Raises:
-      InputError: the model has neither, or a heightfield that no map can stand for.
+      InputError: the model has neither, or ground that no map can stand for: it is turned, or moves.
     """
+    fixed = model.body_weldid[model.geom_bodyid] == 0  # to the world, on whatever bodies
     if model.nhfield == 0:
-        planes = np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (model.geom_bodyid == 0))
+        every = model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)
+        own = every & (model.geom_bodyid == 0)  # the world's own come before what is fixed to it
+        planes = np.flatnonzero(own if own.any() else every & fixed)
         if len(planes) != 1:
             raise InputError(
                 f"{who}: the model has no heightfield and {len(planes)} planes; want one of either as ground"
             )
-        return terrain.Heightfield(np.full(terrain.SHAPE, model.geom_pos[planes[0], 2], np.float32))
+        (_, _, z), axes = _pose(model, planes[0])
+        if not np.allclose(axes[:, 2], (0, 0, 1), atol=_TURN):
+            raise InputError(f"{who}: {_geom(model, planes[0])}, the model's plane, is not level")
+        return terrain.Heightfield(np.full(terrain.SHAPE, z, np.float32))
     rows, cols = int(model.hfield_nrow[0]), int(model.hfield_ncol[0])
     geoms = np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)) & (model.geom_dataid == 0))
     if model.nhfield > 1 or len(geoms) != 1:
         raise InputError(
             f"{who}: the model has {model.nhfield} heightfields, {len(geoms)} geoms of the first; want one each"
         )
-    x, y, z = model.geom_pos[geoms[0]]
+    (x, y, z), axes = _pose(model, geoms[0])
+    if not fixed[geoms[0]] or not np.allclose(axes, np.eye(3), atol=_TURN):
+        how = "is turned" if fixed[geoms[0]] else "is on a body that moves"
+        raise InputError(f"{who}: {_geom(model, geoms[0])}, the model's heightfield, {how}; a map lies along x and y")
     half_x, half_y, span, _ = model.hfield_size[0]
     resolution = 2 * half_x / (cols - 1)
     if not np.isclose(resolution, 2 * half_y / (rows - 1)):
         raise InputError(f"{who}: the cells of the model's heightfield are not square")
     heights = z + span * np.asarray(model.hfield_data[: rows * cols], float).reshape(rows, cols)
     return terrain.Heightfield(heights.astype(np.float32), float(resolution), (float(x - half_x), float(y - half_y)))
+
+
+def _pose(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
+    """Where a geom is in the world, (3,) m, and its axes as columns (3, 3), in the model's own configuration."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy()
+
+
+def _geom(model: mujoco.MjModel, geom: int) -> str:
+    return f"geom {model.geom(geom).name or int(geom)!r}"
 
 
 class ResidualTerrain(EnvWrapper):
@@ -119,6 +154,8 @@ class ResidualTerrain(EnvWrapper):
       env: an environment on a heightfield: a Rough one, or any MuJoCo environment whose model has one.
       source: where an episode's delta_e comes from: a posterior, an array (rows, columns) or (n, rows, columns) in m, a
         path. It lies in the world, cell by cell on the environment's heightfield.
+
+    A `terrain_residual` among the options of `reset` is added to it.
 
     Raises:
       InputError: the environment has no heightfield, or delta_e has another shape than it.
@@ -173,6 +210,7 @@ class VectorResidualTerrain(VectorEnvWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw residuals where all environments are reset, then reset."""
+        self.vet(seed, options)
         mask = (options or {}).get("reset_mask")
         everyone, rng = mask is None or bool(np.all(mask)), self.stream(seed)
         if self._delta is None or (everyone and not self._constant):

@@ -298,3 +298,30 @@ def test_cameras_of_any_scene() -> None:
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with pytest.raises(InputError, match="the scene has none"):
         render.camera_of(model, "track")
+
+
+@pytest.mark.parametrize("options", [{"psi": {"base_mass": -1.0}}, {"terrain_id": 7}, {"perceived": np.zeros(3)}])
+def test_a_reset_that_is_refused_changes_nothing(options: dict[str, Any]) -> None:
+    env, twin = (made(ROUGH, context=["psi"]) for _ in range(2))
+    for each in (env, twin):
+        each.reset(seed=0)
+    with pytest.raises(InputError):
+        env.reset(seed=3, options=options)
+    for a, b in ((env.step(np.ones(2))[0], twin.step(np.ones(2))[0]), (env.reset()[0], twin.reset()[0])):
+        np.testing.assert_array_equal(a["proprio"], b["proprio"])
+
+
+def test_what_was_closed_is_not_stepped() -> None:
+    name = "nfc_gym/JackalFlat-v0"
+    for env in (made(name, context=["psi"]), gymnasium.make_vec(name, num_envs=2, context=["psi"])):
+        env.reset(seed=0)
+        env.close()
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="closed: reset"):
+            env.step(np.zeros(env.action_space.shape))
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape))
+
+
+def test_an_autoreset_mode_that_is_none_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="autoreset_mode is 'foo', want one of: NextStep, SameStep, Disabled"):
+        gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=2, autoreset_mode="foo")

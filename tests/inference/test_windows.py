@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import InputError
+from nfc_gym.inference.shards import maps_path
 from nfc_gym.inference.windows import Manifest, Windows, WindowWriter, packed, shard_path
 
 MANIFEST = Manifest(
@@ -113,6 +114,9 @@ def test_another_set_is_not_mixed_in(tmp_path: Path) -> None:
         WindowWriter(tmp_path, replace(MANIFEST, seed=1))
     (tmp_path / "manifest.json").unlink()
     with pytest.raises(InputError, match=r"shards without a manifest\.json"):
+        WindowWriter(tmp_path, MANIFEST)
+    shard_path(tmp_path, 0).rename(maps_path(tmp_path, 0))
+    with pytest.raises(InputError, match=r"elevation maps without a manifest\.json"):
         WindowWriter(tmp_path, MANIFEST)
 
 

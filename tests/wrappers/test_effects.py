@@ -324,3 +324,28 @@ def test_psi_beside_the_effects_of_a_file_holds_in_every_episode(tmp_path: Path)
     drawn = RandomizePsi(gym.make("nfc_gym/JackalFlat-v0"), np.tile(env.unwrapped.psi_space.nominal, (2, 1)))
     with pytest.raises(InputError, match="psi is written by"):
         ApplyEffects(drawn, file)
+
+
+HEAVY = {"family": "payload", "where": "torso", "parameters": {"mass": 6.0, "x": 0.1, "y": 0.0, "z": 0.0}}
+
+
+def test_the_first_step_has_the_quantities_of_the_edited_model() -> None:
+    env = ApplyEffects(gym.make("nfc_gym/AntFlat-v0", context=["psi"]), [HEAVY])
+    many = VectorApplyEffects(
+        gym.make_vec("nfc_gym/AntFlat-v0", num_envs=2, context=["psi"], max_episode_steps=2), [HEAVY]
+    )
+    model, data = env.unwrapped.model, env.unwrapped.data
+    whole = many.unwrapped.batch.bind("M")
+    mass = model.body("torso").mass[0]
+    shown = many.reset(seed=0)[0]["proprio"][0]
+    np.testing.assert_array_equal(env.reset(seed=0)[0]["proprio"], shown)
+    assert model.body("torso").mass[0] == pytest.approx(mass + 6)
+    inertia, sensed = data.M.copy(), data.sensordata.copy()
+    np.testing.assert_array_equal(whole[0], inertia)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_array_equal(data.M, inertia)
+    np.testing.assert_array_equal(data.sensordata, sensed)
+    for _ in range(3):  # the third begins another episode by itself
+        many.step(np.zeros((2, 8)))
+    env.reset()
+    np.testing.assert_array_equal(whole[0], data.M)

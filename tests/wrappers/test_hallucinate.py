@@ -12,7 +12,14 @@ from scipy.special import ndtr, ndtri
 import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
-from nfc_gym.wrappers import ApplyEffects, Hallucinate, PerturbSignals, RandomizePsi, ResidualDynamics
+from nfc_gym.wrappers import (
+    ApplyEffects,
+    Hallucinate,
+    PerturbSignals,
+    RandomizePsi,
+    ResidualDynamics,
+    VectorHallucinate,
+)
 from nfc_gym.wrappers.belief import Belief
 
 SPACE = ParameterSpace(
@@ -223,3 +230,47 @@ def test_an_array_is_draws_of_psi() -> None:
     assert env.action_space.shape == (3,)
     with pytest.raises(InputError, match=r"3 entries; want cube, pole"):
         Hallucinate(FakeEnv(), np.ones((50, 3)), space=SPACE)
+
+
+LOAD = {"family": "payload", "where": "base", "parameters": {"mass": 5.0, "x": 0.0, "y": 0.0, "z": 0.1}}
+GROUND = 0.05 * np.random.default_rng(0).standard_normal((8, 1, 1)) * np.tile(np.linspace(-1, 1, 256), (256, 1))
+
+
+def _rough() -> gym.Env:
+    return gym.make("nfc_gym/JackalRough-v0", context=["psi"], terrain_pool=1)
+
+
+def test_model_effects_around_a_chosen_ground_outlast_the_first_step() -> None:
+    env = ApplyEffects(Hallucinate(_rough(), Fidelity(delta_e=GROUND), samples=8), [LOAD])
+    model = env.unwrapped.model
+    nominal = model.body("base").mass[0]
+    env.reset(seed=0)
+    for _ in range(2):
+        assert model.body("base").mass[0] == pytest.approx(nominal + 5)
+        env.step(np.array([0, 0, 1], np.float32))
+    assert model.body("base").mass[0] == pytest.approx(nominal + 5)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_the_environment_reads_back_the_psi_that_was_chosen(many: bool) -> None:
+    env = (
+        gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=2, context=["psi"])
+        if many
+        else gym.make("nfc_gym/JackalFlat-v0", context=["psi"])
+    )
+    base, space = env.unwrapped, env.unwrapped.psi_space
+    draws = np.random.default_rng(0).uniform(space.low, space.high, (64, len(space)))
+    env = (VectorHallucinate if many else Hallucinate)(env, draws)
+    told = env.reset(seed=0)[0]["psi"]
+    mean = base.psi
+    shown = env.step(np.ones(env.action_space.shape, np.float32))[0]["psi"]
+    assert env.fidelity.psi is not None
+    np.testing.assert_array_equal(base.psi, env.fidelity.psi)
+    mass = base.batch.expand("body_mass")[:, 1] if many else base.model.body_mass[1]
+    np.testing.assert_array_equal(mass, base.psi[..., 0])
+    assert (base.psi != mean).any()
+    np.testing.assert_array_equal(shown, told)  # the agent still believes the mean
+
+
+def test_a_belief_says_what_it_is_of() -> None:
+    assert repr(Belief(_samples(50), SPACE, 0)) == "Belief(psi 2, delta_s 7; held 2 of 9)"

@@ -2,6 +2,7 @@
 
 import pickle
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -204,3 +205,18 @@ def test_sources_that_give_no_samples_are_told() -> None:
 def test_a_table_that_is_no_parameter_is_told(wrong) -> None:
     with pytest.raises(InputError, match="is no parameter: want a table of name, field, and perhaps of, unit"):
         RandomizePsi(FakeEnv(), 0.5, space=[wrong])
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_a_psi_of_none_is_not_given(many: bool) -> None:
+    shown = []
+    for options in (None, {"psi": None, "psi_belief": None}):
+        if many:
+            env: Any = VectorRandomizePsi(gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=2, context=["psi"]), 0.5)
+        else:
+            env = RandomizePsi(gym.make("nfc_gym/JackalFlat-v0", context=["psi"]), 0.5)
+        env.reset(seed=0, options=options)
+        np.testing.assert_array_equal(env.psi, env.unwrapped.psi)
+        shown.append(env.psi)
+    np.testing.assert_array_equal(shown[1], shown[0])
+    assert (shown[0][..., 0] != env.psi_space.nominal[0]).all()

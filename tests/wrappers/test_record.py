@@ -12,14 +12,14 @@ from fakes import FakeEnv, NoModel, roll, same
 from machines import make
 
 import nfc_gym  # noqa: F401 (registers the ids)
-from nfc_gym.core import InputError, MissingExtra
+from nfc_gym.core import Fidelity, InputError, MissingExtra
 from nfc_gym.measured.checks import check
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.mapping import load_mapping
 from nfc_gym.measured.readers import read_table
 from nfc_gym.physics.names import names
 from nfc_gym.physics.state import rotate
-from nfc_gym.wrappers import ApplyEffects, RecordLog, VectorRecordLog
+from nfc_gym.wrappers import ApplyEffects, Hallucinate, RecordLog, VectorRecordLog
 
 
 def _drive(env: gym.Env, episodes: int, steps: int) -> None:
@@ -332,3 +332,28 @@ def test_wheels_that_turn_and_jump_are_no_doubt(tmp_path: Path) -> None:
                 env.step(command)
     env.close()
     assert [str(f) for f in check(tmp_path / "mapping.yaml") if f.severity != "note"] == []
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_the_model_is_of_the_ground_that_the_first_action_chose(tmp_path: Path, outside: bool) -> None:
+    slopes = 0.05 * np.random.default_rng(0).standard_normal((8, 1, 1)) * np.tile(np.linspace(-1, 1, 256), (256, 1))
+    env = gym.make("nfc_gym/JackalRough-v0", context=["psi"], terrain_pool=1)
+    chosen = Fidelity(delta_e=slopes)
+    env = (
+        RecordLog(Hallucinate(env, chosen, samples=8), tmp_path)
+        if outside
+        else Hallucinate(RecordLog(env, tmp_path), chosen, samples=8)
+    )
+    for _ in range(2):
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.array([0, 0, 1], np.float32))
+    driven = env.unwrapped.heightfield.heights
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    heights = model.geom("ground").pos[2] + model.hfield_size[0, 2] * model.hfield_data.reshape(256, 256)
+    np.testing.assert_allclose(heights, driven, atol=1e-5)
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="other ground"):
+        env.step(np.array([0, 0, -1], np.float32))
+    env.close()
+    assert len(list(tmp_path.glob("*.parquet"))) == 2

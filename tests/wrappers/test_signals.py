@@ -194,3 +194,18 @@ def test_a_mask_that_its_owner_clears_afterwards_was_a_mask() -> None:
     mask[:] = False
     observation, *_ = env.step(np.full((2, 1), -1, np.float32))
     np.testing.assert_array_equal(observation["action"], [[-1], [1]])  # a new episode's first command, and a late one
+
+
+def test_rows_that_are_reset_one_after_the_other_all_forget() -> None:
+    shown = []
+    for masks in ([[True, True, False]], [[True, False, False], [False, True, False]]):
+        envs = gym.vector.SyncVectorEnv([Counting] * 3, autoreset_mode=gym.vector.AutoresetMode.DISABLED)
+        env = VectorPerturbSignals(envs, {"action": {"delay": 2}})
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.full((3, 1), 0.5, np.float32))
+        for mask in masks:
+            env.reset(options={"reset_mask": np.array(mask)})
+        shown.append([env.step(np.full((3, 1), -0.5, np.float32))[0]["action"][:, 0] for _ in range(3)])
+    np.testing.assert_array_equal(shown[0], [[-0.5, -0.5, 0.5], [-0.5, -0.5, 0.5], [-0.5, -0.5, -0.5]])
+    np.testing.assert_array_equal(shown[1], shown[0])

@@ -13,6 +13,7 @@ import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym import terrain
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.wrappers import PerceiveTerrain, ResidualTerrain
+from nfc_gym.wrappers.terrain import read_ground
 
 ROUGH = {"terrain_pool": 2, "difficulty": 0.3}
 BOWL = np.fromfunction(lambda i, j: 0.001 * ((i - 128) ** 2 + (j - 128) ** 2) / 100, (256, 256))
@@ -104,7 +105,7 @@ def test_spec_and_pickle(tmp_path: Path) -> None:
 def test_bad_input_is_refused_by_name() -> None:
     with pytest.raises(InputError, match="Rough"):
         ResidualTerrain(gym.make("nfc_gym/JackalFlat-v0"), BOWL)
-    with pytest.raises(InputError, match=r"AntEnv.*none"):
+    with pytest.raises(InputError, match=r"Ant-v5 has none"):
         ResidualTerrain(gym.make("Ant-v5"), BOWL)
     with pytest.raises(InputError, match="NoModel"):
         ResidualTerrain(NoModel(), BOWL)
@@ -167,3 +168,41 @@ def test_a_stack_of_maps_is_not_taken_for_one() -> None:
         PerceiveTerrain(stacked)
     inside = gym.wrappers.FrameStackObservation(PerceiveTerrain(gym.make("nfc_gym/JackalRough-v0", **ROUGH)), 2)
     assert inside.reset(seed=0)[0]["elevation"].shape == (2, 128, 128)
+
+
+def test_ground_on_a_placed_body_is_read_where_it_is() -> None:
+    ramp = '<geom name="ground" type="hfield" hfield="ramp" pos="0 0 -.2"/>'
+    placed = mujoco.MjModel.from_xml_string(RAMP.replace(ramp, f'<body pos="3 0 1">{ramp}</body>'))
+    data = mujoco.MjData(placed)
+    mujoco.mj_forward(placed, data)
+    ground = read_ground(placed, "x")
+    for x, y in ((3.01, 0.53), (3.47, -0.52), (2.52, 0.03)):
+        above = mujoco.mj_rayHfield(placed, data, 0, np.array([x, y, 9.0]), np.array([0, 0, -1.0]), None)
+        assert ground.height((x, y)) == pytest.approx(9 - above, abs=1e-6)
+    plane = '<geom type="plane" pos="0 0 .5" size="1 1 1"/>'
+    level = f'<mujoco><worldbody><body pos="0 0 2" {{}}>{plane}</body></worldbody></mujoco>'
+    about_z = read_ground(mujoco.MjModel.from_xml_string(level.format('euler="0 0 30"')), "x")
+    assert about_z.height((0.0, 0.0)) == pytest.approx(2.5)
+    for xml, message in (
+        (level.format('euler="0 10 0"'), "geom 0, the model's plane, is not level"),
+        (
+            RAMP.replace(ramp, f'<body euler="0 0 90">{ramp}</body>'),
+            "geom 'ground', the model's heightfield, is turned",
+        ),
+        (RAMP.replace(ramp, f'<body mocap="true">{ramp}</body>'), "is on a body that moves"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_ground(mujoco.MjModel.from_xml_string(xml), "x")
+    with pytest.raises(InputError, match="must belong to the world body"):
+        ResidualTerrain(FakeEnv(RAMP.replace(ramp, f'<body pos="3 0 1">{ramp}</body>')), np.zeros((21, 21)))
+
+
+def test_the_callers_residual_is_added() -> None:
+    env = ResidualTerrain(gym.make("nfc_gym/JackalRough-v0", **ROUGH), np.full((256, 256), 0.1))
+    env.reset(seed=0, options={"terrain_residual": np.full((256, 256), 0.25)})
+    base = env.unwrapped
+    np.testing.assert_allclose(base.heightfield.heights - base.perceived.heights, 0.35, atol=1e-6)
+    env.reset(seed=0, options={"terrain_residual": None})
+    np.testing.assert_allclose(base.heightfield.heights - base.perceived.heights, 0.1, atol=1e-6)
+    with pytest.raises(InputError, match=r"terrain_residual has shape \(\), want \(256, 256\)"):
+        env.reset(options={"terrain_residual": 0.25})

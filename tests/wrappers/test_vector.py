@@ -486,3 +486,32 @@ def test_an_episodes_last_observation_is_what_the_wrapper_makes_of_it(
         if "final_obs" in info:
             assert all(last in ours.single_observation_space for last in info["final_obs"])
             same(list(info["final_obs"]), list(wanted["final_obs"]))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"options": {"psi": {"base_mass": -1.0}}, "seed": 5},
+        {"options": {"terrain_id": 9}},
+        {"options": {"reset_mask": np.ones(2, bool)}},
+        {"options": 3, "seed": 5},
+        {"seed": -1},
+    ],
+)
+def test_a_reset_that_is_refused_changes_nothing(bad: dict[str, Any]) -> None:
+    shown = []
+    for refused in (False, True):
+        env: Any = gym.make_vec(
+            "nfc_gym/JackalRough-v0", num_envs=N, context=["psi"], terrain_pool=2, autoreset_mode="Disabled"
+        )
+        env = VectorResidualTerrain(env, np.random.default_rng(0).normal(0, 0.02, (4, 256, 256)))
+        env = VectorPerturbSignals(env, {"proprio": {"bias_sd": 0.1}, "action": {"delay": 2}})
+        env = VectorResidualDynamics(VectorRandomizePsi(env, 0.5), np.zeros((9, 15)) + np.arange(9)[:, None] / 100)
+        env.reset(seed=0)
+        out = [env.step(np.full((N, 2), k / 3))[0] for k in range(3)]
+        if refused:
+            with pytest.raises((InputError, gym.error.Error)):
+                env.reset(**bad)
+        out += [env.step(np.zeros((N, 2)))[0], env.reset(options={"reset_mask": np.arange(N) > 0})[0]]
+        shown.append([*out, env.step(np.zeros((N, 2)))[0]])
+    same(shown[1], shown[0])
