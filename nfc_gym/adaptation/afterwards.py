@@ -13,9 +13,8 @@ and `Sequential` narrows those.
 Both are judged on trajectories that nothing was learned from, and stay as they were where there are too few.
 """
 
-import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from torch import Tensor
 
 from nfc_gym.adaptation import normal as normality
 from nfc_gym.adaptation import resume
+from nfc_gym.adaptation.digests import digest, flat, of_detector, of_network
 from nfc_gym.adaptation.normal import Normal, quiet_trajectories
 from nfc_gym.adaptation.relearning import relearned
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
@@ -37,14 +36,11 @@ from nfc_gym.inference.contrast import Contrast
 from nfc_gym.inference.data import WindowSet
 from nfc_gym.inference.detector import WindowDetector
 from nfc_gym.inference.jobs import device_of
-from nfc_gym.inference.learner import Learner
 from nfc_gym.inference.posterior import NeuralPosterior, load
 from nfc_gym.inference.progress import Spoken, quiet
 from nfc_gym.inference.rates import Threshold
 from nfc_gym.inference.train import TrainConfig
-from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.simulate.machine import MOTOR, full_id
-from nfc_gym.simulate.replay import Replay
 
 Array = NDArray[np.float64]
 REPORT, STATE = "learned.json", "state.safetensors"
@@ -190,61 +186,23 @@ def _described(
 ) -> dict[str, Any]:  # fmt: skip
     """What another call must have in common with this one to go on from it; None is a detector that nobody can tell."""
     told = {"posterior": "none", "detector": "none", "normal": "none", "beside": "none"}
-    told |= {"trajectories": _digest(*(np.asarray(getattr(t, f.name)) for t in trajectories for f in fields(t)))}
+    told |= {"trajectories": digest(*(np.asarray(getattr(t, f.name)) for t in trajectories for f in fields(t)))}
     if posterior is not None:
-        told["posterior"] = _digest(*_network(posterior.network), posterior.parts)
+        told["posterior"] = digest(*of_network(posterior.network), posterior.parts)
     if detector is not None:
         # The flags themselves: two functions may share a name.
-        told |= {"detector": _detector(detector), "normal": _digest(*(np.asarray(normal(t)) for t in trajectories))}
+        told |= {"detector": of_detector(detector), "normal": digest(*(np.asarray(normal(t)) for t in trajectories))}
     if beside is not None:
         first = next(iter(beside.batches(min(len(beside), _TOLD), None)), {})
-        told["beside"] = _digest(len(beside), *_flat(first))
+        told["beside"] = digest(len(beside), *flat(first))
     return json.loads(json.dumps({**asdict(config), **told}))
-
-
-def _digest(*parts: Any) -> str:
-    """What tells things from others: arrays by type, shape and content, anything else as it is printed."""
-    sha = hashlib.sha256()
-    for part in parts:
-        x = part.detach().cpu().numpy() if isinstance(part, Tensor) else part
-        told, content = ((x.dtype, x.shape), x.tobytes()) if isinstance(x, np.ndarray) else (x, b"")
-        sha.update(repr(told).encode() + content)
-    return sha.hexdigest()[:16]
-
-
-def _flat(tensors: Mapping[str, Tensor]) -> list[Any]:
-    return [part for pair in tensors.items() for part in pair]
-
-
-def _network(net: Learner) -> list[Any]:
-    return [net.config, net.prior.to_dict(), *_flat(net.state_dict())]
-
-
-def _detector(detector: WindowDetector) -> str | None:
-    """What tells it from others, or None: nobody knows what a scorer of another kind is made of."""
-    scorer: Any = detector.scorer
-    if type(scorer) is Contrast:
-        parts = _network(scorer)
-    elif type(scorer) is Replay:
-        parts = [scorer.machine.environment, scorer.psi, scorer.jitter, scorer.start, scorer.eps]
-        parts += [part for m in scorer.maps for part in (m.heights, m.resolution, m.origin)]
-        if scorer.lacks is not None:
-            row = to_row(*scorer.lacks)
-            try:
-                from_row(row)
-            except InputError:  # an effect of the caller's own, of which a row does not say everything
-                return None
-            parts.append(row)
-    else:
-        return None
-    return _digest(detector.every, detector.threshold, detector.calibration, *parts)
 
 
 def _part(folder: Path | None, name: str, of: dict[str, Any]) -> Path | None:
     """Where training keeps its state: what was interrupted goes on under the same arguments alone."""
     if folder is None:
         return None
-    part = folder / name / _digest(of)
+    part = folder / name / digest(of)
     part.mkdir(parents=True, exist_ok=True)
     return part
 

@@ -5,6 +5,7 @@ policy is touched only after an anomaly. A world that never shows one leaves it 
 """
 
 import copy
+import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -12,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import VectorEnv
 from rich.console import Console
@@ -19,13 +21,14 @@ from torch import nn
 
 from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.agent import Agent
-from nfc_gym.adaptation.beliefs import Inference, inference_of, require_width, width
+from nfc_gym.adaptation.beliefs import Inference, inference_of, require_spoken, require_width, width
 from nfc_gym.adaptation.choice import Choice, weights_of
+from nfc_gym.adaptation.digests import of_detector, of_posterior, of_weights
 from nfc_gym.adaptation.earned import RATE, chance, require_home
 from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portable, spread
 from nfc_gym.adaptation.hallucination import hallucination
-from nfc_gym.adaptation.imagined import imagined
+from nfc_gym.adaptation.imagined import imagined, require_parts
 from nfc_gym.adaptation.network import Gaussian
 from nfc_gym.adaptation.optimise import optimise, pi_h_for
 from nfc_gym.adaptation.record import Record, in_words
@@ -40,6 +43,8 @@ from nfc_gym.wrappers.anomaly import opened
 
 STATE = "state.safetensors"
 _POINTS = 3  # how often weights are judged on the way of one mission's learning
+# Digests that the weights of this process began runs with, by folder: they have learned in place since then.
+_BEGAN: "weakref.WeakKeyDictionary[nn.Module, dict[Path, str]]" = weakref.WeakKeyDictionary()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +56,7 @@ class AdaptConfig:
       worlds: N, simulations that are drawn from the belief; so many only that each has steps for several episodes.
         Until its first one has ended a simulation shows but the beginning of what there is to learn.
       steps: control steps of all of them together, after each anomaly.
-      episode: control steps of an episode in them; None is the environment's own.
+      episode: control steps of an episode in them; None is the world's own, or else the simulator's.
       hallucinate: train pi_h too, which leans the draws in the policy's favour.
       parts: of the belief, those that are used where it speaks of them; ("psi",) is the paper's "w/o delta fidelity".
         A neural posterior's delta_e is of the ground around the robot, not of a map, and is not used.
@@ -82,6 +87,7 @@ class AdaptConfig:
             raise InputError(f"adapt: beta is {self.beta!r}; want a number of standard deviations, 0 or more")
         if isinstance(self.parts, str) or not self.parts:
             raise InputError(f"adapt: parts is {self.parts!r}; want parts of the belief, such as ('psi',)")
+        require_parts(self.parts)
 
 
 @dataclass
@@ -117,18 +123,21 @@ def adapt(
       posterior: what infers (see `beliefs`).
       detector: of anomalies, as for `MonitorAnomaly`, or the path of one.
       config: see `AdaptConfig`.
-      environment: id of the simulator; default the world's own.
+      environment: id of the simulator; default the world's own, where `gymnasium.make` made it.
       folder: where trajectories, curves and the state are kept; the same call goes on from there. None keeps nothing.
+        Another agent than the run began with is refused, and so are another detector of windows and another posterior
+        where they can be told from others (see `digests`).
       threshold: of the detector; default its own.
       threads: of the physics; 0 takes every core. On a cluster of each worker, and 0 is one.
-      settings: of the simulator.
+      settings: of the simulator; its task is the world's.
       home: returns of episodes of the agent, as it is before, in the nominal world: a trajectory with which it has
         lately earned less than would happen there (`earned.RATE`) is anomalous, whatever the detector says.
       ray, workers: a Ray cluster on which the worlds of the belief are simulated, as of `pretrain`.
       console: is told.
 
     Raises:
-      InputError: the agent does not fit the world, or one of the arguments is none.
+      InputError: the agent does not fit the world, one of the arguments is none, the posterior speaks of none of the
+        parts, or the settings have another task than the world.
     """
     config = config or AdaptConfig()
     cluster = cluster_of(ray, workers, threads, config.worlds)
@@ -155,11 +164,13 @@ class _Run:
     ) -> None:  # fmt: skip
         check_fit(agent, world)
         self.agent, self.world, self.config, self.threads, self.cluster = agent, world, config, threads, cluster
-        self.environment = full_id(environment or world.spec.id)
-        self.settings, self.home = settings, home
+        self.environment = _simulator_of(world, environment)
+        self.episode = _episode(config, world, self.environment)
+        self.settings, self.home = _with_task(settings, world), home
         self.detector, self.threshold = opened(detector, threshold)
         self.inference = inference_of(posterior)
         require_width(posterior, world.unwrapped.psi_space)
+        require_spoken(posterior, config.parts)
         self.folder = None if folder is None else _made(Path(folder))
         self.record = Record(None if self.folder is None else self.folder / "log", console)
         self.pi_h: Gaussian | None = None
@@ -169,6 +180,10 @@ class _Run:
         self.belief: Sampler | None = None
         self.history: list[dict[str, Any]] = []
         self.now: dict[str, Any] = {}
+        self.whose = {
+            "agent": of_weights(weights_of(agent)), "detector": of_detector(self.detector),
+            "posterior": of_posterior(self.inference),
+        }  # fmt: skip
         self._go_on()
 
     # ---- the lines of the algorithm -------------------------------------------------------------------------------
@@ -249,6 +264,7 @@ class _Run:
         anomalies = sum(tau.anomalous for tau in self.dataset)
         tune = getattr(self.inference, "fine_tuned", None)
         if anomalies and tune is not None:
+            self.record.say("what infers learns from the whole mission")
             self.inference = tune(self.dataset)
         if not anomalies:
             self.record.say(f"no anomaly in {len(self.dataset)} trajectories: nothing was changed")
@@ -260,8 +276,7 @@ class _Run:
         """Makes simulations of the belief."""
         return partial(
             imagined, self.environment, belief, parts=self.config.parts, beta=self.config.beta,
-            episode=self.config.episode or self.world.spec.max_episode_steps or 1000, sight=self.agent.sight,
-            settings=self.settings, **how,
+            episode=self.episode, sight=self.agent.sight, settings=self.settings, **how,
         )  # fmt: skip
 
     @contextmanager
@@ -293,6 +308,7 @@ class _Run:
             return
         size = 0 if self.pi_h is None else len(self.pi_h.log_std)
         plain = {"t": self.t, "steps": self.steps, "pi_h": size, "past": len(self.past), "history": self.history}
+        plain["whose"] = self.whose
         resume.save(self.folder / STATE, self._modules(), None, plain, self._described())
 
     def _go_on(self) -> None:
@@ -300,8 +316,10 @@ class _Run:
         path = None if self.folder is None else self.folder / STATE
         if path is None or not path.is_file():
             self.dataset = Dataset(self.folder)
+            self._remember()
             return
         kept = resume.plain(path)
+        self._require_same(path, kept.get("whose", {}))
         self.past += [copy.deepcopy(self.past[0]) for _ in range(kept.get("past", 1) - 1)]
         size = int(kept["pi_h"])
         if size:
@@ -309,11 +327,68 @@ class _Run:
         plain = resume.load(path, self._modules(), None, self._described())
         self.t, self.steps, self.history = plain["t"], plain["steps"], plain["history"]
         self.dataset = Dataset(self.folder, self.t)
-        for tau in self.dataset:
-            if tau.anomalous:
-                self.belief = belief = self.inference.infer(tau)
-                self.inference = self.inference.updated(tau, belief)
         self.record.say(f"going on from mission {self.t} of {self.config.missions}")
+        self._infer_again([tau for tau in self.dataset if tau.anomalous])
+
+    def _infer_again(self, anomalous: Sequence[Trajectory]) -> None:
+        """What infers is not kept, as it may be anything: it is shown the same trajectories."""
+        if anomalous:
+            self.record.say(f"what infers is shown the {len(anomalous)} anomalous trajectories so far again")
+        for k, tau in enumerate(anomalous, 1):
+            if k == len(anomalous) or getattr(self.inference, "reads_belief", True):
+                self.belief = self.inference.infer(tau)
+            self.inference = self.inference.updated(tau, self.belief)  # type: ignore[arg-type]
+
+    def _remember(self) -> None:
+        """What the agent's weights were as a run began in the folder; without one nothing goes on."""
+        if self.folder is not None:
+            _BEGAN.setdefault(weights_of(self.agent), {})[self.folder.resolve()] = str(self.whose["agent"])
+
+    def _require_same(self, path: Path, kept: Mapping[str, str | None]) -> None:
+        """Refuse to mix the run of a state with one of another agent, detector or posterior, where that can be told.
+
+        An agent that has learned in this very folder, in this process, is the one that began there.
+        """
+        assert self.folder is not None
+        began = _BEGAN.get(weights_of(self.agent), {}).get(self.folder.resolve())
+        self.whose["agent"] = began or self.whose["agent"]
+        odd = [f"another {k}" for k, now in self.whose.items() if now and kept.get(k) and kept[k] != now]
+        if odd:
+            raise InputError(
+                f"{path} is of another run, with {' and '.join(odd)}: give what that one began with, remove it to "
+                "begin anew, or choose another folder"
+            )
+        self._remember()
+
+
+def _simulator_of(world: Any, environment: str | None) -> str:
+    """Full id of the simulator of a world."""
+    spec = getattr(world, "spec", None)
+    if environment is None and spec is None:
+        raise InputError(
+            "adapt: the world was not made by gymnasium.make and names no simulator: give its id, as in "
+            "environment='nfc_gym/JackalFlat-v0'"
+        )
+    return full_id(environment or spec.id)  # type: ignore[union-attr]
+
+
+def _episode(config: AdaptConfig, world: Any, environment: str) -> int:
+    """Control steps of an episode in the imagined worlds."""
+    spec = getattr(world, "spec", None) or gymnasium.spec(environment)
+    return config.episode or spec.max_episode_steps or 1000
+
+
+def _with_task(settings: Mapping[str, Any], world: Any) -> dict[str, Any]:
+    """Settings of a simulator under which it asks for what a world does.
+
+    Raises:
+      InputError: they name another task.
+    """
+    task, first = world.unwrapped.robot.task, world.unwrapped.robot.tasks[0]
+    given = settings.get("task", task) or first
+    if given != task:
+        raise InputError(f"adapt: settings has the task {given!r}, and the world's is {task!r}: leave it out")
+    return {**settings} if task == first else {**settings, "task": task}
 
 
 def _made(folder: Path) -> Path:

@@ -15,7 +15,7 @@ delay is missing, masses need not make up for it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -74,6 +74,7 @@ class Assimilation:
       nthread: threads.
     """
 
+    reads_belief: ClassVar[bool] = False
     environment: str
     reach: float = 0.0
     ground: Heightfield | None = None
@@ -143,6 +144,12 @@ class Assimilation:
                 break
         belief = replace(belief, noise=self._sensed(trajectory.states, parts, mean, off[0] * scale, seen))
         return self._with_residual(belief, parts, rng) if self.delta_s else belief
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """That its beliefs speak of."""
+        maybe = (("delta_s",) if self.delta_s else ()) + (("effects",) if len(self.structure) else ())
+        return ("psi", *maybe, "noise")
 
     def updated(self, trajectory: Trajectory, belief: Sampler) -> "Assimilation":
         """One that remembers the trajectory: where a policy that was adapted goes wrong, its belief did."""

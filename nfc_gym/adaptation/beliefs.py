@@ -6,12 +6,14 @@ full has shown too little, and what is believed is the prior. `Sequential` adds 
 rounds to a neural posterior; `Assimilation` (in a module of its own) needs no network.
 """
 
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
+from nfc_gym.adaptation.imagined import among, spoken
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
@@ -26,7 +28,11 @@ from nfc_gym.physics.parameters import ParameterSpace
 
 @runtime_checkable
 class Inference(Protocol):
-    """From a trajectory to a belief, and on to the next trajectory."""
+    """From a trajectory to a belief, and on to the next trajectory.
+
+    One with an attribute `parts` says before the first trajectory what its beliefs speak of. One whose `reads_belief`
+    is False makes nothing of the belief in `updated`: a run that goes on need not infer it again.
+    """
 
     def infer(self, trajectory: Trajectory) -> Sampler:
         """What the trajectory tells."""
@@ -76,6 +82,7 @@ class Fixed:
       posterior: with `sample`, or with `given(window)` that makes such a one.
     """
 
+    reads_belief: ClassVar[bool] = False
     posterior: Any
 
     def infer(self, trajectory: Trajectory) -> Sampler:
@@ -102,6 +109,7 @@ class Sequential:
       InputError: rounds of a posterior's own draws: what is corrected for one window misleads about the next.
     """
 
+    reads_belief: ClassVar[bool] = False
     posterior: NeuralPosterior
     simulate: Any
     rounds: SequentialConfig = field(default_factory=lambda: SequentialConfig(rounds=2))
@@ -172,6 +180,21 @@ def require_width(posterior: Any, space: ParameterSpace) -> None:
         _require(len(posterior.prior.low), space)
     elif isinstance(posterior, Sampler):
         _psi(posterior, 1, space)
+
+
+def require_spoken(posterior: Any, wanted: Sequence[str]) -> None:
+    """Refuse parts of a belief of which what infers never speaks, where that shows before there is a trajectory.
+
+    Raises:
+      InputError: naming what it speaks of.
+    """
+    posterior = posterior.posterior if isinstance(posterior, Fixed | Sequential) else posterior
+    if isinstance(posterior, NeuralPosterior):
+        among([p for p in posterior.parts if p != "delta_e"], wanted)
+    elif isinstance(posterior, Inference):
+        among(getattr(posterior, "parts", wanted), wanted)
+    elif not callable(getattr(posterior, "given", None)):  # of a `Fidelity`, the names of its parts
+        spoken(posterior, wanted)
 
 
 def _psi(belief: Sampler, n: int, space: ParameterSpace) -> np.ndarray | None:

@@ -68,7 +68,7 @@ class FineTuneConfig:
 
 
 class FineTuning:
-    """A run of fine-tuning.
+    """A run of fine-tuning, on the task that the policy was trained to do.
 
     Args:
       policy: to begin with; its network learns in place.
@@ -90,7 +90,8 @@ class FineTuning:
     ) -> None:  # fmt: skip
         self.policy, self.extension, self.config = policy, extension, config
         self.path, self.of, self.threads, self.record = folder / STATE, of, threads, record
-        recipe = recipe_of(extension.environment)
+        self.settings = policy.settings(extension.environment)
+        recipe = recipe_of(extension.environment, **self.settings)
         self.ppo = replace(recipe.ppo, rate=_RATE, together=_TOGETHER)
         self.whole = config.episode or gymnasium.spec(extension.environment).max_episode_steps or 1000
         self.episode = min(recipe.episode, self.whole)
@@ -164,7 +165,8 @@ class FineTuning:
         """Simulations of the extension, made once."""
         if name not in self._envs:
             seed = mixed(self.config.seed, stream)
-            made = self.extension.envs(n, vary=vary, seed=seed, episode=episode, threads=self.threads)
+            shape = {"episode": episode, "threads": self.threads, "settings": self.settings}
+            made = self.extension.envs(n, vary=vary, seed=seed, **shape)
             self._envs[name] = made
         return self._envs[name]
 

@@ -52,7 +52,7 @@ def hand_over(
     ablate: bool = False, condition: str | None = None, signals: Mapping[str, float] | None = None,
     device: str = "auto", threads: int = 0, console: Console | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Fine-tune a policy in the extended model, and say what it was worth.
+    """Fine-tune a policy in the extended model on the task that it was trained to do, and say what it was worth.
 
     Args:
       environment: id, of the robot that the logs were of.
@@ -60,7 +60,7 @@ def hand_over(
       out: folder for `policy.safetensors`, `report.json`, `report.html`; the same call goes on where it was stopped.
       policy: to begin with: a file, or the id of one that comes with the package; default the environment's.
       world: what plays the real machine: of the same kinds as `effects`, or n -> a vector environment of n simulations
-        without autoreset, which each call measures anew. It is judged in, never learned from.
+        without autoreset and of the policy's task, which each call measures anew. It is judged in, never learned from.
       config: of learning.
       episodes: by which each policy is judged in each world.
       ablate: fine-tune once more without each effect, and judge that where all effects are.
@@ -75,7 +75,7 @@ def hand_over(
 
     Raises:
       InputError: a policy of another robot; effects of another robot, or none at all; values that are not finite; a
-        folder that holds something else, or another run.
+        `world` of another task; a folder that holds something else, or another run.
     """
     if episodes < 2:
         raise InputError(f"episodes is {episodes}; want 2 or more, as each return is given an interval")
@@ -83,9 +83,9 @@ def hand_over(
     extension = Extension(read_found(effects), name, condition=condition, signals=signals)
     extension.require_something()
     config = config or FineTuneConfig()
-    shape = {"threads": threads, "episode": config.episode}
-    truth = _truth(world, name, condition, signals, shape)
     start = load_policy(name if policy is None else policy, device_of(device))
+    shape = {"threads": threads, "episode": config.episode, "settings": start.settings(name)}
+    truth = _truth(world, name, condition, signals, shape)
     _require_fit(start, name)
     folder = Path(out)
     _require_own(folder)
@@ -134,7 +134,7 @@ def _truth(
 
 def _require_fit(policy: Policy, environment: str) -> None:
     rough = {"terrain_pool": 1} if "Rough" in environment else {}
-    envs = vector_env(environment, 1, threads=1, **rough)
+    envs = vector_env(environment, 1, threads=1, **rough, **policy.settings(environment))
     policy.require(envs)
     envs.close()
 
@@ -168,7 +168,9 @@ class _Run:
     ) -> None:  # fmt: skip
         self.start, self.extension, self.truth, self.config = start, extension, truth, config
         self.folder, self.episodes, self.threads, self.record = folder, episodes, threads, record
+        self.settings = start.settings(extension.environment)
         self.of = {"environment": extension.environment, "policy": _digest(start), "found": extension.found.digest}
+        self.of |= self.settings
         self.scores: dict[str, Score] = {}
 
     def trained(self, extension: Extension, folder: Path) -> FineTuning:
@@ -191,15 +193,16 @@ class _Run:
         self._recall(adapted)
         both = {"before": self.start, "after": Policy(self.start.sight, adapted.best)}
         length = {"threads": self.threads, "episode": self.config.episode}
+        shape = {**length, "settings": self.settings}
         worlds: dict[str, World] = {
-            NOMINAL: partial(vector_env, self.extension.environment, **length),
-            EXTENDED: partial(self.extension.envs, **length),
+            NOMINAL: partial(vector_env, self.extension.environment, **length, **self.settings),
+            EXTENDED: partial(self.extension.envs, **shape),
         }
         if self.truth is not None:
             worlds[TRUE] = self.truth.envs
         for e in self.extension.effects:
             if e.acts:
-                worlds[WITHOUT + e.id] = partial(self.extension.without(e.id).envs, **length)
+                worlds[WITHOUT + e.id] = partial(self.extension.without(e.id).envs, **shape)
         judged = {w: {k: self._judged(k, p, w, make) for k, p in both.items()} for w, make in worlds.items()}
         blind = {
             e: {
@@ -213,7 +216,7 @@ class _Run:
         return {
             "schema": 1, "environment": self.extension.environment, "from": str(self.extension.found.source),
             "verdict": self.extension.found.verdict,
-            "policy": {"environment": self.start.sight.environment, "digest": self.of["policy"]},
+            "policy": {"environment": self.start.sight.environment, "digest": self.of["policy"]} | self.settings,
             "world": None if self.truth is None else self.truth.name, "measured_in": where,
             "returns": returns, "parameters": self.extension.told(),
             "effects": [self._effect(e, judged, blind) for e in self.extension.effects],
@@ -251,11 +254,20 @@ class _Run:
         if key not in self.scores:
             self.record.line(f"judging over {self.episodes} episodes: {label}, {world}")
             envs = VectorSight(make(self.episodes), self.start.sight)
+            self._require_task(world, envs)
             self.scores[key] = evaluate(policy, envs, seed=mixed(self.config.seed, _JUDGED) % 2**31)
             envs.close()
             kept = {"of": self._key, "scores": {k: to_plain(s) for k, s in self.scores.items()}}
             write_whole(self.folder / KEPT, json.dumps(kept))
         return self.scores[key]
+
+    def _require_task(self, world: str, envs: VectorEnv) -> None:
+        """Refuse a function's world in which another task is judged than the policy learned."""
+        robot = envs.unwrapped.robot  # type: ignore[attr-defined]
+        wanted = self.settings.get("task", robot.tasks[0])
+        if robot.task != wanted:
+            envs.close()
+            raise InputError(f"{world}: its task is {robot.task!r}, the policy's {wanted!r}: say task={wanted!r} there")
 
     def _recall(self, adapted: FineTuning) -> None:
         """What was judged before an interruption; a world that is a function is judged in anew."""

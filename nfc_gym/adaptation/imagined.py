@@ -1,7 +1,7 @@
 """The worlds that a policy is adapted in: simulations with psi, delta_s and delta_e as a posterior believes them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,20 +40,66 @@ class Parts:
         return Fidelity(**{part: getattr(drawn, part) for part in self.parts})
 
 
+@dataclass
+class Joint:
+    """A posterior of whose samples each wrapper takes a part: what goes together in a sample stays together.
+
+    At a reset wrappers draw one after the other, each for itself. The first one's samples are drawn, with its
+    generator; `again` hands those behind it the same.
+
+    Attributes:
+      posterior: to draw from.
+      last: what was drawn last.
+    """
+
+    posterior: Sampler
+    last: Fidelity = field(default_factory=Fidelity)
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        """See `Sampler`."""
+        self.last = self.posterior.sample(n, rng)
+        return self.last
+
+    @property
+    def again(self) -> Sampler:
+        """To draw from behind the first wrapper."""
+        return _Again(self)
+
+
+@dataclass(frozen=True)
+class _Again:
+    joint: Joint
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        """See `Joint`; wrappers refuse another number than they ask for."""
+        return self.joint.last
+
+
 # What a belief may have besides the parts of a fidelity: `effects(n, rng)`, and standard deviations of what is sensed.
 EFFECTS, NOISE = "effects", "noise"
+ALL = (*PARTS, EFFECTS, NOISE)
+
+
+def require_parts(wanted: Sequence[str]) -> None:
+    """Raises `InputError` at a name that is of no part of a belief."""
+    wrong = [p for p in wanted if p not in ALL]
+    if wrong:
+        raise InputError(f"adapt: no part {wrong[0]!r} of a belief; there are: {', '.join(ALL)}")
 
 
 def spoken(posterior: Sampler, wanted: Sequence[str]) -> tuple[str, ...]:
-    """Of the parts of a fidelity that are wanted those that a posterior speaks of.
+    """Of the parts that are wanted those that a posterior speaks of.
 
     Raises:
       InputError: of none.
     """
-    wrong = [p for p in wanted if p not in (*PARTS, EFFECTS, NOISE)]
-    if wrong:
-        raise InputError(f"adapt: no part {wrong[0]!r} of a belief; there are: {', '.join((*PARTS, EFFECTS, NOISE))}")
-    given = posterior.sample(2, np.random.default_rng(0)).given
+    require_parts(wanted)
+    more = tuple(p for p in (EFFECTS, NOISE) if getattr(posterior, p, None) is not None)
+    return among((*posterior.sample(2, np.random.default_rng(0)).given, *more), wanted)
+
+
+def among(given: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
+    """The wanted parts that are given; raises `InputError` where none is."""
     found = tuple(p for p in wanted if p in given)
     if not found:
         raise InputError(f"adapt: the posterior speaks of {', '.join(given) or 'nothing'}, not of {', '.join(wanted)}")
@@ -86,20 +132,19 @@ def imagined(
     envs: VectorEnv = vector_env(environment, n, threads=threads, episode=episode, **(settings or {}))
     if "delta_e" in found and envs.unwrapped.rough:  # type: ignore[attr-defined]
         envs = VectorResidualTerrain(envs, Parts(belief, ("delta_e",)))
-    moving = tuple(p for p in found if p != "delta_e")
-    drawn = getattr(belief, EFFECTS, None)
-    acting = drawn(n, np.random.default_rng(seed)) if EFFECTS in parts and drawn is not None else []
+    moving = tuple(p for p in found if p in ("psi", "delta_s"))
+    acting = getattr(belief, EFFECTS)(n, np.random.default_rng(seed)) if EFFECTS in found else []
     if acting:  # each simulation has sizes of its own
         values = [v for _, v in acting]
         envs = VectorApplyEffects(envs, [(e, v.mean(0)) for e, v in acting], values=values)
-    noise = getattr(belief, NOISE, None)
-    if NOISE in parts and noise is not None:
-        envs = VectorPerturbSignals(envs, {"proprio": {"sd": noise.tolist()}})
+    if NOISE in found:
+        envs = VectorPerturbSignals(envs, {"proprio": {"sd": getattr(belief, NOISE).tolist()}})
     if hallucinate and moving:
         envs = VectorHallucinate(envs, Parts(belief, moving), beta=beta)
-    else:
+    elif moving:
+        joint = Joint(belief)
         if "psi" in moving:
-            envs = VectorRandomizePsi(envs, Parts(belief, ("psi",)))
+            envs = VectorRandomizePsi(envs, Parts(joint, ("psi",)))
         if "delta_s" in moving:
-            envs = VectorResidualDynamics(envs, Parts(belief, ("delta_s",)))
+            envs = VectorResidualDynamics(envs, Parts(joint.again if "psi" in moving else joint, ("delta_s",)))
     return VectorSight(VectorStaggered(envs, episode, seed) if staggered else envs, sight)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from nfc_gym.adaptation.policy import Policy, load_policy
-from nfc_gym.adaptation.worlds import robot_of
 from nfc_gym.core.errors import InputError, MissingExtra
 from nfc_gym.simulate.machine import full_id
 
@@ -49,10 +48,7 @@ def play(
     loaded = load_policy(name if policy is None else policy)
     look: dict[str, Any] = {} if path is None else {"render_mode": "rgb_array", "width": _SIZE[0], "height": _SIZE[1]}
     context = ["psi", "elevation"] if loaded.sight.cells else ["psi"]
-    task = loaded.about.get("training", {}).get("task")
-    if task and robot_of(name) == robot_of(loaded.sight.environment):  # it is shown doing what it was trained to do
-        look["task"] = task
-    env = gymnasium.make(name, context=context, **look)
+    env = gymnasium.make(name, context=context, **look, **loaded.settings(name))
     loaded.require(env)
     console = console or Console()
     found, frames = [], []

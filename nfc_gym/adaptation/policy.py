@@ -17,6 +17,7 @@ from torchrl.modules import ProbabilisticActor
 from nfc_gym import __version__, assets
 from nfc_gym.adaptation.network import CLIP, ActorCritic, Sizes
 from nfc_gym.adaptation.sight import Sight
+from nfc_gym.adaptation.worlds import robot_of
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
 from nfc_gym.inference.state import read, require_format
@@ -73,6 +74,11 @@ class Policy:
             scale.spread.cpu().numpy().copy(), "elu", CLIP, True, self.sight.cells,
             f"of {self.sight.environment}",
         )  # fmt: skip
+
+    def settings(self, environment: str) -> dict[str, Any]:
+        """Of an environment of the policy's robot, by its full id: the task that training was told, where it was."""
+        task = self.about.get("training", {}).get("task")
+        return {"task": task} if task and robot_of(environment) == robot_of(self.sight.environment) else {}
 
     def require(self, envs: Any) -> None:
         """Refuse an environment, single or vector, that the policy does not fit.

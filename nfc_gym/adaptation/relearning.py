@@ -14,11 +14,11 @@ from nfc_gym.adaptation.perceived import perceived_ground
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.data import TensorWindows, WindowSet
+from nfc_gym.inference.gains import gains
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior
 from nfc_gym.inference.progress import Report
 from nfc_gym.inference.random import mixed
-from nfc_gym.inference.space import EDGE
 from nfc_gym.inference.train import TrainConfig, train
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.recorded import Recorded
@@ -60,10 +60,10 @@ def relearned(
         sets.append(TensorWindows(simulator.draw(n, np.random.default_rng(mixed(seed, 4, k)))))
     held_out, judged = sets[1].split(0.5)
     network = copy.deepcopy(old).to(device)
-    before = gains(network, judged)
+    before = gains(network, judged.tensors)
     windows = with_beside(sets[0], beside, seed)
     outcome = train(network, windows, held_out, training, folder=folder, report=report, scales=False, device=device)
-    after = gains(network, judged)
+    after = gains(network, judged.tensors)
     found: dict[str, Any] = {
         "changed": outcome.best > 0, "simulations": simulations, "stretches": [len(m) for m in parts],
         "best": outcome.best, "stopped": outcome.stopped, "gain": {"before": _mean(before), "after": _mean(after)},
@@ -134,17 +134,6 @@ def _recorded(machine: Machine, trajectories: Sequence[Trajectory], at: Sequence
     used = sorted({k for k, _ in at})
     maps = tuple(perceived_ground(trajectories[k])[0] for k in used)
     return Recorded(starts, states, actions, maps, np.array([used.index(k) for k, _ in at]))
-
-
-@torch.no_grad()
-def gains(network: Network, windows: TensorWindows) -> Array:
-    """(n,) what windows tell about their own psi: log density over the prior's, nats a parameter."""
-    network.eval()
-    batch = windows.to(network.free.device).tensors
-    z = torch.special.ndtri(batch["psi"][:, network.free].clamp(EDGE, 1 - EDGE))
-    given = network.encode(batch["states"], batch["actions"])
-    prior = -(z**2 + np.log(2 * np.pi)).sum(1) / 2
-    return ((network.log_prob(z[:, None], given, 1)[:, 0] - prior) / z.shape[1]).double().cpu().numpy()
 
 
 def _mean(values: Array) -> tuple[float, float]:

@@ -49,16 +49,20 @@ class TensorWindows:
     Args:
       tensors: a batch as above that holds all windows.
       manifest: what is known of them.
+      told: plain values, by name, in which training from other windows would be another training.
 
     Raises:
       InputError: a tensor has another number of axes or windows, states and actions do not belong together, or a
         value is not finite.
     """
 
-    def __init__(self, tensors: Batch, manifest: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, tensors: Batch, manifest: Mapping[str, Any] | None = None, told: Mapping[str, Any] | None = None
+    ) -> None:
         require_batch(tensors)
         self.tensors = tensors
         self.manifest: Mapping[str, Any] = dict(manifest or {})
+        self.told: dict[str, Any] = dict(told or {})
 
     def __len__(self) -> int:
         return len(self.tensors["psi"])
@@ -76,16 +80,16 @@ class TensorWindows:
         """The first windows, and the last `share` of them: to train on and to hold out."""
         cut = len(self) - max(1, round(share * len(self)))
         first, last = ({k: t[part] for k, t in self.tensors.items()} for part in (slice(cut), slice(cut, None)))
-        return TensorWindows(first, self.manifest), TensorWindows(last, self.manifest)
+        return TensorWindows(first, self.manifest, self.told), TensorWindows(last, self.manifest, self.told)
 
     def append(self, other: "TensorWindows") -> "TensorWindows":
         """Both sets as one; they hold the same tensors."""
         joined = {k: torch.cat([t, other.tensors[k].to(t.device)]) for k, t in self.tensors.items()}
-        return TensorWindows(joined, self.manifest)
+        return TensorWindows(joined, self.manifest, self.told)
 
     def to(self, device: str | torch.device) -> "TensorWindows":
         """The same on another device."""
-        return TensorWindows({k: t.to(device) for k, t in self.tensors.items()}, self.manifest)
+        return TensorWindows({k: t.to(device) for k, t in self.tensors.items()}, self.manifest, self.told)
 
 
 class StoredWindows:

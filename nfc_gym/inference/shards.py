@@ -92,8 +92,10 @@ class WindowWriter:
                     f"{folder}: holds windows that were made otherwise ({'; '.join(odd)}); give the same arguments to "
                     "go on, or another folder: Windows(first, second) reads both as one set"
                 )
-        elif any(folder.glob("shard_*.safetensors")):
-            raise InputError(f"{folder}: holds shards without a {MANIFEST}; choose another folder")
+        else:  # maps that were left of other windows would be taken for those of the new ones
+            for what, names in (("shards", "shard_*.safetensors"), ("elevation maps", "maps_*.safetensors")):
+                if any(folder.glob(names)):
+                    raise InputError(f"{folder}: holds {what} without a {MANIFEST}; choose another folder")
         self._save({k: c for k in range(manifest.shards) if (c := self._counts(k)) is not None})
 
     def _counts(self, shard: int) -> dict[str, int] | None:

@@ -78,6 +78,9 @@ class Policy:
         `cells` of the elevation map that it names, if any.
       machine: the robot; one call shows whether the policy is for it.
 
+    Attributes:
+      observation: size of what it is given.
+
     Raises:
       InputError: no such file, not a policy, or one of other sizes.
     """
@@ -90,7 +93,8 @@ class Policy:
         if self.cells is not None and not machine.rough:
             raise InputError(f"policy {name}: looks at elevation, and {machine.environment} is flat ground")
         seen = 0 if self.cells is None else int(np.prod(self.cells.shape))
-        probe = np.zeros((2, kind.proprio_size + kind.goal_size + seen), np.float32)
+        self.observation = kind.proprio_size + kind.goal_size + seen
+        probe = np.zeros((2, self.observation), np.float32)
         try:
             out = np.asarray(self.call(probe))
         except Exception as e:

@@ -1,9 +1,10 @@
 """`simulate`: a training set of windows of an environment's motion under the prior, or under a proposal."""
 
+import copy
 import hashlib
 import platform
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from nfc_gym.simulate.policy import Act, Perceptron, Policy
 from nfc_gym.simulate.residuals import families
 from nfc_gym.simulate.shard import Plan, described, workshop
 
+_ASKED, _DIGITS = 32, 3  # observations by which a policy is told from another, and digits of its answers
 PER_SHARD = 2048  # windows: enough that arrays are long, few enough that 1e5 windows keep 16 cores busy
 
 
@@ -55,7 +57,9 @@ def simulate(
       effects: share of the windows whose dynamics have an effect that the model lacks.
       proposal: what psi is drawn from in place of the prior: anything with `sample(n, rng)`, or a file of such
         (`core.load_source`). It must stay within the prior's box.
-      policy: what moves a share of the windows in place of excitation alone, see `policy.Policy`.
+      policy: what moves a share of the windows in place of excitation alone, see `policy.Policy`. To go on, callables
+        are told from others by their name and by their answers to a few observations; one that answers twice the same
+        in two ways, since it remembers or draws at random, by its name alone.
       policy_share: that share.
       motor: standard deviation of the noise of motors, a share of the actions' full range; actions are kept without.
       ray: address of a Ray cluster, `auto` or `local`; None takes processes of this machine.
@@ -80,7 +84,7 @@ def simulate(
         "effects": effects,
         "proposal": _digest(sampler, seed, shop.machine),
         "motor": motor,
-        "policy": _named(source),
+        "policy": _named(source, shop.machine),
         "policy_share": policy_share if policy is not None else 0.0,
     }
     manifest = manifest_of(environment, windows, seed, per_shard, settings)
@@ -152,14 +156,34 @@ def _digest(sampler: Sampler | None, seed: int, machine: Machine) -> str | None:
     return hashlib.sha256(drawn(sampler, machine, seed, 0, 16).tobytes()).hexdigest()[:16]
 
 
-def _named(policy: Act | str | None) -> str | None:
+def _named(policy: Act | str | None, machine: Machine) -> str | None:
+    """What tells one policy from another."""
     if policy is None:
         return None
     if isinstance(policy, Perceptron):
         return policy.digest
     if callable(policy):
-        return getattr(policy, "__qualname__", type(policy).__qualname__)
+        name = getattr(policy, "__qualname__", type(policy).__qualname__)
+        answers = _answers(policy, machine)
+        return name if answers is None else f"{name} {hashlib.sha256(answers).hexdigest()[:16]}"
     return hashlib.sha256(Path(policy).read_bytes()).hexdigest()[:16]
+
+
+def _answers(policy: Act, machine: Machine) -> bytes | None:
+    """A policy's actions under some observations, or None where it answers otherwise when it is asked again, or not.
+
+    They are rounded, since libraries do so from run to run, and it is a copy that is asked, where one can be made: what
+    the policy remembers stays as it is.
+    """
+    with suppress(Exception):  # what holds what cannot be copied is asked itself
+        policy = copy.deepcopy(policy)
+    size = Policy(policy, machine).observation
+    probe = np.random.default_rng(0).standard_normal((_ASKED, size)).astype(np.float32)
+    try:
+        first, second = (np.nan_to_num(np.array(policy(probe.copy()), float)).round(_DIGITS) + 0.0 for _ in range(2))
+    except Exception:  # these are no observations that the robot would ever make
+        return None
+    return first.tobytes() if np.array_equal(first, second) else None
 
 
 def manifest_of(environment: str, windows: int, seed: int, per_shard: int, settings: dict[str, Any]) -> Manifest:

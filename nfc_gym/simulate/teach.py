@@ -11,7 +11,7 @@ from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
-from nfc_gym.inference.data import Batch, TensorWindows
+from nfc_gym.inference.data import Batch, StoredWindows, TensorWindows
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.space import PriorBox
@@ -55,8 +55,8 @@ def train_structure(
       report: is told of the progress.
 
     Raises:
-      InputError: windows on rough ground, without effects, or of a robot that feels forces; or something else than a
-        structure head is at `out`.
+      InputError: windows on rough ground, without effects, or of a robot that feels forces; something else than a
+        structure head is at `out`, or what a run with other windows or settings left there.
     """
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: a structure head is kept in a file that ends in .safetensors")
@@ -95,4 +95,6 @@ def taught(
     batch = stored.take(rows[fine], ["actions", "psi", "family"])
     shares = np.bincount(batch["family"], minlength=len(stored.manifest.families)) / max(len(batch["family"]), 1)
     arrays = {"states": states[fine], **batch}
-    return TensorWindows({k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}), shares.tolist()
+    tensors = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+    told = StoredWindows(stored, rows, noise=noise).told | {"repeats": len(rows) // len(np.unique(rows))}
+    return TensorWindows(tensors, told=told), shares.tolist()

@@ -1,7 +1,7 @@
 """Algorithm 1: nothing is touched without an anomaly, all is kept, a run that stopped ends as one that did not."""
 
 import copy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,12 +20,14 @@ from torchrl.objectives import ClipPPOLoss
 from nfc_gym import InputError
 from nfc_gym.adaptation import AdaptConfig, Agent, adapt, load_policy, ppo_agent, sac_agent
 from nfc_gym.adaptation.agent import OffPolicyConfig
+from nfc_gym.adaptation.beliefs import Fixed
 from nfc_gym.adaptation.choice import Choice
 from nfc_gym.adaptation.network import ActorCritic
 from nfc_gym.adaptation.policy import Policy
 from nfc_gym.adaptation.sight import Sight
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.envs.single import RobotEnv
 from nfc_gym.wrappers import RandomizePsi
 
 CONFIG = AdaptConfig(missions=2, worlds=8, steps=512, episode=40, judged=0)
@@ -61,6 +63,26 @@ def belief(delta_s: bool = True) -> Fidelity:
     residual = np.zeros((64, 15))
     residual[:, 4] = 0.01 * rng.standard_normal(64)
     return Fidelity(psi, residual) if delta_s else Fidelity(psi)
+
+
+def nameless() -> gym.Env:
+    """A world that `gym.make` did not make."""
+    return gym.wrappers.TimeLimit(RobotEnv("nfc_gym.envs.jackal:Jackal", context=["psi"]), 30)
+
+
+@dataclass(frozen=True)
+class Counted(Fixed):
+    """Knows how often it was asked."""
+
+    asked: list[int] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        return len(self.asked)
+
+    def infer(self, trajectory: Trajectory) -> Any:
+        self.asked.append(len(trajectory))
+        return super().infer(trajectory)
 
 
 def state(module: nn.Module) -> dict[str, torch.Tensor]:
@@ -114,8 +136,45 @@ def test_a_run_that_stopped_ends_as_one_that_did_not(jackal: Path, tmp_path: Pat
     with pytest.raises(InputError, match="another run"):
         adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=other, folder=tmp_path / "b", threads=1)
     wider = ppo_agent(Policy(fresh.sight, ActorCritic(replace(fresh.network.sizes, hidden=(24, 16)))))
-    with pytest.raises(InputError, match=r"another run, whose agent is another network .*size mismatch"):
-        adapt(wider, world(), belief(), Alarm(9), config=config, folder=tmp_path / "b", threads=1)
+    for given, sampled, odd in (
+        (wider, belief(), "another agent"),
+        (ppo_agent(load_policy("JackalFlat")), belief(False), "another agent and another posterior"),
+    ):
+        with pytest.raises(InputError, match=f"is of another run, with {odd}: give what that one began with"):
+            adapt(given, world(), sampled, Alarm(9), config=config, folder=tmp_path / "b", threads=1)
+    # What has learned in this folder, in this process, is the agent that began there; no belief is inferred in vain.
+    shown = Counted(belief())
+    again = adapt(ppo_agent(fresh), world(), shown, Alarm(9), config=config, folder=tmp_path / "b", threads=1)
+    assert again.history == one.history
+    assert shown.count == 1
+    assert same(state(whole.network), state(fresh.network))
+
+
+@pytest.mark.parametrize(
+    ("there", "given", "episode", "task"),
+    [
+        (world, {}, 30, None),
+        (lambda: world(task="figure8"), {}, 30, "figure8"),
+        (nameless, {"environment": "JackalFlat"}, 1000, None),
+    ],
+)
+def test_what_is_imagined_is_as_the_world(
+    jackal: Path, monkeypatch: pytest.MonkeyPatch, there: Any, given: dict[str, Any], episode: int, task: str | None
+) -> None:
+    """Its task, and the length of its episodes where it says it."""
+
+    class Asked(Exception):
+        pass
+
+    def asked(*_: Any, **how: Any) -> Any:
+        assert how["episode"] == episode
+        assert how["settings"].get("task") == task
+        raise Asked
+
+    monkeypatch.setattr("nfc_gym.adaptation.algorithm.imagined", asked)
+    config = replace(CONFIG, episode=None)
+    with pytest.raises(Asked):
+        adapt(ppo_agent(load_policy(jackal)), there(), belief(), Alarm(5), config=config, threads=1, **given)
 
 
 @pytest.mark.parametrize(
@@ -218,6 +277,7 @@ def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path, judge
         ({"beta": -1.0}, "beta is -1.0; want a number of standard deviations"),
         ({"parts": ()}, "parts is \\(\\); want parts of the belief"),
         ({"parts": "psi"}, "parts is 'psi'; want parts of the belief"),
+        ({"parts": ("mass",)}, "no part 'mass' of a belief; there are: psi, delta_s, delta_e, effects, noise"),
     ],
 )
 def test_settings_that_cannot_be_are_named(wrong: dict[str, Any], told: str) -> None:
@@ -250,7 +310,11 @@ def test_what_does_not_fit_is_named(jackal: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="reset"):
         adapt(agent, world(), belief(), object())
     with pytest.raises(InputError, match="not of delta_e"):
-        adapt(agent, world(), belief(), Alarm(5), config=AdaptConfig(parts=("delta_e",)), threads=1)
+        adapt(agent, world(), belief(), Alarm(None), config=AdaptConfig(parts=("delta_e",)), threads=1)
+    with pytest.raises(InputError, match=r"the task 'goal', and the world's is 'figure8': leave it out"):
+        adapt(agent, world(task="figure8"), belief(), Alarm(None), settings={"task": "goal"})
+    with pytest.raises(InputError, match=r"names no simulator: give its id, as in environment='nfc_gym/JackalFlat-v0'"):
+        adapt(agent, nameless(), belief(), Alarm(None))
     with pytest.raises(InputError, match="psi has 3 entries, the world's 17: base_mass, "):
         adapt(agent, world(), Fidelity(np.ones((4, 3))), Alarm(None))
     with pytest.raises(InputError, match="must return a Fidelity"):

@@ -137,6 +137,30 @@ def test_functions_of_one_name_are_worlds_of_their_own(tmp_path: Path, result: P
     assert hard["curve"] == easy["curve"], "what was learned is kept"
 
 
+def test_a_policy_goes_on_with_the_task_that_it_was_trained_to_do(
+    tmp_path: Path, result: Path, jackal: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tasks = set()
+
+    def watched(*args: Any, **kwargs: Any) -> VectorEnv:
+        envs: Any = vector_env(*args, **kwargs)
+        tasks.add(envs.unwrapped.robot.task)
+        return envs
+
+    monkeypatch.setattr("nfc_gym.adaptation.handover.vector_env", watched)
+    monkeypatch.setattr("nfc_gym.adaptation.extension.vector_env", watched)
+    policy = load_policy(jackal)
+    policy.about["training"]["task"] = "figure8"
+    policy.save(tmp_path / "figure8.safetensors")
+    given: dict[str, Any] = {"policy": tmp_path / "figure8.safetensors", "steps": 1, "episodes": 2}
+    report = handed(result, tmp_path / "out", **given)
+    assert tasks == {"figure8"}
+    assert report["policy"]["task"] == "figure8"
+    goal = lambda n: vector_env("JackalFlat", n, threads=1, episode=40)  # noqa: E731
+    with pytest.raises(InputError, match="world: its task is 'goal', the policy's 'figure8'"):
+        handed(result, tmp_path / "out", **given, world=goal)
+
+
 def test_learning_that_comes_apart_keeps_the_best_weights(
     tmp_path: Path, result: Path, jackal: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,6 +51,15 @@ def test_a_head_answers_with_a_probability_for_each_family(head: Path) -> None:
     assert sum(shares) == pytest.approx(1)
 
 
+def test_another_training_is_no_continuation(head: Path) -> None:
+    before = head.read_bytes()
+    with pytest.raises(InputError, match=r"of another run \(noise 0\.5, now 0\.4\)"):
+        train_structure(
+            head.parent / "windows", head, TrainConfig(epochs=1, batch=16), config=TINY, noise=0.4, repeats=1
+        )
+    assert head.read_bytes() == before
+
+
 def test_noise_that_the_log_has_already_is_not_added(head: Path) -> None:
     witness = Witness(head)
     lacking = witness._lacking({"body:base:angvel@body": 0.015, "body:base:linvel": 0.0, "body:base:quat": 0.003})

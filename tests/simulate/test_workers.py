@@ -8,7 +8,9 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,8 @@ import pytest
 from nfc_gym.core import Fidelity, InputError, NfcError
 from nfc_gym.inference.windows import Windows
 from nfc_gym.simulate import simulate
+from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.run import _named
 
 JACKAL = "nfc_gym/JackalFlat-v0"
 SET = {"environment": JACKAL, "windows": 22, "per_shard": 4, "seed": 3}
@@ -129,8 +133,6 @@ def test_two_ray_workers_make_the_same_though_one_is_killed(tmp_path: Path) -> N
 
 
 def test_a_proposal_takes_the_priors_place(tmp_path: Path) -> None:
-    from nfc_gym.simulate.machine import Machine
-
     space = Machine(JACKAL).space
     narrow = space.low + (0.4 + 0.2 * np.random.default_rng(0).random((500, len(space)))) * (space.high - space.low)
     Fidelity(psi=narrow).save(tmp_path / "proposal.npz")
@@ -147,6 +149,33 @@ def test_a_proposal_takes_the_priors_place(tmp_path: Path) -> None:
         simulate(JACKAL, 4, tmp_path / "out", jobs=1, proposal=Fidelity(psi=2 * space.high))
     with pytest.raises(InputError, match=r"has psi of shape .*; want \(16, 17\)"):
         simulate(JACKAL, 4, tmp_path / "out", jobs=1, proposal=Fidelity(psi=np.ones(3)))
+
+
+def test_callables_of_one_name_are_told_by_what_they_answer(tmp_path: Path) -> None:
+    def act(speed: float, observation: np.ndarray) -> np.ndarray:
+        return np.full((len(observation), 2), speed)
+
+    given: dict[str, Any] = {"windows": 2, "out": tmp_path, "jobs": 1, "effects": 0.0, "policy_share": 1.0}
+    simulate(JACKAL, **given, policy=partial(act, 1.0))
+    assert len(simulate(JACKAL, **given, policy=partial(act, 1.0))) == 2
+    with pytest.raises(InputError, match=r"made otherwise \(policy 'partial \w+', now 'partial \w+'\)"):
+        simulate(JACKAL, **given, policy=partial(act, -1.0))
+
+
+class Wandering:
+    """Answers otherwise each time."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(0)
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        return self.rng.uniform(-1, 1, (len(observation), 2))
+
+
+def test_a_callable_with_a_memory_is_told_by_its_name_and_not_disturbed() -> None:
+    policy, machine = Wandering(), Machine(JACKAL)
+    assert _named(policy, machine) == "Wandering"
+    assert policy.rng.random() == np.random.default_rng(0).random()
 
 
 def test_policies_from_files_move_their_share(tmp_path: Path) -> None:
