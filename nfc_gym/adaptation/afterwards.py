@@ -25,10 +25,11 @@ from rich.console import Console
 
 from nfc_gym.adaptation import normal as normality
 from nfc_gym.adaptation import resume
-from nfc_gym.adaptation.digests import digest, flat, of_detector, of_network
+from nfc_gym.adaptation.digests import of_detector, of_network
 from nfc_gym.adaptation.normal import Normal, quiet_trajectories
 from nfc_gym.adaptation.relearning import relearned
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
+from nfc_gym.adaptation.weights import digest, flat
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_whole
 from nfc_gym.inference import detector_file

@@ -23,7 +23,7 @@ from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.agent import Agent
 from nfc_gym.adaptation.beliefs import Inference, inference_of, require_spoken, require_width, width
 from nfc_gym.adaptation.choice import Choice, weights_of
-from nfc_gym.adaptation.digests import of_detector, of_posterior, of_weights
+from nfc_gym.adaptation.digests import of_detector, of_posterior
 from nfc_gym.adaptation.earned import RATE, chance, require_home
 from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portable, spread
@@ -34,6 +34,7 @@ from nfc_gym.adaptation.optimise import optimise, pi_h_for
 from nfc_gym.adaptation.record import Record, in_words
 from nfc_gym.adaptation.sight import Sight, VectorSight
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute
+from nfc_gym.adaptation.weights import of_weights
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
 from nfc_gym.core.whole import require_whole

@@ -1,15 +1,13 @@
 """What tells networks, detectors and posteriors from others, so that a run is never taken up again with another's."""
 
-import hashlib
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
-from torch import Tensor, nn
 
 from nfc_gym.adaptation.assimilation import Assimilation
 from nfc_gym.adaptation.beliefs import Fixed, Sequential
+from nfc_gym.adaptation.weights import digest, flat
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.posterior import Sampler
@@ -23,26 +21,6 @@ from nfc_gym.simulate.replay import Replay
 _DRAWS = 16  # by which a posterior is told from others that can only be drawn from
 # Of an `Assimilation`: what follows from the rest, what changes nothing, and what is told in another way.
 _LEFT_OUT = ("machine", "box", "structure", "nthread", "ground", "remembered")
-
-
-def digest(*parts: Any) -> str:
-    """What tells things from others: arrays by type, shape and content, anything else as it is printed."""
-    sha = hashlib.sha256()
-    for part in parts:
-        x = part.detach().cpu().numpy() if isinstance(part, Tensor) else part
-        told, content = ((x.dtype, x.shape), x.tobytes()) if isinstance(x, np.ndarray) else (x, b"")
-        sha.update(repr(told).encode() + content)
-    return sha.hexdigest()[:16]
-
-
-def flat(tensors: Mapping[str, Tensor]) -> list[Any]:
-    """Names and tensors one after the other, as `digest` takes them."""
-    return [part for pair in tensors.items() for part in pair]
-
-
-def of_weights(module: nn.Module) -> str:
-    """Of a network's weights."""
-    return digest(*flat(module.state_dict()))
 
 
 def of_network(net: Learner) -> list[Any]:

@@ -31,6 +31,7 @@ from nfc_gym.adaptation.record import Record
 from nfc_gym.adaptation.returns import figure, from_plain, gain, to_plain
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.threads import limit_threads
+from nfc_gym.adaptation.weights import of_weights
 from nfc_gym.adaptation.worlds import vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together, write_whole
@@ -169,7 +170,11 @@ class _Run:
         self.start, self.extension, self.truth, self.config = start, extension, truth, config
         self.folder, self.episodes, self.threads, self.record = folder, episodes, threads, record
         self.settings = start.settings(extension.environment)
-        self.of = {"environment": extension.environment, "policy": _digest(start), "found": extension.found.digest}
+        self.of = {
+            "environment": extension.environment,
+            "policy": of_weights(start.network),
+            "found": extension.found.digest,
+        }
         self.of |= self.settings
         self.scores: dict[str, Score] = {}
 
@@ -302,11 +307,3 @@ class _Run:
 def _compared(scores: Mapping[str, Score]) -> dict[str, Any]:
     before, after = scores["before"], scores["after"]
     return {"before": figure(before), "after": figure(after), "gain": gain(after, before)}
-
-
-def _digest(policy: Policy) -> str:
-    """What tells a policy from another: its weights."""
-    sha = hashlib.sha256()
-    for key, tensor in sorted(policy.network.state_dict().items()):
-        sha.update(key.encode() + tensor.detach().cpu().numpy().tobytes())
-    return sha.hexdigest()[:16]

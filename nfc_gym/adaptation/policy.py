@@ -1,6 +1,5 @@
 """A policy as one safetensors file: actor, critic and the scale of observations, and in the metadata all about it."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -17,6 +16,7 @@ from torchrl.modules import ProbabilisticActor
 from nfc_gym import __version__, assets
 from nfc_gym.adaptation.network import CLIP, ActorCritic, Sizes
 from nfc_gym.adaptation.sight import Sight
+from nfc_gym.adaptation.weights import of_weights
 from nfc_gym.adaptation.worlds import robot_of
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
@@ -110,22 +110,14 @@ class Policy:
             "nfc_gym": __version__, "torch": str(torch.__version__), "torchrl": str(torchrl.__version__),
         }  # fmt: skip
         tensors = {k: t.detach().cpu().contiguous().clone() for k, t in unique(self.network.state_dict()).items()}
-        about = _of_weights(self.about, _digest(tensors))
+        about = _said_of(of_weights(self.network), self.about)
         about |= {"sight": self.sight.to_dict(), "sizes": asdict(self.network.sizes), "versions": versions}
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as part:
             save_file(tensors, part, {"format": FORMAT, "about": json.dumps(about)})
 
 
-def _digest(tensors: dict[str, torch.Tensor]) -> str:
-    """What tells these weights from others."""
-    found = hashlib.sha256()
-    for name in sorted(tensors):
-        found.update(name.encode() + tensors[name].numpy().tobytes())
-    return found.hexdigest()
-
-
-def _of_weights(about: dict[str, Any], digest: str) -> dict[str, Any]:
+def _said_of(digest: str, about: dict[str, Any]) -> dict[str, Any]:
     """What may be said of the weights with this digest: steps and returns of others were theirs."""
     if about.get("weights", digest) == digest:
         return {**about, "weights": digest}
@@ -218,7 +210,7 @@ def load_policy(source: str | Path, device: str | torch.device = "cpu") -> Polic
         network = ActorCritic(Sizes(**{**sizes, "hidden": tuple(sizes["hidden"])}))
         sight = Sight.from_dict(about.pop("sight"))
         restore(network, tensors)
-        about.setdefault("weights", _digest(tensors))
+        about.setdefault("weights", of_weights(network))
     except (KeyError, TypeError, ValueError, RuntimeError) as e:
         raise InputError(f"{path}: its metadata and weights are no policy that this version knows ({e})") from None
     return Policy(sight, network.to(device).eval(), about)

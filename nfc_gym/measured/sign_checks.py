@@ -65,12 +65,12 @@ def turned_round(dataset: Dataset) -> Iterator[Finding]:
     commanded = {key.removeprefix("ctrl:") for key in dataset.mapping.controls}
     try:
         bench = make_bench(replace(dataset, logs=tuple(_middles(dataset.logs))), nthread=1)
+        if not commanded.issuperset(actuator_names(bench.plant.model)):
+            return
         logs = bench.dataset.logs
         ahead = max(AHEAD, SAMPLES * max(log.interval for log in logs))
         problem = bench.rollouts(logs, [bench.states[log.name] for log in logs], BLOCKS, (ahead,))
     except InputError:  # told elsewhere
-        return
-    if not commanded.issuperset(actuator_names(bench.plant.model)):
         return
     weighed = [(left, turn) for turn in _turns(bench) if (left := _left(bench, problem, turn)) < BETTER]
     told: set[str] = set()
