@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +18,28 @@ from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.random import mixed
-from nfc_gym.inference.sequential import SequentialConfig, sequential
+from nfc_gym.inference.refine import refine
+from nfc_gym.inference.proposals import Believed, SequentialConfig
+from nfc_gym.inference.sequential import sequential
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
-from nfc_gym.simulate import Simulator
+from nfc_gym.simulate import Simulator, starts
+from nfc_gym.simulate.ceiling import ceiling
 from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.repeated import Repeated
 from posteriors import metrics
 from posteriors.fitted import Ours
 from posteriors.methods import METHODS, OURS, network_config
 
 FIRST, ONE = "first", "one"  # networks of the first round, and of one round of twice as many
 HELD_OUT = 0.1  # of each round's windows
-# How a second round trains: see `SequentialConfig`.
+SAMPLES = 2000  # of a posterior, for its intervals
+GROUND = ("terrain_kind", "terrain_seed", "terrain_difficulty")
+# How a second round trains: see `SequentialConfig`; with its own commands, see `refine`.
+OWN = "own"
 WAYS = {
     "on": {}, "anew": {"anew": True}, "posterior": {"proposal": "posterior"},
-    "anew posterior": {"anew": True, "proposal": "posterior"},
+    "anew posterior": {"anew": True, "proposal": "posterior"}, OWN: {},
 }  # fmt: skip
 AXLE = "front_left_wheel_damping"  # the gain kv of its servo: 0 is a lost axle
 
@@ -71,7 +79,7 @@ def before(
         if file.is_file():
             continue
         rng = np.random.default_rng([4, count])
-        batch = Simulator(env, effects=0, jobs=jobs, names=("states", "actions")).draw(count, rng)
+        batch = Simulator(env, effects=0, jobs=jobs, names=("states", "actions", "start")).draw(count, rng)
         config = network_config(METHODS[OURS], "summaries", small)
         network = Network(config, Sizes.of(batch, place=place_of(Machine(env).state_names)), prior, count)
         train(network, *TensorWindows(batch).split(HELD_OUT), training, device=device)
@@ -98,23 +106,38 @@ def rounds(
       folder: what `before` wrote.
     """
     first, one = (checkpoint.load(folder / f"{name}.safetensors")[0].to(device) for name in (FIRST, ONE))
-    begun = TensorWindows(safetensors.torch.load_file(folder / f"{FIRST}_windows.safetensors"))
+    known = safetensors.torch.load_file(folder / f"{FIRST}_windows.safetensors")
+    begun = TensorWindows({k: t for k, t in known.items() if k != "start"})
     prior, rng = first.prior, np.random.default_rng([3, truth])
     simulate = Simulator(env, effects=0, jobs=jobs, names=("states", "actions"))
     psi = prior.psi_of(rng.uniform(size=(1, len(prior))))
-    seen = simulate(psi, rng)
+    seen = replace(simulate, names=("states", "actions", "start", *GROUND))(psi, rng)
     window = Window(seen["states"][0].numpy(), seen["actions"][0].numpy())
 
-    def gain(given: NeuralPosterior) -> float:
+    def gain(given: Believed) -> float:
         return float(given.log_prob(Fidelity(psi))[0] + prior.log_volume) / prior.size
 
     alone, once = gain(NeuralPosterior(one).given(window)), gain(NeuralPosterior(first).given(window))
     out: dict[str, Any] = {"one": alone, "first": once}
     for way in ways:
         how = SequentialConfig(2, size, narrows=-np.inf, held_out=HELD_OUT, seed=mixed(truth, 2), **WAYS[way])
-        network = deepcopy(first)
-        two = sequential(network, simulate, window, how, training, begun=begun, device=device, scales=False)
-        out |= {way: gain(two.posterior), "kept": two.kept[1]}
+        if way == OWN:
+            again = Repeated.of(simulate, window.states, window.actions, {k: t.numpy() for k, t in known.items()})
+            two = refine(
+                NeuralPosterior(deepcopy(first)), window, again, replace(how, rounds=1), training, device=device
+            )
+            draws = prior.u_of(two.posterior.sample(SAMPLES, rng).psi)[None]
+            low, high = metrics.intervals(draws, 0.9)
+            u = prior.u_of(psi)
+            out |= {"held": float(((low <= u) & (u <= high)).mean()), "width": float((high - low).mean())}
+            one = {k: t.numpy() for k, t in seen.items()} | {"psi": u}
+            most = ceiling(env, one, before=starts.spread(Machine(env), {"start": known["start"].numpy()}))
+            out["ceiling"] = float(most.joint[0]) / prior.size
+        else:
+            two = sequential(
+                deepcopy(first), simulate, window, how, training, begun=begun, device=device, scales=False
+            )
+        out |= {way: gain(two.posterior), "kept": two.kept[-1]}
     return out
 
 
@@ -129,4 +152,11 @@ def summed(found: list[dict[str, Any]]) -> dict[str, Any]:
     for way in (w for w in WAYS if w in found[0]):
         two = np.array([f[way] for f in found])
         out |= {f"two rounds, trained {way}": metrics.mean(two), f"... less one ({way})": metrics.mean(two - one)}
+    own = {
+        "held": "90 % interval holds the truth", "width": "its width over the prior's",
+        "ceiling": "what these windows tell at most, gain a parameter",
+    }  # fmt: skip
+    for name, said in own.items():
+        if name in found[0]:
+            out[said] = metrics.mean(np.array([f[name] for f in found]))
     return out

@@ -30,7 +30,6 @@ from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
 from nfc_gym.simulate.machine import MOTOR, Machine
-from nfc_gym.simulate.replay import told
 from nfc_gym.simulate.start import disturbed, observed
 from nfc_gym.terrain import Heightfield
 
@@ -118,7 +117,7 @@ class Assimilation:
         mujoco.set_mju_user_warning(lambda message: None)  # draws that come apart are left out, not talked about
         most = SEGMENTS // max(1, len(self.remembered))
         parts = [*(self.segments(earlier, most) for earlier in self.remembered), self.segments(trajectory)]
-        rng, seen = np.random.default_rng(self.seed), told(self.machine)
+        rng, seen = np.random.default_rng(self.seed), self.machine.told
         scale = self.machine.noise[seen]
         d = len(self.machine.space) + len(self.structure)
         mean, covariance, prior = np.zeros(d), np.eye(d), np.ones(d)
@@ -260,7 +259,7 @@ class Assimilation:
         z = belief.near().coordinates(DRAWS, rng)
         off = [self.machine.difference(p.last[None], self._ends(p, z, None)) / p.actions.shape[1] for p in parts]
         missed = np.concatenate(off, 1)
-        missed = np.nanmean(np.where(np.isfinite(missed), missed, np.nan), 0) * told(self.machine)
+        missed = np.nanmean(np.where(np.isfinite(missed), missed, np.nan), 0) * self.machine.told
         spread = missed.std(0, ddof=1) / np.sqrt(len(missed))
         return replace(belief, delta=missed.mean(0), spread=spread)
 

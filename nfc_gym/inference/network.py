@@ -65,7 +65,7 @@ class Network(Learner):
             self.place = Place(sizes.place) if sizes.place else nn.Identity()
             plan = Regressions.of(sizes.layout, sizes.states, sizes.actions) if config.summaries else None
             self.encoder = Joined(
-                config.encoder, sizes.horizon, sizes.states, sizes.actions, width=config.width,
+                config.encoder, sizes.horizon, sizes.states, sizes.actions, width=config.width, aligned=config.aligned,
                 summaries=config.summaries, regressions=plan, elevation=config.elevation,
             )  # fmt: skip
             width = config.features or self.encoder.features

@@ -5,17 +5,22 @@ quantile (truncated sequential posterior estimation: Deistler et al. 2022; for s
 appends to all earlier rounds and trains on. Inside the truncated region the proposal is proportional to the prior, so
 the loss needs no correction. With draws of the posterior itself the answer is corrected instead (`proposals`). Either
 way the posterior of the *given* window stays right, that of others does not.
+
+What is learned for one window alone may be learned from windows of its own commands (`simulate.Repeated`), by a network
+of its own: it begins `within` the region in which another posterior of that window has mass.
 """
 
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from nfc_gym.core.errors import InputError
 from nfc_gym.inference.data import Batch, TensorWindows
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
@@ -61,8 +66,8 @@ class Rounds:
 
 def sequential(
     network: Network, simulate: Simulator, window: Window, config: SequentialConfig | None = None,
-    training: TrainConfig | None = None, *, begun: TensorWindows | None = None, device: str | torch.device = "cpu",
-    report: Report = quiet, scales: bool = True,
+    training: TrainConfig | None = None, *, begun: TensorWindows | None = None, within: TruncatedPrior | None = None,
+    device: str | torch.device = "cpu", report: Report = quiet, scales: bool = True,
 ) -> Rounds:  # fmt: skip
     """Infer psi from one window in rounds of simulations that close in on it.
 
@@ -74,14 +79,19 @@ def sequential(
       training: of each round, on all windows so far.
       begun: windows whose psi is drawn from the prior and which the network has been trained on: they are the first
         round, whatever their number, for any window that was observed.
+      within: what the first round is drawn from in place of the prior, where another posterior of this window is there
+        already.
       device: to train on.
       report: is told of the progress.
       scales: see `train`; a network that was trained before on other windows is to keep its own.
 
     Raises:
-      InputError: the simulator returns windows that are not the network's, or another number of them.
+      InputError: the simulator returns windows that are not the network's, or another number of them; or a start that
+        cannot be had.
     """
     config, training = config or SequentialConfig(), training or TrainConfig(epochs=50)
+    if within is not None and (begun is not None or config.proposal != TRUNCATED):
+        raise InputError("sequential: `within` goes with truncated proposals, and with no windows that were `begun`")
     rng = np.random.default_rng(config.seed)
     out = Rounds(NeuralPosterior(network))
     believed = _Beliefs(window, config)
@@ -95,12 +105,13 @@ def sequential(
             if config.anew:
                 _renew(network, mixed(config.seed, r))
         else:
-            out.kept.append(1.0)
-            new = begun or _simulated(network.prior, simulate, _prior(network.prior, config.simulations, rng), rng)
+            out.kept.append(1.0 if within is None else within.kept)
+            draw = within.sample if within else partial(_prior, network.prior)
+            new = begun or _simulated(network.prior, simulate, draw(config.simulations, rng), rng)
             believed.first = len(new)
-        first, last = new.split(config.held_out)
-        train_set = first if train_set is None else train_set.append(first)
-        held_out = last if held_out is None else held_out.append(last)
+        learned, judged = new.split(config.held_out)
+        train_set = learned if train_set is None else train_set.append(learned)
+        held_out = judged if held_out is None else held_out.append(judged)
         if r or begun is None:
             outcome = train(network, train_set, held_out, training, device=device, report=report, scales=scales)
             out.outcomes.append(outcome)

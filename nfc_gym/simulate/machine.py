@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs.contract import robot_class
@@ -134,6 +135,18 @@ class Machine:
     def angles(self) -> list[int]:
         """Entries of `proprio` that are angles which jump from pi to -pi: a runner's yaw, roll, angle to its target."""
         return [7, 8, 9] if issubclass(self.kind, Runner) else []
+
+    @cached_property
+    def aims(self) -> list[int]:
+        """Entries of `proprio` that tell of a runner's target, which nobody who looks at a window knows."""
+        return [9, 11] if issubclass(self.kind, Runner) else []
+
+    @cached_property
+    def told(self) -> NDArray[np.bool_]:
+        """(s,) entries of `proprio` that are measured and that a replay can say: no commands, nothing of aims."""
+        found = self.noise > 0
+        found[self.aims] = False
+        return found
 
     def difference(self, after: Array, before: Array) -> Array:
         """`after` minus `before`, (..., s) each of `proprio`; angles go the shorter way round."""

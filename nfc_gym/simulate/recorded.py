@@ -19,11 +19,12 @@ class Recorded:
     """Stretches of recorded motion, one window long each.
 
     Attributes:
-      starts: (n, nq + nv) positions and velocities where they begin, or with the actuators' states behind them.
+      starts: (n, nq + nv) positions and velocities where they begin, or with the actuators' states behind them. Of one
+        stretch there may be several, m: then window i begins at the i-th.
       states: (n, H+1, s) `proprio` as observed.
       actions: (n, H, a) as commanded.
       maps: the ground that they were recorded on; none is a plane.
-      which: (n,) map of each.
+      which: (n,) map of each stretch.
     """
 
     starts: Array
@@ -41,16 +42,16 @@ class Recorded:
         Raises:
           InputError: there is none, it is of another robot or length, not finite, or lacks the ground.
         """
-        n, h, kind, model = len(self), machine.habit.horizon, machine.kind, machine.model
-        moving = model.nq + model.nv
+        n, h, kind, model = len(self.states), machine.habit.horizon, machine.kind, machine.model
+        moving, starts = model.nq + model.nv, len(self) if n == 1 else n
         wanted = {
-            "starts": {(n, moving), (n, moving + model.na)},
+            "starts": {(starts, moving), (starts, moving + model.na)},
             "states": {(n, h + 1, kind.proprio_size)},
             "actions": {(n, h, kind.action_size)},
         }
         for name, shapes in wanted.items():
             value = getattr(self, name)
-            if not n or value.shape not in shapes or not np.isfinite(value).all():
+            if not n * starts or value.shape not in shapes or not np.isfinite(value).all():
                 raise InputError(
                     f"recorded motion: {name} has shape {value.shape}; {machine.environment} wants finite {shapes}"
                 )
@@ -62,10 +63,12 @@ class Recorded:
                 f"{'some, and for each stretch the number of its own' if machine.rough else 'none'}"
             )
 
-    def at(self, rows: NDArray[np.intp]) -> "Recorded":
-        """Some of the stretches."""
+    def at(self, windows: NDArray[np.intp], drawn: NDArray[np.intp]) -> "Recorded":
+        """What some windows repeat: stretches as drawn, 0 to n - 1, or the one that there is."""
+        starts = windows % len(self) if len(self.states) == 1 else drawn
+        rows = drawn if len(self.states) > 1 else np.zeros_like(drawn)
         which = None if self.which is None else self.which[rows]
-        return Recorded(self.starts[rows], self.states[rows], self.actions[rows], self.maps, which)
+        return Recorded(self.starts[starts], self.states[rows], self.actions[rows], self.maps, which)
 
 
 def place(machine: Machine, sims: Simulations, starts: Array, first: Array) -> None:

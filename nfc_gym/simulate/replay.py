@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
-from nfc_gym.envs.ant import Ant
-from nfc_gym.envs.humanoid import Humanoid
 from nfc_gym.envs.quadcopter import Quadcopter
 from nfc_gym.envs.simulations import Simulations
 from nfc_gym.inference.detector import checked
@@ -48,7 +46,6 @@ INFLATION = 1.1
 SETTLE = 5  # control steps in which replays find the start's contacts and speeds; they do not count
 MOST = 4.0  # of X in one step: beyond it is a blow of contact, and more of it tells nothing more of the model
 _TURN = 2048  # replays at once
-_AIMS = (9, 11)  # entries of a runner's proprio that tell of its target, which no replay knows
 
 
 class Replay:
@@ -93,7 +90,7 @@ class Replay:
         self.psi = _psi(machine, belief, draws, rng)
         self.jitter = motor * rng.standard_normal((draws, self.horizon, self.actions))
         self.start = rng.standard_normal((draws, 2 * machine.model.nv))
-        self.told = np.flatnonzero(told(machine))
+        self.told = np.flatnonzero(machine.told)
         self.eps = rng.standard_normal((draws, self.horizon, len(self.told)))
         self.lacks: tuple[Effect, Array] | None = None  # what every replay has beyond the model, see `under`
         self._residuals: Residuals
@@ -291,14 +288,6 @@ class Driven:
 
     def _note(self, env: Any) -> None:
         self._ids = env.terrain_id
-
-
-def told(machine: Machine) -> NDArray[np.bool_]:
-    """(s,) entries of `proprio` that are measured and that a replay can say: no command, nothing of unknown targets."""
-    found = machine.noise > 0
-    if issubclass(machine.kind, Ant | Humanoid):
-        found[list(_AIMS)] = False
-    return found
 
 
 def _psi(machine: Machine, belief: Sampler | None, draws: int, rng: np.random.Generator) -> Array:

@@ -170,13 +170,13 @@ def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy 
             batch.reset(np.flatnonzero(apart), sims.rest)
         view.task.update(robot.advance(view, action))
         view.before, view.now = view.now, robot.derive(view)
-        ended |= alive & ~apart & robot.terminated(view)
+        if task.recorded is None:  # what was recorded went on, so that these have to, or they could not be compared
+            ended |= alive & ~apart & robot.terminated(view)
         if k >= 0:
             delta[rows] += machine.difference(np.concatenate(robot.proprio(view), -1)[rows], shown)
     states[:, horizon] = np.concatenate(robot.proprio(view), -1)
-    if task.recorded is not None:  # commands and last actions are the task's, not the simulation's
-        quiet = machine.noise == 0
-        states[:, :, quiet] = task.recorded.states[:, :, quiet]
+    if task.recorded is not None:  # commands, last actions and aims are the task's, not the simulation's
+        states[:, :, ~machine.told] = task.recorded.states[:, :, ~machine.told]
     pose[:, horizon] = view.qpos[:, :7]
     unstable |= ~ended & ~(np.isfinite(states).all((1, 2)) & np.isfinite(delta).all(1))
     return Rolled(states, actions, delta / horizon, pose, start, unstable, ended)

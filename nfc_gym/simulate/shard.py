@@ -23,6 +23,7 @@ PLACES_EACH = 2  # of every family in a shard; other shards draw others
 PATIENCE = 4  # attempts at a window's motion before its labels are drawn anew
 LEVELS = (0.5, 2.0)  # of the depth camera's noise
 _FRUITLESS = 40  # attempts after which it is said that this robot cannot be simulated so
+_ANOTHER = 7919  # windows on: the start of which one that comes apart is tried with
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,10 @@ def _task(
     u = uniforms(plan.manifest.seed, shard, MOTION, order, attempt, 5 + starts + waves)
     low, high = (0, 0) if plan.recorded else habit.warm
     which = picked(u[:, 1], max(len(soil.maps), 1))
-    recorded = None if plan.recorded is None else plan.recorded.at(picked(u[:, 3], len(plan.recorded)))
+    recorded = None
+    if plan.recorded is not None:
+        window = shard * plan.manifest.per_shard + order + attempt * _ANOTHER
+        recorded = plan.recorded.at(window, picked(u[:, 3], len(plan.recorded)))
     if recorded is not None and recorded.which is not None:
         which = recorded.which
     psi = machine.space.low + labels.u[order] * (machine.space.high - machine.space.low)

@@ -105,25 +105,32 @@ class Signals(nn.Module):
     Args:
       states: s.
       actions: a.
+      aligned: H, where all windows have the same commands and each time is standardised by itself: what is left is in
+        what they differ. 0 standardises over all times together.
     """
 
-    def __init__(self, states: int, actions: int) -> None:
+    def __init__(self, states: int, actions: int, aligned: int = 0) -> None:
         super().__init__()
-        self.channels = 2 * states + actions
-        self.scales = nn.ModuleDict({"s": Standard(states), "ds": Standard(states), "a": Standard(actions)})
+        self.channels, self.aligned = 2 * states + actions, aligned > 0
+        times = {"s": aligned + 1, "ds": aligned, "a": aligned} if aligned else {"s": 1, "ds": 1, "a": 1}
+        sizes = {"s": states, "ds": states, "a": actions}
+        self.scales = nn.ModuleDict({name: Standard(times[name] * size) for name, size in sizes.items()})
 
     def fit(self, states: Tensor, actions: Tensor) -> None:
         """Take scales from windows of the training set."""
         parts = {"s": states, "ds": states.diff(dim=1), "a": actions}
         for name, x in parts.items():
             if x.numel():
-                cast(Standard, self.scales[name]).fit(x)
+                cast(Standard, self.scales[name]).fit(x.flatten(1) if self.aligned else x)
 
     def forward(self, states: Tensor, actions: Tensor) -> Tensor:
         """(B, H+1, channels)."""
-        steps = nn.functional.pad(self.scales["ds"](states.diff(dim=1)), (0, 0, 1, 0))
-        actions = nn.functional.pad(self.scales["a"](actions), (0, 0, 0, 1))
-        return torch.cat([self.scales["s"](states), steps, actions], -1).clamp(-10, 10)
+        steps = nn.functional.pad(self._scaled("ds", states.diff(dim=1)), (0, 0, 1, 0))
+        actions = nn.functional.pad(self._scaled("a", actions), (0, 0, 0, 1))
+        return torch.cat([self._scaled("s", states), steps, actions], -1).clamp(-10, 10)
+
+    def _scaled(self, name: str, x: Tensor) -> Tensor:
+        return self.scales[name](x.flatten(1)).view(x.shape) if self.aligned else self.scales[name](x)
 
 
 class SignalEncoder(Encoder):
@@ -133,11 +140,12 @@ class SignalEncoder(Encoder):
       horizon: H.
       states: s.
       actions: a.
+      aligned: whether all windows have the same commands, see `Signals`.
     """
 
-    def __init__(self, horizon: int, states: int, actions: int) -> None:
+    def __init__(self, horizon: int, states: int, actions: int, aligned: bool = False) -> None:
         super().__init__()
-        self.signals = Signals(states, actions)
+        self.signals = Signals(states, actions, horizon if aligned else 0)
         self.channels = self.signals.channels
         self.length = horizon + 1
 

@@ -36,14 +36,15 @@ class KernelFeatures(SignalEncoder):
       horizon: H.
       states: s.
       actions: a.
+      aligned: whether all windows have the same commands.
     """
 
     features = FEATURES
     directions: Tensor
     width: Tensor
 
-    def __init__(self, horizon: int, states: int, actions: int) -> None:
-        super().__init__(horizon, states, actions)
+    def __init__(self, horizon: int, states: int, actions: int, aligned: bool = False) -> None:
+        super().__init__(horizon, states, actions, aligned)
         self.size = self.length * self.channels
         self.register_buffer("directions", self.spread_directions().float())
         self.register_buffer("width", torch.tensor(math.sqrt(self.size)))

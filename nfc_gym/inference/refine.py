@@ -1,0 +1,57 @@
+"""`refine`: what a network believes of one window, learned anew from windows of the same commands.
+
+A network that is to read any window reads each a little coarsely, however many it has seen. Windows of the same
+commands, from where this one may have begun (`simulate.Repeated`), differ by psi and noise alone: a small network and a
+linear start read those to the last digit. They are simulated where the first posterior has mass, so that its answer
+stays the prior's posterior (`sequential`), for this window and no other.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from nfc_gym.core.errors import InputError
+from nfc_gym.inference.config import NetworkConfig
+from nfc_gym.inference.network import Network
+from nfc_gym.inference.posterior import NeuralPosterior, Window
+from nfc_gym.inference.progress import Report, quiet
+from nfc_gym.inference.proposals import SequentialConfig, TruncatedPrior
+from nfc_gym.inference.sequential import Rounds, Simulator, sequential
+from nfc_gym.inference.train import TrainConfig
+
+NETWORK = NetworkConfig(encoder="nn", width=512, features=256, draws=8, aligned=True, linear=True)
+SIMULATIONS = 10_000
+
+
+def refine(
+    posterior: NeuralPosterior, window: Window, again: Simulator, config: SequentialConfig | None = None,
+    training: TrainConfig | None = None, *, network: NetworkConfig = NETWORK, device: str | torch.device = "cpu",
+    report: Report = quiet,
+) -> Rounds:  # fmt: skip
+    """Learn what one window tells of psi from windows of its own commands.
+
+    Args:
+      posterior: trained on windows of any motion; the first round is drawn where it has mass.
+      window: what was observed.
+      again: (psi (n, d) in physical units, generator) -> windows of the same commands, `simulate.Repeated`.
+      config: rounds; one of `SIMULATIONS` by default.
+      training: of each round.
+      network: what learns.
+      device: to train on; the posterior's network stays where it is.
+      report: is told of the progress.
+
+    Returns:
+      As of `sequential`. `posterior` of it speaks of psi alone.
+
+    Raises:
+      InputError: a window that is not the network's, a network with maps or more than psi, or a posterior of maps.
+    """
+    if network.elevation or network.delta_s or network.families or posterior.network.config.elevation:
+        raise InputError("refine: it is psi that is learned anew, from states and actions alone, without maps")
+    config = config or SequentialConfig(1, SIMULATIONS)
+    given, rng = posterior.of("psi").given(window), np.random.default_rng([config.seed, 1])
+    within = TruncatedPrior(given, config, rng)
+    sizes = replace(posterior.network.sizes, layout=None)
+    learner = Network(network, sizes, posterior.prior, config.seed).to(device)
+    return sequential(learner, again, window, config, training, within=within, device=device, report=report)
