@@ -17,9 +17,9 @@ from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
+from nfc_gym.inference.proposals import Believed, SequentialConfig
 from nfc_gym.inference.random import mixed
 from nfc_gym.inference.refine import refine
-from nfc_gym.inference.proposals import Believed, SequentialConfig
 from nfc_gym.inference.sequential import sequential
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
@@ -134,9 +134,7 @@ def rounds(
             most = ceiling(env, one, before=starts.spread(Machine(env), {"start": known["start"].numpy()}))
             out["ceiling"] = float(most.joint[0]) / prior.size
         else:
-            two = sequential(
-                deepcopy(first), simulate, window, how, training, begun=begun, device=device, scales=False
-            )
+            two = sequential(deepcopy(first), simulate, window, how, training, begun=begun, device=device, scales=False)
         out |= {way: gain(two.posterior), "kept": two.kept[-1]}
     return out
 

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -184,6 +185,12 @@ def infer(
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
     log: Annotated[str | None, typer.Option(metavar="NAME", help="Of a mapping's logs; default the first.")] = None,
     until: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where the window ends in that log.")] = None,
+    refine: Annotated[
+        int | None,
+        typer.Option(min=500, metavar="N", help="Learn anew from N simulations of these commands: sharper, minutes."),
+    ] = None,
+    device: Annotated[str, typer.Option(help="For --refine: auto, cpu or cuda.")] = "auto",
+    jobs: Annotated[int, typer.Option(min=0, help="For --refine: processes that simulate; 0 takes all cores.")] = 0,
 ) -> None:
     """Say what psi could have made a window of motion, and draw from that posterior.
 
@@ -194,6 +201,9 @@ def infer(
 
     A mapping file (or the folder that RecordLog wrote) names logs instead; what the robot would have observed is then
     made of their channels, for robots that feel no forces: Jackal, Quadcopter, Quadruped.
+
+    A posterior of any window reads each a little coarsely. --refine N simulates N windows of this window's own commands
+    and learns from these alone, on a plane; 10000 are a good number.
 
     Either kind of --out goes into RandomizePsi, into `nfc-gym simulate --proposal` and into `nfc-gym close-loop
     --posterior`.
@@ -206,16 +216,24 @@ def infer(
         from nfc_gym.core import MissingExtra
 
         try:
-            from nfc_gym.inference import jobs
+            from nfc_gym.inference import jobs as learning
         except ImportError as e:
             raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
 
         mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
         seen = _window(posterior, window, log, until) if mapped else window
-        drawn, found = jobs.infer(posterior, seen, samples=samples, seed=seed, out=out)
+        anew = None
+        if refine is not None:
+            from nfc_gym.inference.progress import Spoken
+            from nfc_gym.simulate.refined import refined
+
+            anew = partial(
+                refined, simulations=refine, seed=seed, jobs=jobs, device=learning.device_of(device), report=Spoken()
+            )
+        drawn, found = learning.infer(posterior, seen, samples=samples, seed=seed, out=out, refined=anew)
         table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
         for each in found:
-            note = "  not shown" if each.width >= jobs.AS_WIDE else ""
+            note = "  not shown" if each.width >= learning.AS_WIDE else ""
             interval = f"{each.low:.4g} to {each.high:.4g}"
             table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
         Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 140).print(table)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.inference.random import mixed
 
 Batch = dict[str, Tensor]
 _AXES = {"states": 3, "actions": 3, "psi": 2, "delta_s": 2, "delta_e": 3, "map": 3, "family": 1}
@@ -50,6 +51,7 @@ class TensorWindows:
       tensors: a batch as above that holds all windows.
       manifest: what is known of them.
       told: plain values, by name, in which training from other windows would be another training.
+      noise: (H+1, s) standard deviation of what is added to the states anew in each pass; None adds nothing.
 
     Raises:
       InputError: a tensor has another number of axes or windows, states and actions do not belong together, or a
@@ -57,10 +59,11 @@ class TensorWindows:
     """
 
     def __init__(
-        self, tensors: Batch, manifest: Mapping[str, Any] | None = None, told: Mapping[str, Any] | None = None
-    ) -> None:
+        self, tensors: Batch, manifest: Mapping[str, Any] | None = None, told: Mapping[str, Any] | None = None,
+        noise: Tensor | None = None,
+    ) -> None:  # fmt: skip
         require_batch(tensors)
-        self.tensors = tensors
+        self.tensors, self.noise = tensors, noise
         self.manifest: Mapping[str, Any] = dict(manifest or {})
         self.told: dict[str, Any] = dict(told or {})
 
@@ -73,23 +76,35 @@ class TensorWindows:
         if seed is not None:
             order = order[torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))]
         order = order.to(self.tensors["psi"].device)
-        for rows in order.split(size):
-            yield {name: t[rows] for name, t in self.tensors.items()}
+        for i, rows in enumerate(order.split(size)):
+            batch = {name: t[rows] for name, t in self.tensors.items()}
+            if self.noise is not None:
+                batch["states"] = self._noisy(batch["states"], mixed(seed or 0, i))
+            yield batch
+
+    def _noisy(self, states: Tensor, seed: int) -> Tensor:
+        assert self.noise is not None  # the caller has asked
+        drawn = torch.randn(states.shape, generator=torch.Generator(states.device).manual_seed(seed),
+                            device=states.device)  # fmt: skip
+        return states + self.noise.to(states) * drawn
 
     def split(self, share: float) -> tuple["TensorWindows", "TensorWindows"]:
         """The first windows, and the last `share` of them: to train on and to hold out."""
         cut = len(self) - max(1, round(share * len(self)))
         first, last = ({k: t[part] for k, t in self.tensors.items()} for part in (slice(cut), slice(cut, None)))
-        return TensorWindows(first, self.manifest, self.told), TensorWindows(last, self.manifest, self.told)
+        return self._like(first), self._like(last)
 
     def append(self, other: "TensorWindows") -> "TensorWindows":
-        """Both sets as one; they hold the same tensors."""
+        """Both sets as one; they hold the same tensors, and get the same noise."""
         joined = {k: torch.cat([t, other.tensors[k].to(t.device)]) for k, t in self.tensors.items()}
-        return TensorWindows(joined, self.manifest, self.told)
+        return self._like(joined)
 
     def to(self, device: str | torch.device) -> "TensorWindows":
         """The same on another device."""
-        return TensorWindows({k: t.to(device) for k, t in self.tensors.items()}, self.manifest, self.told)
+        return self._like({k: t.to(device) for k, t in self.tensors.items()})
+
+    def _like(self, tensors: Batch) -> "TensorWindows":
+        return TensorWindows(tensors, self.manifest, self.told, self.noise)
 
 
 class StoredWindows:

@@ -1,5 +1,6 @@
 """What `nfc-gym train` and `nfc-gym infer` do: a posterior from a folder of windows, and draws of it given one."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from nfc_gym.inference.data import StoredWindows
 from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.gains import gains
 from nfc_gym.inference.network import Network
-from nfc_gym.inference.posterior import Window, load
+from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
@@ -128,8 +129,9 @@ class Told(NamedTuple):
 
 
 def infer(
-    posterior: Path, window: Path | Window, *, samples: int = 1000, seed: int = 0, out: Path | None = None
-) -> tuple[Fidelity, list[Told]]:
+    posterior: Path, window: Path | Window, *, samples: int = 1000, seed: int = 0, out: Path | None = None,
+    refined: Callable[[NeuralPosterior, Window], NeuralPosterior] | None = None,
+) -> tuple[Fidelity, list[Told]]:  # fmt: skip
     """Draw from a posterior given a window.
 
     Args:
@@ -139,6 +141,7 @@ def infer(
       seed: of the draws.
       out: `.npz` for the draws (`psi`, and `delta_s` where it is inferred), or `.safetensors` for the posterior given
         this window; wrappers and `nfc-gym simulate --proposal` take either.
+      refined: makes of the posterior one given the window, `simulate.refined`; None gives it the window.
 
     Raises:
       InputError: a damaged file, a window that is not the network's, another ending, or something else than that is
@@ -148,7 +151,8 @@ def infer(
         raise InputError(f"{out}: draws are kept in .npz, the posterior given the window in .safetensors")
     if out is not None:
         kinds.require_kind(out, kinds.DRAWS if out.suffix == ".npz" else kinds.POSTERIOR)
-    given = load(posterior).given(window if isinstance(window, Window) else read_window(window))
+    found, seen = load(posterior), window if isinstance(window, Window) else read_window(window)
+    given = found.given(seen) if refined is None else refined(found, seen)
     parts = [p for p in given.network.parts if p != "delta_e"]
     drawn = given.of(*parts).sample(samples, np.random.default_rng(seed))
     if out is not None and out.suffix == ".safetensors":

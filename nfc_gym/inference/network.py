@@ -3,7 +3,9 @@
 from functools import partial
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from nfc_gym.core.errors import InputError
@@ -24,6 +26,7 @@ from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import EDGE, PriorBox
 
 _CHUNK = 1024  # windows whose fixed features are computed at once
+_SAME = 1e-3  # commands that are as near as this are the same
 
 
 class Encoded(NamedTuple):
@@ -142,6 +145,13 @@ class Network(Learner):
         for name in ("map", "delta_e") if self.config.elevation else ():
             if name in batch and batch[name].shape[1:] != (CELLS, CELLS):
                 raise InputError(f"windows: {name} has shape {tuple(batch[name].shape)}, want (n, {CELLS}, {CELLS})")
+
+    def repeats(self, actions: NDArray[np.float64]) -> bool:
+        """Whether actions (H, a) are the commands that it was trained on, where those were the same in all windows."""
+        signals = self.encoder.signals
+        if not self.config.aligned or signals is None:
+            return True
+        return bool(np.allclose(signals.commands.cpu().numpy(), actions, atol=_SAME))
 
     def facing(self, states: Tensor) -> Tensor:
         """(B, 3) how windows as logged lie in the world, see `Place`; ahead where their place is not told."""

@@ -7,25 +7,41 @@ stays the prior's posterior (`sequential`), for this window and no other.
 """
 
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.config import NetworkConfig
+from nfc_gym.inference.data import Batch
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.proposals import SequentialConfig, TruncatedPrior
-from nfc_gym.inference.sequential import Rounds, Simulator, sequential
+from nfc_gym.inference.sequential import Rounds, sequential
 from nfc_gym.inference.train import TrainConfig
 
 NETWORK = NetworkConfig(encoder="nn", width=512, features=256, draws=8, aligned=True, linear=True)
 SIMULATIONS = 10_000
 
 
+class Again(Protocol):
+    """Windows of the same commands, without the sensors' noise; see `simulate.Repeated`."""
+
+    @property
+    def noise(self) -> NDArray[np.float64]:
+        """(H+1, s) standard deviation of what is to be added to their states."""
+        ...
+
+    def __call__(self, psi: NDArray[np.float64], rng: np.random.Generator) -> Batch:
+        """A batch of n windows, one for each psi (n, d) in physical units."""
+        ...
+
+
 def refine(
-    posterior: NeuralPosterior, window: Window, again: Simulator, config: SequentialConfig | None = None,
+    posterior: NeuralPosterior, window: Window, again: Again, config: SequentialConfig | None = None,
     training: TrainConfig | None = None, *, network: NetworkConfig = NETWORK, device: str | torch.device = "cpu",
     report: Report = quiet,
 ) -> Rounds:  # fmt: skip
@@ -34,7 +50,7 @@ def refine(
     Args:
       posterior: trained on windows of any motion; the first round is drawn where it has mass.
       window: what was observed.
-      again: (psi (n, d) in physical units, generator) -> windows of the same commands, `simulate.Repeated`.
+      again: simulates windows of the same commands, `simulate.Repeated`.
       config: rounds; one of `SIMULATIONS` by default.
       training: of each round.
       network: what learns.
@@ -54,4 +70,6 @@ def refine(
     within = TruncatedPrior(given, config, rng)
     sizes = replace(posterior.network.sizes, layout=None)
     learner = Network(network, sizes, posterior.prior, config.seed).to(device)
-    return sequential(learner, again, window, config, training, within=within, device=device, report=report)
+    return sequential(
+        learner, again, window, config, training, within=within, device=device, report=report, noise=again.noise
+    )

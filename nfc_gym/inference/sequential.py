@@ -67,7 +67,7 @@ class Rounds:
 def sequential(
     network: Network, simulate: Simulator, window: Window, config: SequentialConfig | None = None,
     training: TrainConfig | None = None, *, begun: TensorWindows | None = None, within: TruncatedPrior | None = None,
-    device: str | torch.device = "cpu", report: Report = quiet, scales: bool = True,
+    device: str | torch.device = "cpu", report: Report = quiet, scales: bool = True, noise: Array | None = None,
 ) -> Rounds:  # fmt: skip
     """Infer psi from one window in rounds of simulations that close in on it.
 
@@ -84,6 +84,8 @@ def sequential(
       device: to train on.
       report: is told of the progress.
       scales: see `train`; a network that was trained before on other windows is to keep its own.
+      noise: (H+1, s) standard deviation of the sensors' noise, which windows are simulated without: each pass over
+        them draws it anew, and little of it is learned by heart. None takes them as they are.
 
     Raises:
       InputError: the simulator returns windows that are not the network's, or another number of them; or a start that
@@ -92,6 +94,7 @@ def sequential(
     config, training = config or SequentialConfig(), training or TrainConfig(epochs=50)
     if within is not None and (begun is not None or config.proposal != TRUNCATED):
         raise InputError("sequential: `within` goes with truncated proposals, and with no windows that were `begun`")
+    made = partial(_simulated, network.prior, simulate, noise)
     rng = np.random.default_rng(config.seed)
     out = Rounds(NeuralPosterior(network))
     believed = _Beliefs(window, config)
@@ -101,13 +104,13 @@ def sequential(
         if r:
             proposal = believed.proposal(network, rng)
             out.kept.append(proposal.kept)
-            new = _simulated(network.prior, simulate, proposal.sample(config.simulations, rng), rng)
+            new = made(proposal.sample(config.simulations, rng), rng)
             if config.anew:
                 _renew(network, mixed(config.seed, r))
         else:
             out.kept.append(1.0 if within is None else within.kept)
             draw = within.sample if within else partial(_prior, network.prior)
-            new = begun or _simulated(network.prior, simulate, draw(config.simulations, rng), rng)
+            new = begun or made(draw(config.simulations, rng), rng)
             believed.first = len(new)
         learned, judged = new.split(config.held_out)
         train_set = learned if train_set is None else train_set.append(learned)
@@ -165,7 +168,9 @@ def _prior(prior: PriorBox, n: int, rng: np.random.Generator) -> Array:
     return prior.psi_of(rng.uniform(size=(n, len(prior))))
 
 
-def _simulated(prior: PriorBox, simulate: Simulator, psi: Array, rng: np.random.Generator) -> TensorWindows:
+def _simulated(
+    prior: PriorBox, simulate: Simulator, noise: Array | None, psi: Array, rng: np.random.Generator
+) -> TensorWindows:
     batch: dict[str, Any] = dict(simulate(psi, rng))
     batch["psi"] = torch.as_tensor(prior.u_of(psi), dtype=torch.float32).clamp(0, 1)
-    return TensorWindows(batch)
+    return TensorWindows(batch, noise=None if noise is None else torch.as_tensor(noise, dtype=torch.float32))

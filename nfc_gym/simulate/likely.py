@@ -22,7 +22,8 @@ from nfc_gym.simulate.machine import Machine
 
 Array = NDArray[np.float64]
 LEAST = 200  # windows that starts are learned from
-_NEAR, _EACH = 0.2, 4  # of all windows, and for each number that a regression is made on: the nearest, whichever is more
+_NEAR = 0.2  # of all windows: those that starts are taken from, the nearest,
+_EACH = 4  # and no fewer for each number that a regression is made on
 _TOUCHES = 0.01  # m above the ground, below which a start touches it
 _YAW = 7  # entry of a runner's `proprio`
 _GOAL = (0, 1, 2)  # entries of a Quadcopter's
@@ -68,11 +69,14 @@ class Likely:
         wanted = np.concatenate([np.broadcast_to(self._at, (len(u), len(self._at))), u], 1)
         own = self._starts[rows] + (wanted - self._seen[rows]) @ self._slope.T
         yaw, place = _heading(self.machine, self.first, len(u), rng)
-        return _placed(self.machine, own, yaw, place, self._above[rows])
+        out = _placed(self.machine, own, yaw, place, self._above[rows])
+        if quat := _quat(self.machine):  # which of the two that say the same is observed has no meaning, but is seen
+            out[:, 3:7] *= np.where(out[:, 3:7] @ self.first[quat] < 0, -1.0, 1.0)[:, None]
+        return out
 
 
 def _slopes(inputs: Array, outputs: Array) -> Array:
-    """(k, m) of a least-squares plane through outputs (n, k) over inputs (n, m); an input that never varies has none."""
+    """(k, m) of a least-squares plane through outputs (n, k) over inputs (n, m); 0 for an input that never varies."""
     middle, spread = inputs.mean(0), inputs.std(0)
     varies = spread > 1e-9
     scaled = (inputs - middle)[:, varies] / spread[varies]

@@ -23,7 +23,7 @@ from nfc_gym.simulate.rounds import Simulator
 class Repeated:
     """Calls with (psi, generator) simulate the window once for each psi.
 
-    The first observation of each is the one that was made; the others have the sensors' noise.
+    The first observation of each is the one that was made; the others come without the sensors' noise.
 
     Attributes:
       simulator: how windows are made; what moves them is replaced.
@@ -65,11 +65,18 @@ class Repeated:
             raise InputError("repeated: the window has entries that are not finite")
         return cls(simulator, states, actions, Likely(machine, windows, states[0]))
 
+    @property
+    def noise(self) -> Array:
+        """(H + 1, s) standard deviation of what the sensors would add."""
+        noise = np.tile(Machine(self.simulator.environment).noise * self.simulator.noise, (len(self.states), 1))
+        noise[0] = 0  # the first observation has been made
+        return noise
+
     def __call__(self, psi: Array, rng: np.random.Generator) -> dict[str, Any]:
         """As of `Simulator.__call__`."""
         space = Machine(self.simulator.environment).space
         u = (np.asarray(psi, float) - space.low) / (space.high - space.low)
         motion = Recorded(self.begun.draw(u, rng), self.states[None], self.actions[None])
-        batch = replace(self.simulator, recorded=motion)(psi, rng)
+        batch = replace(self.simulator, recorded=motion, noise=0.0)(psi, rng)
         batch["states"][:, 0] = batch["states"].new_tensor(self.states[0])
         return batch

@@ -220,3 +220,23 @@ def test_windows_on_disk_train_as_those_in_memory_do() -> None:
     net = network(motion_windows(500), delta_s=True)
     out = train(net, windows, held_out, replace(QUICK, epochs=3))
     assert out.held_out[-1] < out.start
+
+
+def test_noise_is_drawn_anew_in_each_pass_and_is_the_same_for_a_seed() -> None:
+    windows = motion_windows(40)
+    noise = torch.zeros(11, 2)
+    noise[1:, 0] = 0.1
+    noisy = TensorWindows(windows.tensors, noise=noise)
+    clean, one, again, other = (
+        next(w.batches(40, s))["states"] for w, s in ((windows, 3), (noisy, 3), (noisy, 3), (noisy, 4))
+    )
+    assert torch.equal(one, again)
+    added = one - clean
+    assert (added[:, 0] == 0).all()
+    assert (added[:, :, 1] == 0).all()
+    assert 0.08 < added[:, 1:, 0].std() < 0.12
+    order = next(windows.batches(40, 4))["states"]
+    assert not torch.equal(other - order, added)
+    first, last = noisy.split(0.25)
+    assert first.noise is last.noise is first.append(last).noise is noise
+    assert not torch.equal(next(first.batches(5, None))["states"], first.tensors["states"][:5])

@@ -111,7 +111,7 @@ class Signals(nn.Module):
 
     def __init__(self, states: int, actions: int, aligned: int = 0) -> None:
         super().__init__()
-        self.channels, self.aligned = 2 * states + actions, aligned > 0
+        self.channels, self.aligned, self.length = 2 * states + actions, aligned > 0, aligned
         times = {"s": aligned + 1, "ds": aligned, "a": aligned} if aligned else {"s": 1, "ds": 1, "a": 1}
         sizes = {"s": states, "ds": states, "a": actions}
         self.scales = nn.ModuleDict({name: Standard(times[name] * size) for name, size in sizes.items()})
@@ -128,6 +128,11 @@ class Signals(nn.Module):
         steps = nn.functional.pad(self._scaled("ds", states.diff(dim=1)), (0, 0, 1, 0))
         actions = nn.functional.pad(self._scaled("a", actions), (0, 0, 0, 1))
         return torch.cat([self._scaled("s", states), steps, actions], -1).clamp(-10, 10)
+
+    @property
+    def commands(self) -> Tensor:
+        """(H, a) that all windows had, where they are aligned."""
+        return cast(Standard, self.scales["a"]).mean.view(self.length, -1)
 
     def _scaled(self, name: str, x: Tensor) -> Tensor:
         return self.scales[name](x.flatten(1)).view(x.shape) if self.aligned else self.scales[name](x)

@@ -93,8 +93,8 @@ class FKS(KernelFeatures):
 
     radii: Tensor
 
-    def __init__(self, horizon: int, states: int, actions: int) -> None:
-        super().__init__(horizon, states, actions)
+    def __init__(self, horizon: int, states: int, actions: int, aligned: bool = False) -> None:
+        super().__init__(horizon, states, actions, aligned)
         self.register_buffer("radii", torch.as_tensor(chi_quantiles(self.size, _NODES), dtype=torch.float32))
 
     def spread_directions(self) -> Tensor:
