@@ -31,7 +31,9 @@ class SequentialConfig:
     Attributes:
       rounds: at most.
       simulations: a round.
-      quantile: of the posterior's density, below which truncated proposals have nothing.
+      quantile: of the posterior's density, below which truncated proposals have nothing,
+      slack: and by how many nats less they begin: room for what the posterior gets wrong. What it leaves out no later
+        round finds again.
       samples: posterior draws that set the threshold and the bounding box, or the normaliser of a corrected posterior.
       oversampling: candidates for each draw that importance resampling chooses from.
       narrows: nats of entropy that a round must take from the posterior for another to follow.
@@ -45,6 +47,7 @@ class SequentialConfig:
     rounds: int = 5
     simulations: int = 1000
     quantile: float = QUANTILE
+    slack: float = 0.0
     samples: int = 2000
     oversampling: int = 16
     narrows: float = _NARROWS
@@ -56,8 +59,11 @@ class SequentialConfig:
     def __post_init__(self) -> None:
         if self.rounds < 1 or self.simulations < 20 or self.samples < 100 or self.oversampling < 1:
             raise InputError("sequential: want rounds >= 1, simulations >= 20, samples >= 100 and oversampling >= 1")
-        if not 0 < self.quantile < 0.5 or not 0 < self.held_out < 1:
-            raise InputError(f"sequential: quantile in (0, 0.5), held_out in (0, 1): {self.quantile}, {self.held_out}")
+        if not 0 < self.quantile < 0.5 or not 0 < self.held_out < 1 or not 0 <= self.slack < np.inf:
+            raise InputError(
+                "sequential: want quantile in (0, 0.5), held_out in (0, 1) and slack of 0 or more, got "
+                f"{self.quantile}, {self.held_out}, {self.slack}"
+            )
         if self.proposal not in PROPOSALS:
             raise InputError(f"sequential: proposal is one of {', '.join(PROPOSALS)}, got {self.proposal!r}")
 
@@ -83,7 +89,7 @@ class TruncatedPrior:
         self.posterior, self.config = posterior, config
         psi = drawn(posterior, config.samples, rng)
         gain = told(posterior, psi)
-        self.threshold = float(np.quantile(gain, config.quantile))
+        self.threshold = float(np.quantile(gain, config.quantile)) - config.slack
         u = posterior.prior.u_of(psi)
         margin = (u.max(0) - u.min(0)) / config.samples  # a bounding box of draws is a little too small
         self.low, self.high = np.clip(u.min(0) - margin, 0, 1), np.clip(u.max(0) + margin, 0, 1)

@@ -1,0 +1,81 @@
+"""From a posterior in a file to one window's own, as `nfc-gym infer --refine` makes it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from nfc_gym.core import InputError
+
+pytest.importorskip("torch")
+
+from nfc_gym.cli import app
+from nfc_gym.inference import Network, NetworkConfig, NeuralPosterior, PriorBox, Sizes, TrainConfig, Window, load
+from nfc_gym.inference.encoders.place import place_of
+from nfc_gym.simulate import Simulator, refined
+from nfc_gym.simulate.machine import Machine
+
+ENVIRONMENT = "nfc_gym/JackalFlat-v0"
+SMALL = {"encoder": "nn", "width": 16, "features": 8, "hidden": 16, "depth": 1, "density": "mixture", "components": 2}
+
+
+def untrained(environment: str = ENVIRONMENT) -> NeuralPosterior:
+    """A posterior that is the prior yet."""
+    machine = Machine(environment)
+    sizes = Sizes(50, 15, 2, place=place_of(machine.state_names))
+    network = Network(NetworkConfig(**SMALL), sizes, PriorBox.of(machine.space, "jackal"))
+    return NeuralPosterior(network, notes={"environment": environment})
+
+
+def seen() -> Window:
+    """A Jackal that moves."""
+    machine = Machine(ENVIRONMENT)
+    simulator = Simulator(ENVIRONMENT, effects=0.0, jobs=1, names=("states", "actions"))
+    found = simulator(machine.space.nominal[None], np.random.default_rng(0))
+    return Window(found["states"][0].numpy(), found["actions"][0].numpy())
+
+
+def test_a_posterior_is_refined_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refined, "BEGINNINGS", 260)
+    posterior, window = untrained(), seen()
+    once = TrainConfig(epochs=1, batch=128, warmup=2, average=0.5)
+    own = refined.refined(posterior, window, simulations=400, jobs=1, training=once)
+    assert own.notes == posterior.notes | {"refined": 400, "kept": pytest.approx(1, abs=0.05)}
+    u = own.prior.u_of(own.sample(2000, np.random.default_rng(0)).psi)
+    prior = posterior.given(window)
+    before = prior.prior.u_of(prior.sample(2000, np.random.default_rng(0)).psi)
+    assert u.std(0).min() < 0.8 * before.std(0).min()
+
+
+def test_what_cannot_be_refined_is_refused() -> None:
+    window = seen()
+    with pytest.raises(InputError, match="on a plane only"):
+        refined.refined(untrained("nfc_gym/JackalRough-v0"), window)
+    nameless = NeuralPosterior(untrained().network)
+    with pytest.raises(InputError, match="name the environment"):
+        refined.refined(nameless, window)
+    with pytest.raises(InputError, match="a posterior of 'jackal', and nfc_gym/AntFlat-v0"):
+        refined.refined(nameless, window, environment="AntFlat")
+    with pytest.raises(InputError, match="40 steps"):
+        refined.refined(untrained(), Window(np.asarray(window.states)[:41], np.asarray(window.actions)[:40]))
+
+
+def test_the_command_line_refines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, motion, out = tmp_path / "jackal.safetensors", tmp_path / "window.npz", tmp_path / "today.safetensors"
+    untrained().save(file)
+    window, asked = seen(), {}
+    np.savez(motion, states=window.states, actions=window.actions)
+
+    def instead(posterior: NeuralPosterior, window: Window, **how: object) -> NeuralPosterior:
+        asked.update(how)
+        return NeuralPosterior(posterior.network, posterior.given(window).kept, {"refined": how["simulations"]})
+
+    monkeypatch.setattr(refined, "refined", instead)
+    done = CliRunner().invoke(
+        app, ["infer", str(file), str(motion), "--refine", "700", "--out", str(out), "--jobs", "1"]
+    )
+    assert done.exit_code == 0, done.output
+    assert (asked["simulations"], asked["jobs"], asked["seed"]) == (700, 1, 0)
+    assert load(out).notes["refined"] == 700
+    assert CliRunner().invoke(app, ["infer", str(file), str(motion), "--refine", "10"]).exit_code == 2
