@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
@@ -21,6 +22,10 @@ from nfc_gym.inference.space import PriorBox
 Array = NDArray[np.float64]
 TRUNCATED, POSTERIOR = PROPOSALS = ("truncated", "posterior")
 QUANTILE = 5e-4  # of the posterior's density, below which nothing is proposed
+SLACK = 1.0  # nats
+_WIDER = 1.5  # than draws of a posterior, candidates for what lies around them
+_TRIED, _ENOUGH = 100_000, 100  # draws of the prior by which its share inside is told, and how many must be inside
+_LEAST = 1e-4  # probit, of a normal's standard deviations: draws may all be equal
 _NARROWS = 0.05  # nats of posterior entropy that a round must win, or the rounds end
 
 
@@ -31,9 +36,7 @@ class SequentialConfig:
     Attributes:
       rounds: at most.
       simulations: a round.
-      quantile: of the posterior's density, below which truncated proposals have nothing,
-      slack: and by how many nats less they begin: room for what the posterior gets wrong. What it leaves out no later
-        round finds again.
+      quantile: of the posterior's density, below which truncated proposals have nothing.
       samples: posterior draws that set the threshold and the bounding box, or the normaliser of a corrected posterior.
       oversampling: candidates for each draw that importance resampling chooses from.
       narrows: nats of entropy that a round must take from the posterior for another to follow.
@@ -47,7 +50,6 @@ class SequentialConfig:
     rounds: int = 5
     simulations: int = 1000
     quantile: float = QUANTILE
-    slack: float = 0.0
     samples: int = 2000
     oversampling: int = 16
     narrows: float = _NARROWS
@@ -59,11 +61,8 @@ class SequentialConfig:
     def __post_init__(self) -> None:
         if self.rounds < 1 or self.simulations < 20 or self.samples < 100 or self.oversampling < 1:
             raise InputError("sequential: want rounds >= 1, simulations >= 20, samples >= 100 and oversampling >= 1")
-        if not 0 < self.quantile < 0.5 or not 0 < self.held_out < 1 or not 0 <= self.slack < np.inf:
-            raise InputError(
-                "sequential: want quantile in (0, 0.5), held_out in (0, 1) and slack of 0 or more, got "
-                f"{self.quantile}, {self.held_out}, {self.slack}"
-            )
+        if not 0 < self.quantile < 0.5 or not 0 < self.held_out < 1:
+            raise InputError(f"sequential: quantile in (0, 0.5), held_out in (0, 1): {self.quantile}, {self.held_out}")
         if self.proposal not in PROPOSALS:
             raise InputError(f"sequential: proposal is one of {', '.join(PROPOSALS)}, got {self.proposal!r}")
 
@@ -89,7 +88,7 @@ class TruncatedPrior:
         self.posterior, self.config = posterior, config
         psi = drawn(posterior, config.samples, rng)
         gain = told(posterior, psi)
-        self.threshold = float(np.quantile(gain, config.quantile)) - config.slack
+        self.threshold = float(np.quantile(gain, config.quantile))
         u = posterior.prior.u_of(psi)
         margin = (u.max(0) - u.min(0)) / config.samples  # a bounding box of draws is a little too small
         self.low, self.high = np.clip(u.min(0) - margin, 0, 1), np.clip(u.max(0) + margin, 0, 1)
@@ -120,6 +119,59 @@ class TruncatedPrior:
         psi = drawn(self.posterior, n * self.config.oversampling, rng)
         gain = told(self.posterior, psi)
         return psi[chosen(np.where(gain > self.threshold, -gain, -np.inf), n, rng)]
+
+
+class Around:
+    """The uniform prior where a normal through a posterior's draws, in probit coordinates, exceeds its own quantile.
+
+    As `TruncatedPrior`, but of draws alone: densities of a score model take a processor a tenth of a second each, and
+    tens of thousands of them would be asked for. Any region that holds the posterior's mass will do to propose from.
+    The threshold is lowered by `SLACK`: where a posterior is a little too sure, or a little beside the truth, what it
+    leaves out no later round would find.
+
+    Args:
+      posterior: given a window.
+      config: `samples` draws make the normal, whose `quantile` is asked for; `oversampling` candidates are drawn for
+        each proposal that cannot be had by rejection from the prior.
+      rng: of these draws.
+
+    Attributes:
+      threshold: log density over the prior's that a proposal exceeds.
+      kept: share of the prior's volume above it.
+    """
+
+    def __init__(self, posterior: "Believed", config: SequentialConfig, rng: np.random.Generator) -> None:
+        self.prior, self.oversampling = posterior.prior, config.oversampling
+        z = self.prior.to_z(drawn(posterior, config.samples, rng))
+        self.middle = z.mean(0)
+        self.root = np.linalg.cholesky(np.atleast_2d(np.cov(z.T)) + _LEAST**2 * np.eye(z.shape[1]))
+        self.threshold = float(np.quantile(self.gain(z), config.quantile)) - SLACK
+        inside = float((self.gain(rng.standard_normal((_TRIED, len(self.middle)))) > self.threshold).mean())
+        self.rejects = inside * _TRIED >= _ENOUGH
+        self.kept = inside if self.rejects else float(np.exp(self._candidates(_TRIED, rng)[1]).mean())
+
+    def gain(self, z: Array) -> Array:
+        """(n,) log density of the normal over the prior's at z (n, size)."""
+        white = solve_triangular(self.root, (z - self.middle).T, lower=True)
+        return 0.5 * (z * z).sum(1) - 0.5 * (white * white).sum(0) - np.log(self.root.diagonal()).sum()
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """(n, d) psi, physical units."""
+        if not self.rejects:
+            z, log_weight = self._candidates(n * self.oversampling, rng)
+            return self.prior.from_z(z[chosen(log_weight, n, rng)])
+        found: list[Array] = []
+        while (missing := n - sum(map(len, found))) > 0:
+            z = rng.standard_normal((min(_TRIED, 1 + int(1.2 * missing / self.kept)), len(self.middle)))
+            found.append(z[self.gain(z) > self.threshold])
+        return self.prior.from_z(np.concatenate(found)[:n])
+
+    def _candidates(self, n: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """(n, size) from a wider normal, and (n,) the log weights that make them the prior above the threshold."""
+        white = rng.standard_normal((n, len(self.middle)))
+        z = self.middle + _WIDER * white @ self.root.T
+        density = -0.5 * (white * white).sum(1) - np.log(_WIDER * self.root.diagonal()).sum()
+        return z, np.where(self.gain(z) > self.threshold, -0.5 * (z * z).sum(1) - density, -np.inf)
 
 
 class Corrected:

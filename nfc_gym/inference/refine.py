@@ -19,7 +19,7 @@ from nfc_gym.inference.data import Batch
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
-from nfc_gym.inference.proposals import SequentialConfig, TruncatedPrior
+from nfc_gym.inference.proposals import Around, SequentialConfig
 from nfc_gym.inference.sequential import Rounds, sequential
 from nfc_gym.inference.train import TrainConfig
 
@@ -67,7 +67,7 @@ def refine(
         raise InputError("refine: it is psi that is learned anew, from states and actions alone, without maps")
     config = config or SequentialConfig(1, SIMULATIONS)
     given, rng = posterior.of("psi").given(window), np.random.default_rng([config.seed, 1])
-    within = TruncatedPrior(given, config, rng)
+    within = Around(given, config, rng)
     sizes = replace(posterior.network.sizes, layout=None)
     learner = Network(network, sizes, posterior.prior, config.seed).to(device)
     return sequential(

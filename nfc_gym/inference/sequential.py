@@ -27,6 +27,7 @@ from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.proposals import (
     TRUNCATED,
+    Around,
     Believed,
     Corrected,
     Proposed,
@@ -66,7 +67,7 @@ class Rounds:
 
 def sequential(
     network: Network, simulate: Simulator, window: Window, config: SequentialConfig | None = None,
-    training: TrainConfig | None = None, *, begun: TensorWindows | None = None, within: TruncatedPrior | None = None,
+    training: TrainConfig | None = None, *, begun: TensorWindows | None = None, within: Around | None = None,
     device: str | torch.device = "cpu", report: Report = quiet, scales: bool = True, noise: Array | None = None,
 ) -> Rounds:  # fmt: skip
     """Infer psi from one window in rounds of simulations that close in on it.

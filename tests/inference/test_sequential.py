@@ -10,7 +10,7 @@ from scipy.stats import kstest, norm
 
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.inference.posterior import NeuralPosterior, Window
-from nfc_gym.inference.proposals import Corrected, Proposed, SequentialConfig, TruncatedPrior, told
+from nfc_gym.inference.proposals import SLACK, Around, Corrected, Proposed, SequentialConfig, TruncatedPrior, told
 from nfc_gym.inference.sequential import sequential
 from nfc_gym.inference.train import TrainConfig, train
 
@@ -212,3 +212,44 @@ def test_bad_settings_are_refused() -> None:
         SequentialConfig(quantile=0.0)
     with pytest.raises(InputError, match="truncated, posterior, got 'prior'"):
         SequentialConfig(proposal="prior")
+
+
+def test_around_draws_the_prior_holds_the_posterior_and_is_the_prior_there() -> None:
+    posterior, rng = given(), np.random.default_rng(0)
+    around = Around(posterior, SequentialConfig(samples=1000), rng)
+    psi = around.sample(3000, np.random.default_rng(1))
+    brute = box(3).psi_of(np.random.default_rng(2).uniform(size=(200_000, 3)))
+    inside = brute[around.gain(box(3).to_z(brute)) > around.threshold]
+    assert around.rejects
+    assert around.kept == pytest.approx(len(inside) / 200_000, rel=0.05)
+    assert around.kept < 0.7
+    u, v = box(3).u_of(psi), box(3).u_of(inside)
+    np.testing.assert_allclose(u.mean(0), v.mean(0), atol=0.02)
+    np.testing.assert_allclose(u.std(0), v.std(0), atol=0.02)
+    truths = gaussian(X[0]).sample((4000,)).double().numpy()
+    assert (around.gain(truths) > around.threshold).mean() > 0.999
+    # the posterior is normal: where densities put the edge, `SLACK` aside
+    often = SequentialConfig(samples=2000, quantile=0.05)  # the farthest draw of all differs from time to time
+    exact, normal = (way(posterior, often, np.random.default_rng(0)) for way in (TruncatedPrior, Around))
+    assert normal.threshold == pytest.approx(exact.threshold - SLACK, abs=0.2)
+
+
+def test_a_region_too_small_to_be_met_by_chance_is_filled_all_the_same() -> None:
+    middle, sd = np.array([1.0, -0.5, 0.2]), 1e-3
+
+    class Narrow:
+        prior = box(3)
+
+        def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+            return Fidelity(box(3).from_z(middle + sd * rng.standard_normal((n, 3))))
+
+    around = Around(Narrow(), SequentialConfig(samples=4000), np.random.default_rng(0))
+    assert not around.rejects
+    # the density over the prior's at a distance of r standard deviations is that of a ball's edge
+    highest = around.gain(middle[None])[0]
+    radius = sd * np.sqrt(2 * (highest - around.threshold))
+    assert around.kept == pytest.approx(4 / 3 * np.pi * radius**3 * np.prod(norm.pdf(middle)), rel=0.15)
+    z = box(3).to_z(around.sample(3000, np.random.default_rng(1)))
+    away = np.linalg.norm(z - middle, axis=1) / radius
+    assert away.max() < 1.1
+    assert kstest(away**3, "uniform").statistic < 0.06  # in the ball, where the prior is flat
