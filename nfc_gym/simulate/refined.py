@@ -31,7 +31,7 @@ def refined(
       simulations: windows of the same commands, `BEGINNINGS` aside.
       seed: of simulations and training.
       jobs: processes of the simulation; 0 takes all cores.
-      training: see `TrainConfig`; 60 epochs at most by default.
+      training: see `TrainConfig`; by default it ends after ten epochs without a better one.
       device: to train on.
       report: is told of the progress.
 
@@ -60,10 +60,8 @@ def refined(
     known = replace(simulator, names=("states", "start")).draw(BEGINNINGS, rng)
     again = Repeated.of(simulator, states, actions, {k: t.numpy() for k, t in known.items()})
     report.message(f"simulates {simulations} windows of these commands")
-    rounds = SequentialConfig(1, simulations, samples=500, seed=seed)
-    done = refine(
-        posterior, window, again, rounds, training or TrainConfig(epochs=60, seed=seed), device=device, report=report
-    )
+    rounds, training = SequentialConfig(1, simulations, seed=seed), training or TrainConfig(patience=10, seed=seed)
+    done = refine(posterior, window, again, rounds, training, device=device, report=report)
     learned = done.posterior
     assert isinstance(learned, NeuralPosterior)  # only draws of the posterior itself want a correction
     notes = posterior.notes | {"refined": simulations, "kept": done.kept[-1]}
