@@ -260,13 +260,13 @@ class Search:
         return arena
 
     def _plainer(self, arena: Arena, rounds: list[Round]) -> Arena:
-        """The arena with two laws in place of one whose values differ by place, if fewer numbers do as well.
+        """The arena with plain laws in place of one whose values differ by place, if fewer numbers do as well.
 
         Asked of what is confirmed alone: it says in other words what was found, and nothing new competes beside it.
         """
         while (found := sparser(arena, self.named, self.options.worth)) is not None:
             law, plainer = found
-            self.say(f"two laws in place of {law.id}: fewer numbers do as well")
+            self.say(f"plain laws in place of {law.id}: fewer numbers do as well")
             rounds.append(self._exchanged(arena.current, plainer.fitted, "with fewer numbers"))
             arena = self._confirmed(self.settle(plainer.fitted.plant, plainer.fitted.x), rounds)
         return arena

@@ -43,7 +43,7 @@ class Likely:
 
     def __init__(self, machine: Machine, windows: Batch, first: Array) -> None:
         if machine.rough:
-            raise InputError(f"{machine.environment}: where a window begins is told on a plane only; give `starts`")
+            raise InputError(f"{machine.environment}: where a window may have begun is told on a plane only")
         seen = np.concatenate([np.asarray(first, float)[None], np.asarray(windows["states"], float)[:, 0]])
         n, size = len(seen) - 1, machine.kind.proprio_size
         if n < LEAST or np.shape(first) != (size,) or not np.isfinite(seen).all():

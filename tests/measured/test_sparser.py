@@ -1,4 +1,4 @@
-"""One law for all places and one for the odd one out, instead of a law with values of its own at each."""
+"""Plain laws, at some places or at all and the odd one out, instead of a law with values of its own at each."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -41,6 +41,16 @@ def test_two_laws_stand_for_many_values_where_they_are_worth_more(total: float) 
 def test_two_places_need_two_numbers_anyway_and_what_may_not_be_named_is_not_tried() -> None:
     assert asked("ab", [1.0, 1.1], 200.0, ["a", "b", "a+b"]) == (None, [])
     assert asked("abc", [1.0, 1.1, 1.0], 200.0, ["a", "c", "a+b+c"]) == (None, [])
+
+
+def test_a_law_at_some_places_is_tried_first_and_is_the_one_that_comes_nearest() -> None:
+    pool = ["a", "b", "c", "d", "a+b", "c+d", "a+b+c+d", "c+d+e"]
+    found, tried = asked("abcd", [1.0, 1.002, 1.1, 1.098], 101.0, pool)
+    assert tried == [(["gain:c+d"], [pytest.approx(1.099)])]
+    assert found is not None
+    assert found[1].total == 101
+    _, tried = asked("abcd", [1.0, 1.002, 1.1, 1.098], 99.0, pool)
+    assert [ids for ids, _ in tried] == [["gain:c+d"], ["gain:a+b+c+d", "gain:a"]]
 
 
 def test_the_odd_one_out_leaves_the_others_alike() -> None:
