@@ -1,6 +1,7 @@
 """One window of a cart whose dynamics are linear in its state: what its own commands teach."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 from nfc_gym.inference.proposals import SequentialConfig
 from nfc_gym.inference.refine import refine
+from nfc_gym.inference.sequential import Rounds
 from nfc_gym.inference.train import TrainConfig, train
 
 PRIOR = box(2, "cart")
@@ -82,9 +84,15 @@ TRAINING = TrainConfig(epochs=30, batch=64, rate=2e-3, warmup=10, average=0.95)
 HOW = SequentialConfig(1, 3000, samples=300, oversampling=4)
 
 
-def test_a_windows_own_commands_teach_what_it_tells() -> None:
+@pytest.fixture(scope="module")
+def learned() -> tuple[NeuralPosterior, Window, Rounds]:
+    """A posterior of any motion, a window, and what its own commands taught."""
     posterior, window = coarse(), seen([0.4, 0.55])
-    out = refine(posterior, window, Own(window), HOW, TRAINING, network=NETWORK)
+    return posterior, window, refine(posterior, window, Own(window), HOW, TRAINING, network=NETWORK)
+
+
+def test_a_windows_own_commands_teach_what_it_tells(learned: tuple[NeuralPosterior, Window, Rounds]) -> None:
+    posterior, window, out = learned
     mean, sd = exact(window)
     u = PRIOR.u_of(out.posterior.sample(4000, np.random.default_rng(0)).psi)
     before = PRIOR.u_of(posterior.given(window).sample(4000, np.random.default_rng(0)).psi)
@@ -95,13 +103,11 @@ def test_a_windows_own_commands_teach_what_it_tells() -> None:
     assert len(out.windows) == 3000
 
 
-def test_what_is_learned_is_right_on_the_average() -> None:
+def test_what_is_learned_is_right_on_the_average(learned: tuple[NeuralPosterior, Window, Rounds]) -> None:
     """Ranks of truths drawn from the prior, among draws of one posterior each, all of the same commands."""
-    posterior, ranks = coarse(), []
-    rng = np.random.default_rng(1)
-    out = refine(posterior, seen([0.5, 0.5]), Own(seen([0.5, 0.5])), HOW, TRAINING, network=NETWORK)
-    own = Own(seen([0.5, 0.5]))
+    _, window, out = learned
     assert out.kept[0] > 0.9  # so that the network has learned of nearly all that the prior allows
+    own, rng, ranks = Own(window), np.random.default_rng(1), []
     truths = rng.uniform(size=(80, 2))
     states = own(PRIOR.psi_of(truths), rng)["states"]
     states[:, 1:] += SENSED * torch.randn(80, 10, 2, generator=torch.Generator().manual_seed(2))
@@ -113,9 +119,8 @@ def test_what_is_learned_is_right_on_the_average() -> None:
         assert kstest(np.array(ranks)[:, i], "uniform").pvalue > 1e-3
 
 
-def test_it_is_this_windows_alone(tmp_path) -> None:
-    posterior, window = coarse(), seen([0.4, 0.55])
-    out = refine(posterior, window, Own(window), HOW, replace(TRAINING, epochs=1), network=NETWORK)
+def test_it_is_this_windows_alone(learned: tuple[NeuralPosterior, Window, Rounds], tmp_path: Path) -> None:
+    _, window, out = learned
     file = tmp_path / "own.safetensors"
     out.posterior.save(file)
     opened = load(file)
