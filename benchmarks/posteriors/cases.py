@@ -130,8 +130,8 @@ def rounds(
             low, high = metrics.intervals(draws, 0.9)
             u = prior.u_of(psi)
             out |= {"held": float(((low <= u) & (u <= high)).mean()), "width": float((high - low).mean())}
-            one = {k: t.numpy() for k, t in seen.items()} | {"psi": u}
-            most = ceiling(env, one, before=starts.spread(Machine(env), {"start": known["start"].numpy()}))
+            asked = {k: t.numpy() for k, t in seen.items()} | {"psi": u}
+            most = ceiling(env, asked, before=starts.spread(Machine(env), {"start": known["start"].numpy()}))
             out["ceiling"] = float(most.joint[0]) / prior.size
         else:
             two = sequential(deepcopy(first), simulate, window, how, training, begun=begun, device=device, scales=False)

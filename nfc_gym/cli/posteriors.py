@@ -203,7 +203,7 @@ def infer(
     made of their channels, for robots that feel no forces: Jackal, Quadcopter, Quadruped.
 
     A posterior of any window reads each a little coarsely. --refine N simulates N windows of this window's own commands
-    and learns from these alone, on a plane; 10000 are a good number.
+    and learns from these alone, on a plane, of psi alone.
 
     Either kind of --out goes into RandomizePsi, into `nfc-gym simulate --proposal` and into `nfc-gym close-loop
     --posterior`.

@@ -34,9 +34,13 @@ def sparser(arena: Arena, pool: Sequence[Effect], worth: float) -> tuple[Each, J
         if not isinstance(effect, Each) or len(effect.members) < _PLACES:
             continue
         without = arena.without(effect)
+        own: float | None = None  # what the law itself is worth, judged once a plainer one is believed
         for laws, start in _plainer(effect, theta.reshape(len(effect.members), -1), known):
             rival = without.enter_at(laws, start)
-            if without.believed(rival, worth) and rival.total > without.judge(arena.current).total:
+            if not without.believed(rival, worth):
+                continue
+            own = without.judge(arena.current).total if own is None else own
+            if rival.total > own:
                 return effect, rival
     return None
 
