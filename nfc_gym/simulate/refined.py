@@ -50,8 +50,9 @@ def refined(
         raise InputError(f"refined: a posterior of {posterior.prior.robot!r}, and {machine.environment}")
     if machine.rough:
         raise InputError(f"{machine.environment}: one window's commands are repeated on a plane only")
-    states, actions = np.asarray(window.states, float), np.asarray(window.actions, float)
     posterior.given(window)  # or it is refused before anything is simulated
+    states, actions = np.asarray(window.states, float), np.clip(np.asarray(window.actions, float), -1, 1)
+    window = Window(states, actions)  # as the machine took its commands
     measured, assumed = posterior.notes.get("noise"), machine.noise
     noise = float(np.max(measured) / np.max(assumed)) if measured else 1.0
     simulator = Simulator(environment, effects=0.0, jobs=jobs, noise=noise, names=("states", "actions"))

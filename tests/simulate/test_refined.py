@@ -39,6 +39,7 @@ def seen() -> Window:
 def test_a_posterior_is_refined_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refined, "BEGINNINGS", 260)
     posterior, window = untrained(), seen()
+    window.actions[3, 0] = 1.2  # of which the machine makes 1
     once = TrainConfig(epochs=1, batch=128, warmup=2, average=0.5)
     own = refined.refined(posterior, window, simulations=400, jobs=1, training=once)
     assert own.notes == posterior.notes | {"refined": 400, "kept": pytest.approx(1, abs=0.05)}
