@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import safetensors.torch
 import torch
+from numpy.typing import NDArray
 
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.inference import checkpoint
@@ -17,10 +18,10 @@ from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
-from nfc_gym.inference.proposals import Believed, SequentialConfig
+from nfc_gym.inference.proposals import Around, Believed, SequentialConfig
 from nfc_gym.inference.random import mixed
 from nfc_gym.inference.refine import refine
-from nfc_gym.inference.sequential import sequential
+from nfc_gym.inference.sequential import Rounds, sequential
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
 from nfc_gym.simulate import Simulator, starts
@@ -36,10 +37,10 @@ HELD_OUT = 0.1  # of each round's windows
 SAMPLES = 2000  # of a posterior, for its intervals
 GROUND = ("terrain_kind", "terrain_seed", "terrain_difficulty")
 # How a second round trains: see `SequentialConfig`; with its own commands, see `refine`.
-OWN = "own"
+OWN, TWICE = "own", "own twice"  # in one round, or in two of half the size, the second where the first has mass
 WAYS = {
     "on": {}, "anew": {"anew": True}, "posterior": {"proposal": "posterior"},
-    "anew posterior": {"anew": True, "proposal": "posterior"}, OWN: {},
+    "anew posterior": {"anew": True, "proposal": "posterior"}, OWN: {}, TWICE: {"anew": True},
 }  # fmt: skip
 AXLE = "front_left_wheel_damping"  # the gain kv of its servo: 0 is a lost axle
 
@@ -121,22 +122,29 @@ def rounds(
     out: dict[str, Any] = {"one": alone, "first": once}
     for way in ways:
         how = SequentialConfig(2, size, narrows=-np.inf, held_out=HELD_OUT, seed=mixed(truth, 2), **WAYS[way])
-        if way == OWN:
+        if way in (OWN, TWICE):
             again = Repeated.of(simulate, window.states, window.actions, {k: t.numpy() for k, t in known.items()})
-            two = refine(
-                NeuralPosterior(deepcopy(first)), window, again, replace(how, rounds=1), training, device=device
-            )
-            draws = prior.u_of(two.posterior.sample(SAMPLES, rng).psi)[None]
-            low, high = metrics.intervals(draws, 0.9)
-            u = prior.u_of(psi)
-            out |= {"held": float(((low <= u) & (u <= high)).mean()), "width": float((high - low).mean())}
-            asked = {k: t.numpy() for k, t in seen.items()} | {"psi": u}
-            most = ceiling(env, asked, before=starts.spread(Machine(env), {"start": known["start"].numpy()}))
-            out["ceiling"] = float(most.joint[0]) / prior.size
+            how = replace(how, rounds=1) if way == OWN else replace(how, simulations=size // 2)
+            begin = NeuralPosterior(deepcopy(first))
+            two = refine(begin, window, again, how, training, device=device)
+            region = Around(begin.given(window), how, np.random.default_rng([how.seed, 1]))  # as `refine` makes it
+            out["inside"] = float(region.gain(prior.to_z(psi))[0] > region.threshold)
+            out |= {f"{k} ({way})": v for k, v in _held(two, prior, psi, rng).items()}
         else:
             two = sequential(deepcopy(first), simulate, window, how, training, begun=begun, device=device, scales=False)
-        out |= {way: gain(two.posterior), "kept": two.kept[-1]}
+        out |= {way: gain(two.posterior), f"kept ({way})": two.kept[-1]}
+    if OWN in ways or TWICE in ways:
+        asked = {k: t.numpy() for k, t in seen.items()} | {"psi": prior.u_of(psi)}
+        most = ceiling(env, asked, before=starts.spread(Machine(env), {"start": known["start"].numpy()}))
+        out["ceiling"] = float(most.joint[0]) / prior.size
     return out
+
+
+def _held(two: Rounds, prior: PriorBox, psi: NDArray[np.float64], rng: np.random.Generator) -> dict[str, float]:
+    """Share of the true parameters that the 90 % intervals hold, and their mean width."""
+    low, high = metrics.intervals(prior.u_of(two.posterior.sample(SAMPLES, rng).psi)[None], 0.9)
+    u = prior.u_of(psi)
+    return {"held": float(((low <= u) & (u <= high)).mean()), "width": float((high - low).mean())}
 
 
 def summed(found: list[dict[str, Any]]) -> dict[str, Any]:
@@ -150,11 +158,10 @@ def summed(found: list[dict[str, Any]]) -> dict[str, Any]:
     for way in (w for w in WAYS if w in found[0]):
         two = np.array([f[way] for f in found])
         out |= {f"two rounds, trained {way}": metrics.mean(two), f"... less one ({way})": metrics.mean(two - one)}
-    own = {
-        "held": "90 % interval holds the truth", "width": "its width over the prior's",
-        "ceiling": "what these windows tell at most, gain a parameter",
-    }  # fmt: skip
-    for name, said in own.items():
-        if name in found[0]:
-            out[said] = metrics.mean(np.array([f[name] for f in found]))
+        for name, said in {"held": "90 % interval holds the truth", "width": "its width over the prior's"}.items():
+            if (key := f"{name} ({way})") in found[0]:
+                out[f"... {said} ({way})"] = metrics.mean(np.array([f[key] for f in found]))
+    if "ceiling" in found[0]:
+        out["what these windows tell at most, gain a parameter"] = metrics.mean(np.array([f["ceiling"] for f in found]))
+        out["the second round's region holds the truth"] = metrics.mean(np.array([f["inside"] for f in found]))
     return out
