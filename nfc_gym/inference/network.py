@@ -16,6 +16,7 @@ from nfc_gym.inference.encoders.base import TINY, Standard, Tamed
 from nfc_gym.inference.encoders.place import Place
 from nfc_gym.inference.heads.density import Chain, Density
 from nfc_gym.inference.heads.flow import Flow
+from nfc_gym.inference.heads.members import Members
 from nfc_gym.inference.heads.mixture import Mixture
 from nfc_gym.inference.heads.score import Score
 from nfc_gym.inference.heads.structure import Structure
@@ -69,7 +70,7 @@ class Network(Learner):
             plan = Regressions.of(sizes.layout, sizes.states, sizes.actions) if config.summaries else None
             self.encoder = Joined(
                 config.encoder, sizes.horizon, sizes.states, sizes.actions, width=config.width, aligned=config.aligned,
-                summaries=config.summaries, regressions=plan, elevation=config.elevation,
+                summaries=config.summaries, regressions=plan, elevation=config.elevation, members=config.members,
             )  # fmt: skip
             width = config.features or self.encoder.features
             self.project = nn.Linear(self.encoder.features, width) if config.features else nn.Identity()
@@ -89,8 +90,12 @@ class Network(Learner):
         if c.density == "score":
             return Score(widths, features, c.hidden, c.depth, c.dropout, c.draws)
         if c.density == "mixture":
-            return Chain(widths, features, partial(Mixture, hidden=c.hidden, components=c.components))
-        return Chain(widths, features, partial(Flow, hidden=c.hidden, transforms=c.depth))
+            link = partial(Mixture, hidden=c.hidden, components=c.components)
+        else:
+            link = partial(Flow, hidden=c.hidden, transforms=c.depth)
+        if c.members == 1:
+            return Chain(widths, features, link)
+        return Members(widths, features, c.members, lambda sizes, width: Chain(sizes, width, link))
 
     @torch.no_grad()
     def fit_scales(self, batch: Batch) -> None:

@@ -68,7 +68,8 @@ class Passes:
 
     What comes a second time on a GPU, with the same shapes and number of draws, is captured and replayed from then on;
     there `tensor_cores` multiply, the first time too, so that all turns draw alike.
-    Densities other than the score model, whose sampling asks the processor what to do next, run as they are.
+    Densities other than the score model, whose sampling asks the processor what to do next, and encoders that wait for
+    the GPU run as they are.
 
     Args:
       network: its weights may change in place; once it is moved, make another.
@@ -86,6 +87,9 @@ class Passes:
         def run(*x: Tensor) -> tuple[Tensor, ...]:
             return tuple(t for t in self.network.encode(*x) if t is not None)
 
+        if given[0].is_cuda and self.network.encoder.waits:
+            with tensor_cores():
+                return Encoded(*run(*given))
         return Encoded(*self._replayed(("encode", len(given)), run, *given))
 
     def sample(self, n: int, given: Encoded, blocks: int, **how: Any) -> Tensor:

@@ -8,8 +8,7 @@ import torch
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
-from nfc_gym.inference.proposals import SequentialConfig
-from nfc_gym.inference.refine import SIMULATIONS, refine
+from nfc_gym.inference.refine import SIMULATIONS, halved, refine
 from nfc_gym.inference.train import TrainConfig
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.repeated import Repeated
@@ -28,7 +27,7 @@ def refined(
       posterior: trained on windows of any motion of that robot.
       window: what was observed.
       environment: id; by default the one whose windows the posterior was trained on.
-      simulations: windows of the same commands, `BEGINNINGS` aside.
+      simulations: windows of the same commands in two rounds, `BEGINNINGS` aside.
       seed: of simulations and training.
       jobs: processes of the simulation; 0 takes all cores.
       training: see `TrainConfig`; by default it ends after ten epochs without a better one.
@@ -60,9 +59,9 @@ def refined(
     report.message(f"simulates {BEGINNINGS} windows of any motion: where this one may have begun")
     known = replace(simulator, names=("states", "start")).draw(BEGINNINGS, rng)
     again = Repeated.of(simulator, states, actions, {k: t.numpy() for k, t in known.items()})
-    report.message(f"simulates {simulations} windows of these commands")
-    rounds, training = SequentialConfig(1, simulations, seed=seed), training or TrainConfig(patience=10, seed=seed)
-    done = refine(posterior, window, again, rounds, training, device=device, report=report)
+    report.message(f"simulates {simulations} windows of these commands, in two rounds")
+    training = training or TrainConfig(patience=10, seed=seed)
+    done = refine(posterior, window, again, halved(simulations, seed), training, device=device, report=report)
     learned = done.posterior
     assert isinstance(learned, NeuralPosterior)  # only draws of the posterior itself want a correction
     notes = posterior.notes | {"refined": simulations, "kept": done.kept[-1]}

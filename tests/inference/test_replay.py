@@ -5,8 +5,9 @@ from contextlib import nullcontext, suppress
 import numpy as np
 import pytest
 import torch
-from problems import motion_windows, network
+from problems import SMALL, box, motion_windows, network
 
+from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.random import seeded
@@ -59,6 +60,20 @@ def test_every_turn_draws_what_the_network_draws(device: str, config: dict[str, 
         # TF32 has ten bits behind the point, and a GPU may choose other kernels for a product the next time.
         rtol = 1e-4 if device == "cpu" else 1e-3
         np.testing.assert_allclose(got, direct(kept.network, window, 7, seed), rtol=rtol)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("joints", [3, 20])
+def test_robots_of_many_joints_have_turns_too(device: str, joints: int) -> None:
+    """Regressions on more than sixteen actions are solved by a library that no graph can hold."""
+    sizes, box_ = Sizes(10, joints, joints), box(2)
+    ours = NeuralPosterior(Network(NetworkConfig(**SMALL, summaries=True), sizes, box_)).to(device)
+    assert ours.network.encoder.waits == (joints == 20)
+    rng = np.random.default_rng(0)
+    for seed in range(3):
+        window = Window(rng.standard_normal((11, joints)), rng.standard_normal((10, joints)))
+        got = ours.given(window).sample(5, np.random.default_rng(seed)).psi
+        np.testing.assert_allclose(got, direct(ours.network, window, 5, seed), rtol=1e-3)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -16,9 +16,11 @@ class Encoder(nn.Module):
 
     Attributes:
       features: how many.
+      waits: whether it waits for a GPU on its way, so that no CUDA graph can hold it.
     """
 
     features: int
+    waits: bool = False
 
     def fit(self, states: Tensor, actions: Tensor, elevation: Tensor | None) -> None:
         """Take scales from windows of the training set."""

@@ -11,6 +11,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.inference.encoders.base import Encoder, Standard
 
 _CHUNK = 1024
+_MOST = 16  # unknowns: batches of larger systems torch hands to MAGMA, which waits for the GPU
 RIDGE = 1e-3  # of the regressors' mean square: what the window does not excite gets a coefficient near 0
 
 
@@ -77,6 +78,7 @@ class Summaries(Encoder):
         self.outputs = Standard(states)
         per = len(self.plan.states[0]) + len(self.plan.actions[0]) + 2
         self.features = per * len(self.plan.target) + 2 * (states + actions)
+        self.waits = per - 1 > _MOST  # the spread is no unknown
         self.scale = Standard(self.features)
         for name in ("target", "states", "actions"):  # on the device: lists would be sent there with every batch
             index = torch.tensor(getattr(self.plan, name), dtype=torch.long)
