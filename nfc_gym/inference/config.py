@@ -32,8 +32,6 @@ class NetworkConfig:
       dropout: in the score model's blocks.
       draws: noise draws a window and step, of the score model.
       components: of the mixture.
-      members: encoders and densities that learn side by side and whose mean the density is, where that is a flow or a
-        mixture on the motion alone (`Members`).
     """
 
     encoder: str = "tcn"
@@ -52,7 +50,6 @@ class NetworkConfig:
     dropout: float = 0.0
     draws: int = 4
     components: int = 8
-    members: int = 1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "families", tuple(self.families))
@@ -65,15 +62,9 @@ class NetworkConfig:
             )
         if len(self.families) == 1:
             raise InputError(f"structure head: two families or more, the first 'none', got {self.families}")
-        for name in ("hidden", "depth", "draws", "components", "members"):
+        for name in ("hidden", "depth", "draws", "components"):
             if getattr(self, name) < 1:
                 raise InputError(f"network: {name} must be 1 or more, got {getattr(self, name)}")
-        alone = not (self.summaries or self.elevation or self.features or self.families) and self.encoder != "none"
-        if self.members > 1 and not (alone and self.density != "score"):
-            raise InputError(
-                f"network: {self.members} members are flows or mixtures on the motion alone, each with features of its "
-                "own: want density='flow' or 'mixture', features=0, no summaries, elevation or families"
-            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values that JSON holds."""

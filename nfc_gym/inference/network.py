@@ -16,7 +16,6 @@ from nfc_gym.inference.encoders.base import TINY, Standard, Tamed
 from nfc_gym.inference.encoders.place import Place
 from nfc_gym.inference.heads.density import Chain, Density
 from nfc_gym.inference.heads.flow import Flow
-from nfc_gym.inference.heads.members import Members
 from nfc_gym.inference.heads.mixture import Mixture
 from nfc_gym.inference.heads.score import Score
 from nfc_gym.inference.heads.structure import Structure
@@ -70,7 +69,7 @@ class Network(Learner):
             plan = Regressions.of(sizes.layout, sizes.states, sizes.actions) if config.summaries else None
             self.encoder = Joined(
                 config.encoder, sizes.horizon, sizes.states, sizes.actions, width=config.width, aligned=config.aligned,
-                summaries=config.summaries, regressions=plan, elevation=config.elevation, members=config.members,
+                summaries=config.summaries, regressions=plan, elevation=config.elevation,
             )  # fmt: skip
             width = config.features or self.encoder.features
             self.project = nn.Linear(self.encoder.features, width) if config.features else nn.Identity()
@@ -90,12 +89,8 @@ class Network(Learner):
         if c.density == "score":
             return Score(widths, features, c.hidden, c.depth, c.dropout, c.draws)
         if c.density == "mixture":
-            link = partial(Mixture, hidden=c.hidden, components=c.components)
-        else:
-            link = partial(Flow, hidden=c.hidden, transforms=c.depth)
-        if c.members == 1:
-            return Chain(widths, features, link)
-        return Members(widths, features, c.members, lambda sizes, width: Chain(sizes, width, link))
+            return Chain(widths, features, partial(Mixture, hidden=c.hidden, components=c.components))
+        return Chain(widths, features, partial(Flow, hidden=c.hidden, transforms=c.depth))
 
     @torch.no_grad()
     def fit_scales(self, batch: Batch) -> None:
@@ -216,6 +211,13 @@ class Network(Learner):
             scaled = self.delta_scale(self.faced(batch["delta_s"], self.facing(batch["states"])))
             parts.append(torch.where(self.varies, scaled, torch.randn_like(scaled)))
         return torch.cat(parts, 1)
+
+    @torch.no_grad()
+    def calibrate(self, batch: Batch) -> None:
+        """Take the density's width from windows that were not trained on, see `Density.calibrate`."""
+        given = self.encode(batch["states"], batch["actions"], batch.get("map"))
+        x = self.targets(batch)
+        self.density.calibrate(x if self.base is None else self.base.whiten(x, given.mean), given.features)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Mean loss of each head over a batch; their sum is what training brings down."""

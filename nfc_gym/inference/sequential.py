@@ -7,7 +7,8 @@ the loss needs no correction. With draws of the posterior itself the answer is c
 way the posterior of the *given* window stays right, that of others does not.
 
 What is learned for one window alone may be learned from windows of its own commands (`simulate.Repeated`), by a network
-of its own: it begins `within` the region in which another posterior of that window has mass.
+of its own: it begins `within` the region in which another posterior of that window has mass, and later rounds are drawn
+from regions of that kind too.
 """
 
 from collections.abc import Callable
@@ -36,12 +37,13 @@ from nfc_gym.inference.proposals import (
     drawn,
     told,
 )
-from nfc_gym.inference.random import mixed
+from nfc_gym.inference.random import mixed, seeded
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
 
 Array = NDArray[np.float64]
 Simulator = Callable[[Array, np.random.Generator], Batch]
+_PASSES = 4  # over held out windows, each with noise of its own
 
 
 @dataclass
@@ -98,7 +100,7 @@ def sequential(
     made = partial(_simulated, network.prior, simulate, noise)
     rng = np.random.default_rng(config.seed)
     out = Rounds(NeuralPosterior(network))
-    believed = _Beliefs(window, config)
+    believed = _Beliefs(window, config, around=within is not None)
     train_set: TensorWindows | None = None
     held_out: TensorWindows | None = None
     for r in range(config.rounds):
@@ -119,6 +121,7 @@ def sequential(
         if r or begun is None:
             outcome = train(network, train_set, held_out, training, device=device, report=report, scales=scales)
             out.outcomes.append(outcome)
+            _calibrate(network, held_out, config.seed)
         out.posterior = believed.now(network, rng)
         out.entropy.append(-float(told(out.posterior, drawn(out.posterior, config.samples, rng)).mean()))
         report.message(f"round {r + 1}: {len(train_set)} windows, posterior entropy {out.entropy[-1]:.3f} nats")
@@ -134,12 +137,18 @@ def sequential(
 class _Beliefs:
     """What was believed of the window from round to round.
 
+    Args:
+      window: what was observed.
+      config: see `SequentialConfig`.
+      around: whether truncated proposals are `Around` the draws of a posterior.
+
     Attributes:
       first: windows from the prior.
     """
 
-    def __init__(self, window: Window, config: SequentialConfig) -> None:
+    def __init__(self, window: Window, config: SequentialConfig, around: bool) -> None:
         self.window, self.config, self.first = window, config, 0
+        self._truncated = Around if around else TruncatedPrior
         self._proposals: list[tuple[Believed, int]] = []
 
     def now(self, network: Network, rng: np.random.Generator) -> Believed:
@@ -147,13 +156,21 @@ class _Beliefs:
         learned = NeuralPosterior(network).given(self.window)
         return Corrected(learned, self._proposals, self.first, self.config, rng) if self._proposals else learned
 
-    def proposal(self, network: Network, rng: np.random.Generator) -> TruncatedPrior | Proposed:
+    def proposal(self, network: Network, rng: np.random.Generator) -> Around | TruncatedPrior | Proposed:
         """Of the next round; a posterior whose draws it learns from is kept as it is now."""
         if self.config.proposal == TRUNCATED:
-            return TruncatedPrior(NeuralPosterior(network).given(self.window), self.config, rng)
+            return self._truncated(NeuralPosterior(network).given(self.window), self.config, rng)
         kept = self.now(deepcopy(network), rng)
         self._proposals.append((kept, self.config.simulations))
         return Proposed(kept, self.config, rng)
+
+
+def _calibrate(network: Network, held_out: TensorWindows, seed: int) -> None:
+    """Take the density's width from what was held out, with the sensors' noise of several passes."""
+    device = next(network.parameters()).device
+    passes = [batch for k in range(_PASSES) for batch in held_out.batches(len(held_out), mixed(seed, k))]
+    with seeded(seed, device):
+        network.calibrate({name: torch.cat([p[name] for p in passes]).to(device) for name in passes[0]})
 
 
 def _renew(network: Network, seed: int) -> None:

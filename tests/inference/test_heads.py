@@ -7,14 +7,12 @@ import torch
 
 from nfc_gym.inference.heads.density import Chain, Density
 from nfc_gym.inference.heads.flow import Flow
-from nfc_gym.inference.heads.members import Members
 from nfc_gym.inference.heads.mixture import Mixture
 from nfc_gym.inference.heads.score import Score
 from nfc_gym.inference.heads.structure import Structure
 from nfc_gym.inference.linear import LinearBase
 
 PRIOR = torch.distributions.Normal(0, 1)
-WIDTH = {"score": 3, "mixture": 3, "flow": 3, "members": 4}  # of features
 
 
 def densities(sizes: tuple[int, ...], features: int) -> dict[str, Density]:
@@ -22,7 +20,6 @@ def densities(sizes: tuple[int, ...], features: int) -> dict[str, Density]:
         "score": Score(sizes, features, 16, 2),
         "mixture": Chain(sizes, features, lambda d, f: Mixture(d, f, 16, 3)),
         "flow": Chain(sizes, features, lambda d, f: Flow(d, f, 16, 2)),
-        "members": Members(sizes, 2 * (features // 2), 2, lambda s, f: Chain(s, f, lambda d, g: Mixture(d, g, 16, 2))),
     }
 
 
@@ -41,10 +38,10 @@ def test_an_untrained_score_model_is_exactly_the_prior() -> None:
     torch.testing.assert_close(model.log_prob(x[..., :2], f, 1), PRIOR.log_prob(x[..., :2]).sum(-1))
 
 
-@pytest.mark.parametrize("name", list(WIDTH))
+@pytest.mark.parametrize("name", ["score", "mixture", "flow"])
 def test_densities_integrate_to_one_jointly_and_for_psi_alone(name: str) -> None:
-    model = shaken(densities((1, 1), WIDTH[name])[name])
-    f = torch.randn(1, WIDTH[name])
+    model = shaken(densities((1, 1), 3)[name])
+    f = torch.randn(1, 3)
     line = torch.linspace(-9, 9, 81)
     grid = torch.stack(torch.meshgrid(line, line, indexing="ij"), -1).reshape(1, -1, 2)
     cell = float(line[1] - line[0])
@@ -57,11 +54,11 @@ def test_densities_integrate_to_one_jointly_and_for_psi_alone(name: str) -> None
         torch.testing.assert_close(joint.view(81, 81).sum(1) * cell, alone[0], atol=0.02, rtol=0.05)
 
 
-@pytest.mark.parametrize("name", list(WIDTH))
+@pytest.mark.parametrize("name", ["score", "mixture", "flow"])
 def test_samples_follow_the_density(name: str) -> None:
     """E[-log q] over a model's own samples is its entropy, which the density gives by integration too."""
-    model = shaken(densities((1,), WIDTH[name])[name])
-    f = torch.randn(1, WIDTH[name])
+    model = shaken(densities((1,), 3)[name])
+    f = torch.randn(1, 3)
     line = torch.linspace(-9, 9, 721)
     with torch.no_grad():
         logq = model.log_prob(line[None, :, None], f)[0]
@@ -85,17 +82,20 @@ def test_many_pairs_at_once_are_the_same_as_one_by_one() -> None:
         torch.testing.assert_close(together, alone, atol=1e-4, rtol=1e-4)
 
 
-def test_members_learn_alone_and_answer_together() -> None:
-    model = Members((2,), 4, 2, lambda s, f: Chain(s, f, lambda d, g: Mixture(d, g, 8, 1)))
-    shaken(model)
-    x, f = torch.randn(3, 5, 2), torch.randn(3, 4)
+def test_a_flow_that_is_too_sure_is_widened_by_pairs_it_has_not_learned() -> None:
+    model, features = shaken(densities((2, 1), 3)["flow"]), torch.randn(1, 3).expand(4000, 3)
     with torch.no_grad():
-        one, two = (m.log_prob(x, part) for m, part in zip(model.members, f.chunk(2, 1), strict=True))
-        torch.testing.assert_close(model.log_prob(x, f).exp(), (one.exp() + two.exp()) / 2)
-        torch.testing.assert_close(model.loss(x, f), -model.log_prob(x, f).mean(1))
-        torch.testing.assert_close(model.train().loss(x, f), -(one + two).mean(1) / 2)
-        assert model.sample(5, f).shape == (3, 5, 2)
-        assert model.sample(1, f).shape == (3, 1, 2)
+        for link in model.links:
+            link.flow.base.scale.fill_(1.5)  # what the pairs are drawn from is half as wide again
+        x = model.sample(4000, features[:1])[0]
+        right = float(model.log_prob(x[None], features[:1]).mean())
+        for link in model.links:
+            link.flow.base.scale.fill_(1.0)
+        narrow = float(model.log_prob(x[None], features[:1]).mean())
+        model.calibrate(x, features)
+        mended = float(model.log_prob(x[None], features[:1]).mean())
+    assert [float(link.flow.base.scale.mean()) for link in model.links] == pytest.approx([1.5, 1.5], abs=0.04)
+    assert narrow + 0.2 < right == pytest.approx(mended, abs=0.01)
 
 
 def test_a_mixture_of_one_is_a_gaussian() -> None:

@@ -28,7 +28,6 @@ class Joined(Encoder):
       summaries: with physics summaries.
       regressions: theirs.
       elevation: with a map.
-      members: motion encoders, of the same kind; their features come one after the other.
 
     Raises:
       InputError: no such encoder, no encoder at all, or a map for a kernel method.
@@ -36,7 +35,7 @@ class Joined(Encoder):
 
     def __init__(
         self, name: str, horizon: int, states: int, actions: int, *, width: int = 1024, aligned: bool = False,
-        summaries: bool = False, regressions: Regressions | None = None, elevation: bool = False, members: int = 1,
+        summaries: bool = False, regressions: Regressions | None = None, elevation: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if name not in (*ENCODERS, "none"):
@@ -44,9 +43,10 @@ class Joined(Encoder):
         if elevation and name in BLIND:
             raise InputError(f"the encoder {name!r} sees no map; those that do: tcn, nn")
         parts: list[Encoder] = []
-        for _ in range(members if name != "none" else 0):
-            sizes = (horizon, states, actions, aligned)
-            parts.append(MLP(*sizes, width) if name == "nn" else ENCODERS[name](*sizes))
+        if name == "nn":
+            parts.append(MLP(horizon, states, actions, aligned, width))
+        elif name != "none":
+            parts.append(ENCODERS[name](horizon, states, actions, aligned))
         parts += [Summaries(horizon, states, actions, regressions)] if summaries else []
         parts += [ResNet18()] if elevation else []
         if name == "none" and not summaries:

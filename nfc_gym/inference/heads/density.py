@@ -39,6 +39,12 @@ class Density(nn.Module):
         """(B, n) log density of x (B, n, width), nats."""
         raise NotImplementedError
 
+    def calibrate(self, x: Tensor, features: Tensor) -> None:
+        """Take the width from pairs x (B, D) and features (B, F) that were not trained on, where the density has one.
+
+        What is learned from few windows is too sure of itself; how much so, windows that were held out tell.
+        """
+
 
 class Explicit(Density):
     """A density that is evaluated in one pass, and so trained on its log-likelihood."""
@@ -76,6 +82,13 @@ class Chain(Explicit):
             )
             at += size
         return total.view(b, n)
+
+    def calibrate(self, x: Tensor, features: Tensor) -> None:
+        """Each link's, given the blocks before it."""
+        at = 0
+        for link, size in zip(self.links, self.sizes, strict=True):
+            cast(Density, link).calibrate(x[:, at : at + size], torch.cat([features, x[:, :at]], 1))
+            at += size
 
     def sample(self, n: int, features: Tensor, blocks: int | None = None) -> Tensor:
         """See `Density`."""

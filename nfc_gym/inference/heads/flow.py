@@ -1,5 +1,7 @@
 """Neural spline flow (Durkan et al. 2019), by zuko: a stronger peer of the paper's densities."""
 
+from typing import cast
+
 import torch
 import zuko
 from torch import Tensor, nn
@@ -29,6 +31,12 @@ class Flow(Explicit):
         with torch.autocast(x.device.type, enabled=False):
             context = self.context(features.float())[:, None].expand(-1, x.shape[1], -1)
             return self.flow(context).log_prob(x.float())
+
+    @torch.no_grad()
+    def calibrate(self, x: Tensor, features: Tensor) -> None:
+        """See `Density`: the normal that the flow begins at gets the spread that the pairs have there."""
+        latent = self.flow(self.context(features)).transform(x)
+        cast(Tensor, self.flow.base.scale).copy_(latent.square().mean().sqrt())
 
     def sample(self, n: int, features: Tensor, blocks: int | None = None) -> Tensor:
         """See `Density`."""
