@@ -15,8 +15,8 @@ import yaml
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from nfc_gym.core import InputError
-from nfc_gym.measured import entries, units
+from nfc_gym.core import InputError, units
+from nfc_gym.measured import entries
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.checks import check
 from nfc_gym.measured.dataset import load

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.physics.parameters import numbers
 from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield
 from nfc_gym.terrain.model import HfieldAsset, asset
 
@@ -99,7 +100,7 @@ def checked(heights: ArrayLike, name: str = "heightfield") -> Heightfield:
     Raises:
       InputError: another shape than `SHAPE`, values that are not finite, or outside [LOWEST, HIGHEST].
     """
-    grid = heights.heights if isinstance(heights, Heightfield) else np.asarray(heights, np.float32)
+    grid = heights.heights if isinstance(heights, Heightfield) else np.asarray(numbers(heights, name), np.float32)
     if grid.shape != SHAPE:
         raise InputError(f"{name} has shape {grid.shape}, want {SHAPE} (rows along y, columns along x)")
     if not np.isfinite(grid).all():
@@ -116,7 +117,7 @@ def checked(heights: ArrayLike, name: str = "heightfield") -> Heightfield:
 
 def risen(ground: Heightfield, residual: ArrayLike) -> Heightfield:
     """Ground plus a residual (rows, columns) m; errors as `checked`."""
-    residual = np.asarray(residual, float)
+    residual = numbers(residual, "terrain_residual")
     if residual.shape != SHAPE:
         raise InputError(f"terrain_residual has shape {residual.shape}, want {SHAPE} (rows along y, columns along x)")
     return checked((ground.heights + residual).astype(np.float32), "the terrain with terrain_residual")

@@ -31,7 +31,7 @@ SIMULATIONS = 10_000
 
 def halved(simulations: int, seed: int = 0) -> SequentialConfig:
     """Two rounds with so many simulations in all: 2 x 5000 tell more than 10,000 do, on most robots by far."""
-    return SequentialConfig(2, simulations // 2, anew=True, seed=seed)
+    return SequentialConfig(2, simulations // 2, anew=True, oversampling=8, seed=seed)
 
 
 class Again(Protocol):

@@ -7,8 +7,7 @@ the loss needs no correction. With draws of the posterior itself the answer is c
 way the posterior of the *given* window stays right, that of others does not.
 
 What is learned for one window alone may be learned from windows of its own commands (`simulate.Repeated`), by a network
-of its own: it begins `within` the region in which another posterior of that window has mass, and later rounds are drawn
-from regions of that kind too.
+of its own: it begins `within` the region in which another posterior of that window has mass.
 """
 
 from collections.abc import Callable
@@ -100,7 +99,7 @@ def sequential(
     made = partial(_simulated, network.prior, simulate, noise)
     rng = np.random.default_rng(config.seed)
     out = Rounds(NeuralPosterior(network))
-    believed = _Beliefs(window, config, around=within is not None)
+    believed = _Beliefs(window, config)
     train_set: TensorWindows | None = None
     held_out: TensorWindows | None = None
     for r in range(config.rounds):
@@ -137,18 +136,12 @@ def sequential(
 class _Beliefs:
     """What was believed of the window from round to round.
 
-    Args:
-      window: what was observed.
-      config: see `SequentialConfig`.
-      around: whether truncated proposals are `Around` the draws of a posterior.
-
     Attributes:
       first: windows from the prior.
     """
 
-    def __init__(self, window: Window, config: SequentialConfig, around: bool) -> None:
+    def __init__(self, window: Window, config: SequentialConfig) -> None:
         self.window, self.config, self.first = window, config, 0
-        self._truncated = Around if around else TruncatedPrior
         self._proposals: list[tuple[Believed, int]] = []
 
     def now(self, network: Network, rng: np.random.Generator) -> Believed:
@@ -156,10 +149,10 @@ class _Beliefs:
         learned = NeuralPosterior(network).given(self.window)
         return Corrected(learned, self._proposals, self.first, self.config, rng) if self._proposals else learned
 
-    def proposal(self, network: Network, rng: np.random.Generator) -> Around | TruncatedPrior | Proposed:
+    def proposal(self, network: Network, rng: np.random.Generator) -> TruncatedPrior | Proposed:
         """Of the next round; a posterior whose draws it learns from is kept as it is now."""
         if self.config.proposal == TRUNCATED:
-            return self._truncated(NeuralPosterior(network).given(self.window), self.config, rng)
+            return TruncatedPrior(NeuralPosterior(network).given(self.window), self.config, rng)
         kept = self.now(deepcopy(network), rng)
         self._proposals.append((kept, self.config.simulations))
         return Proposed(kept, self.config, rng)

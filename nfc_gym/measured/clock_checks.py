@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 AGREE = 0.8  # correlation from which on two signals are taken for the same motion
 SURE = 4.0  # standard deviations, with which an offset is not zero
 SHARE = 0.25  # of a sampling interval: a smaller offset is none to speak of
+# The same of a speed after its position, where a new command comes with about every sample: a drive that follows it
+# before the next one has reached its speed when it is sampled, and moves on at the mean of both around that moment.
+HELD = 0.5
 COARSE = 1.0  # the same of a motion that the samples do not resolve: what happens between two of them looks like one
 RESOLVED = 0.7  # change from sample to sample over the speed's own spread, below which they do
 MOST = 2.0  # s, or a fifth of the log where that is less
@@ -52,7 +55,8 @@ def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log], shifts: Map
             offset = clock_offset(time, travel, other, rate, min(MOST, 0.2 * log.duration))
             if offset is not None and offset.correlation > AGREE and offset.sd > 0:
                 coarsest = max(float(np.median(np.diff(t))) for t in (time, other))
-                least = coarsest * (SHARE if _resolved(rate) else COARSE)
+                held = HELD if offset.seconds > 0 and _commanded(log, coarsest) else SHARE
+                least = coarsest * (held if _resolved(rate) else COARSE)
                 found.setdefault((position, speed), []).append((log.name, offset, least))
     for (position, speed), offsets in found.items():
         yield from _told(position, speed, offsets, shifts)
@@ -91,6 +95,12 @@ def _told(
 def _resolved(rate: Array) -> bool:
     """Whether a speed, (T, k), goes over from sample to sample; one that jumps is another between them."""
     return bool(np.diff(rate, axis=0).std() < RESOLVED * rate.std(0).mean())
+
+
+def _commanded(log: Log, interval: float) -> bool:
+    """Whether commands change about as often as every `interval` s."""
+    changes = [int(np.count_nonzero(np.diff(series))) for series in log.controls.values()]
+    return max(changes, default=0) * interval > 0.5 * log.duration
 
 
 def _pairs(model: mujoco.MjModel | None, log: Log) -> Iterator[tuple[str, str, Array, Array]]:

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.core import Channel, InputError, Log
-from nfc_gym.measured import units
+from nfc_gym.core import Channel, InputError, Log, units
 from nfc_gym.measured.align import Alignment, Use, align, shifted, uses
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.columns import LogColumns, finite

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self, cast
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from nfc_gym.measured import units
+from nfc_gym.core import units
 from nfc_gym.measured.yaml_marks import suggest
 from nfc_gym.physics.parameters import Parameter
 

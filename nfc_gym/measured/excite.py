@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from nfc_gym.core import units
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import write_whole
-from nfc_gym.measured import questions, units
+from nfc_gym.measured import questions
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.contest import losses

@@ -5,8 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.core import InputError
-from nfc_gym.measured import units
+from nfc_gym.core import InputError, units
 from nfc_gym.measured.columns import LogColumns, plausible
 from nfc_gym.measured.entries import TimeColumn
 from nfc_gym.measured.readers import Streams

@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from nfc_gym.core import InputError
-from nfc_gym.measured import units
+from nfc_gym.core import InputError, units
 from nfc_gym.measured.channels import ChannelName, parse_channel
 from nfc_gym.measured.entries import (
     Control,

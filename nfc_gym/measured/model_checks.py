@@ -7,6 +7,7 @@ from difflib import get_close_matches
 import mujoco
 
 from nfc_gym.core import InputError
+from nfc_gym.core.units import si_unit
 from nfc_gym.measured.buffers import too_short
 from nfc_gym.measured.channels import ChannelName, parse_channel
 from nfc_gym.measured.findings import Finding
@@ -14,7 +15,6 @@ from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.observe import observer
 from nfc_gym.measured.start_checks import unmeasured
 from nfc_gym.measured.stiffness import stiffness_findings
-from nfc_gym.measured.units import si_unit
 from nfc_gym.measured.yaml_marks import suggest
 from nfc_gym.physics.activations import integrators, on_servos
 from nfc_gym.physics.effects.drive import command_unit

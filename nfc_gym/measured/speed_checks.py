@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.core import Channel, Log
-from nfc_gym.measured import units
+from nfc_gym.core import Channel, Log, units
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.entries import TimeColumn
 from nfc_gym.measured.findings import Suspicion

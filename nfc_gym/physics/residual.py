@@ -82,7 +82,7 @@ class Components:
         for i, name in enumerate(names):
             if name == OBSERVED:
                 continue
-            match = _FORM.match(name)
+            match = _FORM.match(name) if isinstance(name, str) else None
             if match is None:
                 raise InputError(f"component {name!r} of delta_s: want {_GRAMMAR}")
             if match["joint"] is not None:

@@ -1,7 +1,8 @@
 """A stereo depth camera's figures, by default those of the Intel RealSense D435."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,15 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 
 Array = NDArray[np.float64]
+
+
+def _finite(value: Any, count: int) -> bool:
+    """Whether a value is that many finite numbers, or with 0 a single one."""
+    try:
+        given = np.asarray(value)
+    except ValueError:  # ragged
+        return False
+    return given.dtype.kind in "iuf" and given.shape == ((count,) if count else ()) and bool(np.isfinite(given).all())
 
 
 @dataclass(frozen=True)
@@ -59,9 +69,12 @@ class DepthCamera:
     tilt: float = 0.0035
 
     def __post_init__(self) -> None:
-        if len(self.position) != 3 or not np.isfinite(self.position).all():
-            raise InputError(f"position {self.position!r}: want x, y, z in the base's frame [m]")
-        if len(self.fov) != 2 or not all(0 < angle < np.pi for angle in self.fov):
+        for each in fields(self):
+            count, value = {"position": 3, "fov": 2}.get(each.name, 0), getattr(self, each.name)
+            if not _finite(value, count):
+                want = f"{count} finite numbers" if count else "a finite number"
+                raise InputError(f"{each.name} {value!r}: want {want}")
+        if not all(0 < angle < np.pi for angle in self.fov):
             raise InputError(f"fov {self.fov!r}: want two angles between 0 and pi [rad]")
         if not 0 <= self.near < self.far < np.inf:
             raise InputError(f"near {self.near!r} and far {self.far!r}: want 0 <= near < far [m]")

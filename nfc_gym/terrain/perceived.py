@@ -166,7 +166,10 @@ class _Robot:
         cos, sin = np.cos(self.drift[3]), np.sin(self.drift[3])
         error = np.array([[cos, -sin, tilt[0]], [sin, cos, tilt[1]], [-tilt[0], -tilt[1], 1]])
         believed = points @ error.T.astype(np.float32) + (error @ arm + xyz + self.drift[:3]).astype(np.float32)
-        cells = np.rint(believed[:, :2] / CELL).astype(np.int64) % SIDE
+        cells = np.rint(believed[:, :2] / CELL).astype(np.int64)
+        # What lies beyond the map would be entered on its other side.
+        inside = (np.abs(cells - np.rint((xyz + self.drift[:3])[:2] / CELL).astype(np.int64)) < SIDE // 2).all(1)
+        believed, sd, cells = believed[inside], sd[inside], cells[inside] % SIDE
         flat = cells[:, 1] * SIDE + cells[:, 0]
         gain = 1 / (sd * sd + FLOOR**2)
         total = np.bincount(flat, gain, SIDE * SIDE)

@@ -21,6 +21,7 @@ from nfc_gym.physics.effects.base import TIME, Effect, overrides
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.parameters import numbers
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.effects_file import check_model, psi_said, read_effects
@@ -38,6 +39,8 @@ def recorded(effects: Given) -> list[dict[str, Any]] | str:
     """Effects as a spec keeps them: rows of plain data, or a path."""
     if isinstance(effects, str | os.PathLike):
         return os.fspath(effects)
+    if not isinstance(effects, Iterable):  # which `bound` refuses
+        return effects
     return [_recorded(e) for e in effects]
 
 
@@ -119,7 +122,7 @@ def own_values(effects: Sequence[Effect], each: Sequence[ArrayLike], shape: tupl
     """
     if len(each) != len(effects):
         raise InputError(f"ApplyEffects: values of {len(each)} effects are given, and there are {len(effects)}")
-    found = [np.array(v, float) for v in each]
+    found = [np.array(numbers(v, f"ApplyEffects: values of {e.id}")) for v, e in zip(each, effects, strict=True)]
     for effect, theta in zip(effects, found, strict=True):
         want = (*shape, len(effect.params))
         if theta.shape != want or not np.isfinite(theta).all():
@@ -156,7 +159,7 @@ class Application:
         self, sim: Simulation, given: Given, exogenous: Mapping[str, Signal] | None, condition: str | None = None,
         each: Sequence[ArrayLike] | None = None,
     ) -> None:  # fmt: skip
-        self.sim, self.exogenous = sim, dict(exogenous or {})
+        self.sim, self.exogenous = sim, _named(exogenous, sim.shape)
         self.effects, values = bound(given, sim.nominal, condition)
         self.thetas = [np.broadcast_to(t, (*sim.shape, len(t))) for t in values]
         if each is not None:
@@ -207,8 +210,31 @@ class Application:
 
     def _signals(self) -> dict[str, Any]:
         time = np.asarray(self.sim.bind("time"), float)
-        given = {n: np.asarray(s(time) if callable(s) else s, float) for n, s in self.exogenous.items()}
-        return {TIME: time, **{n: np.broadcast_to(v, self.sim.shape) for n, v in given.items()}}
+        shape, signals = self.sim.shape, self.exogenous
+        return {TIME: time, **{n: _level(n, s(time) if callable(s) else s, shape) for n, s in signals.items()}}
+
+
+def _named(exogenous: Mapping[str, Signal] | None, shape: tuple[int, ...]) -> dict[str, Signal]:
+    """Signals by name, of which those that are no functions are levels."""
+    if not isinstance(exogenous or {}, Mapping):
+        raise InputError(f"ApplyEffects: exogenous maps names to numbers or functions of time, and is no {exogenous!r}")
+    signals = dict(exogenous or {})
+    for name, signal in signals.items():
+        if not callable(signal):
+            _level(name, signal, shape)
+    return signals
+
+
+def _level(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    """(*shape,) a signal now; MuJoCo would drop all commands where one is not finite."""
+    try:
+        level = np.broadcast_to(numbers(value, name), shape)
+    except (InputError, ValueError):
+        level = None
+    if level is None or not np.isfinite(level).all():
+        want = f"finite numbers of shape {shape}" if shape else "a finite number"
+        raise InputError(f"ApplyEffects: exogenous {name!r} is {value!r}; want {want}, or a function of time that is")
+    return level
 
 
 class ApplyEffects(EnvWrapper):

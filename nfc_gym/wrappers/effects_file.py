@@ -13,10 +13,14 @@ from nfc_gym.core.errors import InputError, MissingExtra
 
 # Fields by which a compiled model is known again where no file of it is at hand.
 _TELLING = (
-    "body_parentid", "body_mass", "body_inertia", "body_pos", "jnt_type", "jnt_axis", "dof_damping", "dof_armature",
-    "dof_frictionloss", "geom_type", "geom_size", "geom_friction", "actuator_gear", "actuator_gainprm",
-    "actuator_biasprm", "actuator_ctrlrange",
+    "body_parentid", "body_mass", "body_inertia", "body_pos", "body_ipos", "jnt_type", "jnt_axis", "jnt_stiffness",
+    "qpos_spring", "dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss", "geom_type", "geom_size",
+    "geom_friction", "geom_solref", "geom_margin", "actuator_gear", "actuator_gainprm", "actuator_biasprm",
+    "actuator_ctrlrange", "actuator_forcelimited", "actuator_forcerange", "actuator_dyntype", "actuator_dynprm",
+    "actuator_delay",
 )  # fmt: skip
+_TELLING_OPTIONS = ("timestep", "gravity", "density", "viscosity", "wind", "impratio")
+_ROUNDED = 1e-5  # MJCF text has six digits
 
 
 def read_effects(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -87,9 +91,10 @@ def check_model(env: Any, path: str | os.PathLike[str]) -> None:
     if not beside.is_file() or _digest(beside) != wanted:
         raise InputError(f"{path}: {beside} is absent or another model than the one it was made for; {advice}")
     theirs, mine = mujoco.MjModel.from_xml_path(str(beside)), base.model
-    for name in _TELLING:
-        a, b = getattr(theirs, name), getattr(mine, name)
-        if a.shape != b.shape or not np.allclose(a, b, rtol=1e-6, atol=1e-9):
+    pairs = [(name, getattr(theirs, name), getattr(mine, name)) for name in _TELLING]
+    pairs += [(f"option {name}", getattr(theirs.opt, name), getattr(mine.opt, name)) for name in _TELLING_OPTIONS]
+    for name, a, b in pairs:
+        if np.shape(a) != np.shape(b) or not np.allclose(a, b, rtol=_ROUNDED, atol=1e-9):
             raise InputError(
                 f"{path} was made for {beside}, which differs from the environment's model in {name}; {advice}"
             )

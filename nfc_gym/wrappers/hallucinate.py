@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.core.whole import require_whole
 from nfc_gym.physics.residual import Components
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
 from nfc_gym.wrappers.batched import batch_simulation_of
@@ -47,7 +48,8 @@ def checked_beta(beta: Any) -> float:
 
 def drawn(posterior: Source, samples: int) -> Fidelity:
     """Samples of a posterior, always the same ones: what the action means must not change from run to run."""
-    return sampler_of(posterior, "psi", "Hallucinate").sample(samples, np.random.default_rng(0))
+    count = require_whole("samples", samples, 2)
+    return sampler_of(posterior, "psi", "Hallucinate").sample(count, np.random.default_rng(0))
 
 
 def wider(space: gym.Space, more: int) -> spaces.Box:

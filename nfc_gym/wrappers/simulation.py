@@ -274,8 +274,9 @@ class SingleSimulation(Simulation):
         data = self.env.data
         if data is not self.data:
             self._look()
-        if data.time < self._time:  # the clock of an episode that was begun by whomever went back
+        if data.time < self._time and not self.started:  # the clock of an episode that whomever beneath went back to
             self.started = True
+            self.edit()
         self.commanded = self.ctrl.copy()
         if self.pushed:
             self._base[0][...], self._base[1][...] = self.qfrc_applied, self.xfrc_applied

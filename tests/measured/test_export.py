@@ -113,6 +113,7 @@ def gain(value: float) -> tuple[str, str, dict[str, float]]:
 
 OFFSET, DEAD = ("offset", "m", {"offset": 0.3}), ("dead_zone", "m", {"width": 0.5})
 LAG, DELAY = ("lag", "m", {"time_constant": 0.1}), ("delay", "m", {"delay": 0.05})
+BETWEEN = ("delay", "m", {"delay": 2.5 * DT})  # in units of steps no whole number
 CUT, FORCE = ("saturation", "m", {"removed": 0.4}), ("saturation", "m", {"inverse_limit": 2.0})
 DRY, RISE = ("coulomb", "j", {"level": 0.1}), ("stribeck", "j", {"level": 0.1, "rise": 0.1, "speed": 0.3})
 SPRING, ROTOR = ("spring_offset", "j", {"stiffness": 3.0, "rest": 0.5}), ("armature", "j", {"inertia": 0.2})
@@ -153,6 +154,9 @@ CASES: dict[str, tuple[Any, ...]] = {
             (LAG, DELAY), (OFFSET, gain(0.5)), (FORCE, gain(0.5)), (gain(0.5), FORCE), (FORCE, DEAD, LAG),
         )
     },
+    "saturation then a delay between steps": (arm(LIMITED), [CUT, BETWEEN]),
+    "a delay between steps then saturation": (arm(LIMITED), [BETWEEN, CUT]),
+    "a delay between steps": (arm(LIMITED), [BETWEEN]),
     "saturation then offset": (arm(LIMITED), [CUT, OFFSET]),
     "offset then saturation": (arm(LIMITED), [OFFSET, CUT]),
     "a law that reads the command": (arm(), [LAG, ("law_command", ["j", "m"], {"size": 0.3})]),

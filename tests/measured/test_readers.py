@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from nfc_gym.core import InputError
+from nfc_gym.core.units import UNITS, si_unit, spread_to_si, to_si
 from nfc_gym.measured.columns import LogColumns
 from nfc_gym.measured.readers import read_table, register_reader, suffixes
-from nfc_gym.measured.units import UNITS, si_unit, spread_to_si, to_si
 
 T = np.linspace(0, 1, 200)
 Q = np.random.default_rng(0).standard_normal(200)

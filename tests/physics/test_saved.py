@@ -9,7 +9,7 @@ import yaml
 from machines import candidates, plant_of, probe, zoo, zoo_scales, zoo_segments
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects import FAMILIES, Effect
+from nfc_gym.physics.effects import FAMILIES, Effect, build
 from nfc_gym.physics.effects.command import SupplySag
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import each
@@ -35,6 +35,38 @@ def test_no_setting_is_lost(family: str) -> None:
         assert type(again) is type(effect)
         assert [(p.name, p.unit) for p in again.params] == [(p.name, p.unit) for p in effect.params]
         assert _told(again) == _told(effect), effect.id
+
+
+@pytest.mark.parametrize(
+    ("family", "place", "entry", "value", "unit"),
+    [
+        ("delay", "m", {"value": 30, "unit": "ms"}, 0.03, "s"),
+        ("slope", "world", {"value": 5, "unit": "deg"}, np.deg2rad(5), "rad"),
+        ("backlash", "j", {"value": 2, "unit": "mm"}, 0.002, "m"),  # of a joint that slides
+        ("stribeck", "j", {"value": 2, "unit": "m/s"}, 2, "m/s"),
+        ("gain", "m", {"value": 12, "unit": "%"}, 0.12, "1"),
+    ],
+)
+def test_other_scales_of_a_unit_are_converted(
+    family: str, place: str, entry: dict[str, Any], value: float, unit: str
+) -> None:
+    names = [p.name for p in FAMILIES[family].PARAMS]
+    at = {"stribeck": "speed"}.get(family, names[0])
+    effect, theta = build(family, place, dict.fromkeys(names, 0.1) | {at: entry})
+    assert theta[names.index(at)] == pytest.approx(value)
+    assert effect.params[names.index(at)].unit == unit
+
+
+@pytest.mark.parametrize("unit", ["mN m", "g", "deg", "parsec"])
+def test_a_unit_of_something_else_is_refused(unit: str) -> None:
+    with pytest.raises(InputError, match=f"coulomb: level is in '{unit}'; want N m"):
+        build("coulomb", "j", {"level": {"value": 200, "unit": unit}})
+
+
+def test_a_place_that_is_named_twice_is_refused() -> None:
+    with pytest.raises(InputError, match="gain: m is named more than once"):
+        build("gain", ["m", "n", "m"], {"gain": 0.1})
+    build("law_harmonic", "j+j", {"cosine": 0.1, "sine": 0.1, "order": 2.0})  # its second harmonic
 
 
 def _sag(signal: str) -> Effect:

@@ -109,6 +109,15 @@ def test_behind_a_wall_nothing_is_seen() -> None:
     np.testing.assert_array_equal(found[hidden], np.float32(-1.0))  # filled with the ground below the base
 
 
+def test_what_lies_beyond_the_map_is_not_entered_on_its_other_side() -> None:
+    heights = np.zeros((256, 256))
+    heights[:, np.arange(256) * 0.1 - 12.75 > 11.0] = 3.0
+    perceived = standing(replace(QUIET, far=18.0), Heightfield(heights), 1.0)
+    behind = FORWARD < -0.5
+    assert not perceived.valid[behind].any()
+    assert perceived.valid[~behind].sum() > 2000
+
+
 def test_a_tower_taller_than_the_camera_is_seen_by_its_face() -> None:
     heights = np.zeros((256, 256))
     x = np.arange(256) * 0.1 - 12.75
@@ -260,6 +269,10 @@ def test_a_reset_forgets_everything() -> None:
         ({"dropout": 1.5}, "dropout 1.5"),
         ({"drift": -1.0}, "drift -1.0"),
         ({"tilt": float("nan")}, "tilt nan"),
+        ({"pitch": float("nan")}, "pitch nan: want a finite number"),
+        ({"pitch": "30"}, "pitch '30': want a finite number"),
+        ({"fov": 1.0}, "fov 1.0: want 2 finite numbers"),
+        ({"position": [[0], [1, 2], 3]}, "want 3 finite numbers"),
     ],
 )
 def test_impossible_cameras_are_refused(kwargs: dict, message: str) -> None:

@@ -113,6 +113,40 @@ def test_episodes_begun_beneath_the_wrapper_are_seen() -> None:
     same([s[0] for s in first[1:]], again)
 
 
+@pytest.mark.parametrize(
+    ("family", "place", "parameters", "field"),
+    [
+        ("stribeck", "shoulder", {"level": 0.5, "rise": 0.2, "speed": 0.1}, "dof_frictionloss"),
+        ("backlash", "wheel_l", {"gap": 0.1, "rotor": 0.5}, "dof_armature"),
+        ("coulomb", "shoulder", {"level": 0.5}, "dof_frictionloss"),
+    ],
+)
+def test_what_an_effect_writes_each_step_does_not_add_up(
+    family: str, place: str, parameters: dict[str, float], field: str
+) -> None:
+    """Where somebody below resets, the model still holds what the last step of the last episode wrote."""
+    env = ApplyEffects(ZooEnv(), [make(family, place, parameters)])
+    env.reset(seed=0)
+    found = []
+    for _ in range(3):
+        for _ in range(3):
+            env.step(np.zeros(env.action_space.shape))
+        found.append(getattr(env.unwrapped.model, field).copy())
+        env.unwrapped.reset(seed=0)
+    np.testing.assert_array_equal(found[1:], [found[0]] * 2)
+
+
+@pytest.mark.parametrize("signal", [np.nan, None, "12", np.ones(3)])
+def test_a_signal_that_is_no_number_stops_at_its_name(signal: object) -> None:
+    wanted = r"exogenous 'exo:supply' is .*; want a finite number"
+    with pytest.raises(InputError, match=wanted):
+        ApplyEffects(ZooEnv(), [_sag()], exogenous={"exo:supply": signal})
+    env = ApplyEffects(ZooEnv(), [_sag()], exogenous={"exo:supply": lambda t: signal})
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=wanted):
+        env.step(np.zeros(env.action_space.shape))
+
+
 def test_model_edits_start_from_nominal_at_each_reset() -> None:
     env = ApplyEffects(ZooEnv(), [make("payload", "craft", {"mass": 0.7, "x": 0, "y": 0, "z": 0})])
     nominal = MODEL.body("craft").mass[0]
@@ -185,6 +219,11 @@ def test_from_file_without_a_model_file_compares_the_model_beside_it(tmp_path: P
     other.fullpath = None
     with pytest.raises(InputError, match="body_mass"):
         ApplyEffects.from_file(other, path)
+    heavy = FakeEnv()
+    heavy.fullpath = None
+    heavy.model.opt.gravity[2] = -1.62
+    with pytest.raises(InputError, match="option gravity"):
+        ApplyEffects.from_file(heavy, path)
 
 
 @pytest.mark.parametrize(
@@ -217,6 +256,10 @@ def test_bad_input_is_refused_by_name() -> None:
         ApplyEffects(FakeEnv(), [{"family": "coulomb", "where": "hinge", "parameters": {"level": "much"}}])
     with pytest.raises(InputError, match="exo:supply"):
         ApplyEffects(ZooEnv(), [_sag()])
+    with pytest.raises(InputError, match="exogenous maps names to numbers"):
+        ApplyEffects(ZooEnv(), [_sag()], exogenous=[12.0])
+    with pytest.raises(InputError, match="effects is None"):
+        ApplyEffects(FakeEnv(), None)
     with pytest.raises(InputError, match="only once"):
         ApplyEffects(ApplyEffects(FakeEnv(), []), [])
 

@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from nfc_gym.core import units
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import DragLinear, DragQuadratic
 from nfc_gym.physics.effects.backlash import Backlash
@@ -25,6 +27,7 @@ from nfc_gym.physics.effects.law_motion import LawCommand, LawCross, LawPolynomi
 from nfc_gym.physics.effects.law_place import LawFrictionByPlace, LawHeight, LawPlace
 from nfc_gym.physics.effects.law_waves import LawHarmonic, LawWave
 from nfc_gym.physics.effects.load import ExternalForce, Slope, Wind
+from nfc_gym.physics.effects.places import slid
 from nfc_gym.physics.effects.rotor import GroundEffect, RotorDrag
 from nfc_gym.physics.effects.sensors import Misalignment, SensorBias, SensorDelay, SensorGain
 from nfc_gym.physics.effects.sinkage import Sinkage
@@ -77,25 +80,39 @@ def build(family: str, where: Sequence[str] | str, parameters: Mapping[str, obje
     Args:
       family: one of `FAMILIES`.
       where: a name of the model, several, several joined by `+`, or `all` (see `everywhere`).
-      parameters: by name, a number or a mapping with `value` and perhaps `unit`.
+      parameters: by name, a number or a mapping with `value` and perhaps `unit`; `ms`, `deg` and other scales of the
+        parameter's own unit are converted.
 
     Raises:
-      InputError: an unknown family, names of parameters that the family does not have, or several places of a family
-        that sits at one alone.
+      InputError: an unknown family, names of parameters that the family does not have, a unit of something else, a
+        place that is named twice, or several places of a family that sits at one alone.
     """
     kind = _family(family)
     places = tuple(where.split("+")) if isinstance(where, str) else tuple(where)
     if kind.lone and len(places) > 1:
         raise InputError(f"{family} sits at one place alone, got: {', '.join(places)}; give an effect for each")
+    if twice := [p for p in dict.fromkeys(places) if places.count(p) > 1 and not kind.repeats]:
+        raise InputError(f"{family}: {twice[0]} is named more than once; an effect acts at a place or it does not")
     declared = kind.declare(tuple(parameters))
     values, params = [], []
     for p in declared:
         entry = parameters[p.name]
-        unit = str(entry.get("unit", p.unit)) if isinstance(entry, Mapping) else p.unit
+        value, unit = entry, p.unit
+        if isinstance(entry, Mapping):
+            value, unit = _converted(f"{family}: {p.name}", entry["value"], str(entry.get("unit", p.unit)), p.unit)
         params.append(replace(p, unit=unit))
-        values.append(float(entry["value"] if isinstance(entry, Mapping) else entry))  # type: ignore[arg-type]
+        values.append(float(value))  # type: ignore[arg-type]
     placed = everywhere(kind) if places == (ALL,) else kind
     return placed(places, params), np.array(values)
+
+
+def _converted(what: str, value: Any, unit: str, own: str) -> tuple[Any, str]:
+    """A value in a parameter's own unit, of a hinge or of what slides, and that unit."""
+    if units.coherent(unit):
+        return value, unit
+    if not units.known(unit) or units.si_unit(unit) not in (own, slid(own)):
+        raise InputError(f"{what} is in {unit!r}; want {own}")
+    return float(units.to_si(float(value), unit)), units.si_unit(unit)
 
 
 def _family(name: str) -> type[Effect]:

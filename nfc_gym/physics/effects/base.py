@@ -193,6 +193,8 @@ class Effect(ABC):
     driven: ClassVar[bool] = False
     # Whether it sits at one place alone, and not with the same values at several.
     lone: ClassVar[bool] = False
+    # Whether a place that is named twice says something.
+    repeats: ClassVar[bool] = False
     # Whether it may sit on a ball joint, and then acts alike along all three of its degrees of freedom.
     BALLS: ClassVar[bool] = False
     # Attributes that `propose` sets and no parameter holds, each a text or a number: saved effects keep them.

@@ -22,7 +22,7 @@ from nfc_gym.physics.effects.base import (
 )
 from nfc_gym.physics.effects.drive import ENDLESS, actuator_places, command_unit, is_position, plain
 from nfc_gym.physics.effects.places import sized, with_units
-from nfc_gym.physics.effects.ranges import narrow_ranges, shift_range
+from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, shift_range
 from nfc_gym.physics.fields import ModelFields
 
 _NONE, _AFFINE = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -186,6 +186,8 @@ class Saturation(_OnCommand):
         if self.on_force:
             high = np.full(len(self.where), 1 / max(float(theta[0]), 1 / ENDLESS))
             kind, low = "force", -high
+        elif any(mixes(spec, spec.actuator(n)) for n in self.where):  # a delay after it, which is carried before it
+            return False
         return narrow_ranges(spec, self.where, kind, low, high)
 
     def say(self, theta: Array, sd: Array | None = None) -> str:

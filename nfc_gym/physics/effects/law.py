@@ -53,6 +53,7 @@ class Law(Effect):
     """
 
     generic = True
+    repeats = True  # what is pushed and what is read are named beside each other
     terms: ClassVar[int] = 1
 
     def bind(self, model: mujoco.MjModel) -> None:

@@ -82,8 +82,13 @@ def with_joint_units(params: Iterable[Param], model: mujoco.MjModel, dofs: Itera
     """The same parameters with units that fit what they act on: families declare those of a hinge."""
     if any(turns(model, int(d)) for d in dofs):
         return tuple(params)
-    slid = (("kg m^2", "kg"), ("N m", "N"), ("rad", "m"))
-    return tuple(replace(p, unit=reduce(lambda unit, pair: unit.replace(*pair), slid, p.unit)) for p in params)
+    return tuple(replace(p, unit=slid(p.unit)) for p in params)
+
+
+def slid(unit: str) -> str:
+    """What takes the place of a hinge's unit where a joint slides."""
+    pairs = (("kg m^2", "kg"), ("N m", "N"), ("rad", "m"))
+    return reduce(lambda told, pair: told.replace(*pair), pairs, unit)
 
 
 def force_unit(model: mujoco.MjModel, joint: str) -> str:

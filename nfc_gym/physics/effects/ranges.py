@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+_WHOLE = 1e-6  # of a step
 
 
 def range_of(actuator: mujoco.MjsActuator, kind: str) -> tuple[float, float]:
@@ -23,6 +24,12 @@ def shift_range(actuator: mujoco.MjsActuator, kind: str, by: float) -> None:
     low, high = range_of(actuator, kind)
     if low > -np.inf:
         setattr(actuator, f"{kind}range", (low - by, high - by))
+
+
+def mixes(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> bool:
+    """Whether an actuator's delay mixes two commands, which MuJoCo does before it clips them."""
+    steps = actuator.delay / spec.option.timestep
+    return actuator.interp > 0 and abs(steps - round(steps)) > _WHOLE
 
 
 def narrow_ranges(spec: mujoco.MjSpec, names: Sequence[str], kind: str, low: Array, high: Array) -> bool:

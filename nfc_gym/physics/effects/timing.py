@@ -117,7 +117,10 @@ class Lag(_Late):
 
 
 class Delay(_Late):
-    """Pure delay of the command. A delay between two steps mixes the two commands around it linearly."""
+    """Pure delay of the command. A delay between two steps mixes the two commands around it linearly.
+
+    What is mixed is clipped, as MuJoCo's own delay is.
+    """
 
     family = "delay"
     summary = "Delayed command"
@@ -126,7 +129,7 @@ class Delay(_Late):
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         """What each past command weighs, None for one that no simulation looks back to, and those commands."""
         weights = self._weights(theta, dt)
-        return weights, [self._commands(ctrl)] * len(weights)
+        return weights, [ctrl[..., self.rows]] * len(weights)
 
     @staticmethod
     def _weights(theta: Array, dt: float) -> list[Array | None]:
@@ -142,14 +145,15 @@ class Delay(_Late):
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
         weights, past = memory
-        past = [self._commands(ctrl), *past[:-1]]
+        past = [ctrl[..., self.rows], *past[:-1]]
         made = reduce(add, [w * values for w, values in zip(weights, past, strict=True) if w is not None])
-        return self._replace(ctrl, made), (weights, past)
+        return self._replace(ctrl, limited(made, *self.limits)), (weights, past)
 
     def course(self, ctrl: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
-        wish, at = self._commands(ctrl), np.arange(ctrl.shape[-2])
+        wish, at = ctrl[..., self.rows], np.arange(ctrl.shape[-2])
         weighed = ((age, w[..., None, :]) for age, w in enumerate(self._weights(theta, dt)) if w is not None)
-        return self._replace(ctrl, reduce(add, [w * wish[..., np.maximum(at - age, 0), :] for age, w in weighed]))
+        made = reduce(add, [w * wish[..., np.maximum(at - age, 0), :] for age, w in weighed])
+        return self._replace(ctrl, limited(made, *self.limits))
 
     def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
         out, time = np.array(force), np.arange(len(force)) * ctx.dt

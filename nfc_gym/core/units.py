@@ -1,11 +1,12 @@
 """One table of units: what a log may be given in, and the SI unit it becomes."""
 
+import re
 from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nfc_gym.core import InputError
+from nfc_gym.core.errors import InputError
 
 _TURN = 2 * np.pi
 _STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
@@ -43,11 +44,20 @@ _TABLE: dict[str, tuple[str, float, float]] = {
     "Pa": ("Pa", 1.0, 0.0),
 }
 UNITS = tuple(_TABLE)
+_NAMES = re.compile(r"[^\W\d]+")
+_COHERENT = {"s", "rad", "m", "N", "Nm", "V", "A", "kg", "K", "Pa", "W", "J", "Hz"}
 
 
 def known(unit: str) -> bool:
     """Whether `unit` is in the table."""
     return unit in _TABLE
+
+
+def coherent(unit: str) -> bool:
+    """Whether `unit` is SI as it stands, a product of powers of base units included, or "1" or "own unit"."""
+    if unit in _TABLE:
+        return _TABLE[unit] == (unit, 1.0, 0.0)
+    return unit == "own unit" or set(_NAMES.findall(unit)) <= _COHERENT
 
 
 def si_unit(unit: str) -> str:
