@@ -98,9 +98,9 @@ def _resolved(rate: Array) -> bool:
 
 
 def _commanded(log: Log, interval: float) -> bool:
-    """Whether commands change about as often as every `interval` s."""
-    changes = [int(np.count_nonzero(np.diff(series))) for series in log.controls.values()]
-    return max(changes, default=0) * interval > 0.5 * log.duration
+    """Whether commands are held about as long as `interval` s."""
+    changes = max((int(np.count_nonzero(np.diff(series))) for series in log.controls.values()), default=0)
+    return 0.5 * log.duration < changes * interval < 1.5 * log.duration
 
 
 def _pairs(model: mujoco.MjModel | None, log: Log) -> Iterator[tuple[str, str, Array, Array]]:

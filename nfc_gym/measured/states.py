@@ -14,6 +14,9 @@ from nfc_gym.physics.effects.sensors import RATES, SPEEDS
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back, vector_to_quat
 
 Array = NDArray[np.float64]
+# Standard deviations of the declared noise by which a channel's fit is off what was measured, from which on the motion
+# is one that a polynomial does not follow, as a wheel's speed that is another after each command.
+_FAR = 3.0
 _FEWEST = 8  # rows of a channel from which its course is told without those that are masked
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
@@ -64,11 +67,17 @@ def _turned(quat: Array) -> Array:
 def _smooth(log: Log, channel: Channel, values: Array, points: int, raw: bool) -> Local:
     index, wide = _measured(log, channel), values.reshape(len(log), -1)
     fit = local_polynomial(log.time[index], wide[index], log.time, points)
-    if not raw or (channel.mask is None and len(index) < len(log)):
+    whole = channel.mask is not None or len(index) == len(log)
+    if raw and whole:
+        value = fit.value.copy()
+        value[index] = wide[index]
+        return replace(fit, value=value)
+    off = float(np.sqrt(np.square(wide[index] - fit.value[index]).mean()))
+    if channel.noise is None or off <= _FAR * channel.noise:
         return fit
-    value = fit.value.copy()
-    value[index] = wide[index]
-    return replace(fit, value=value)
+    value, gain = fit.value.copy(), fit.value_gain.copy()
+    value[index], gain[index] = wide[index], 1.0
+    return replace(fit, value=value, value_gain=gain)
 
 
 def _averaged(log: Log, channel: Channel) -> Array:

@@ -148,3 +148,21 @@ def test_roll_outs_of_a_log_begin_at_the_true_state(speed: tuple[str, ...]) -> N
     rolled = plant.shoot(np.concatenate([th for _, th in faults])[None], segments)
     np.testing.assert_allclose(rolled.qpos[0, :, 0, 7], truth(1.0)[J + "pos"][where.start, 0], atol=1e-8)
     np.testing.assert_allclose(rolled.qvel[0, :, 0, 6], 0.7, atol=1e-8)
+
+
+def _stepping(noise: float | None) -> tuple[Log, Array]:
+    """A joint whose speed is another after each command, measured to 1e-4 rad/s, and that speed."""
+    rng = np.random.default_rng(0)
+    speed = np.repeat(rng.normal(size=ROWS // 3 + 1), 3)[:ROWS] + 1e-4 * rng.normal(size=ROWS)
+    position, speed_ = Channel(DT * np.cumsum(speed), "rad", 1e-4), Channel(speed, "rad/s", noise)
+    return Log("steps", DT * np.arange(ROWS), {}, {J + "pos": position, J + "vel": speed_}), speed
+
+
+def test_a_motion_that_no_polynomial_follows_is_taken_as_it_is_measured() -> None:
+    """Where the log says how well: else what jumps is told from noise by nothing."""
+    log, speed = _stepping(1e-4)
+    states = estimate_states(MODEL, log)
+    np.testing.assert_array_equal(states.qvel[:, 6], speed)
+    np.testing.assert_allclose(states.qvel_sd[:, 6], 1e-4)
+    for noise in (None, 0.5):
+        assert np.abs(estimate_states(MODEL, _stepping(noise)[0]).qvel[:, 6] - speed).max() > 0.3
