@@ -80,7 +80,8 @@ As a row, as `ApplyEffects` takes it and `effects.yaml` holds it, with a value o
   says what the effect is like, and the others say how much of it there is. What is *of the day* may differ between the
   `condition`s of the logs. *Own unit* is that of the place: of an actuator's command, of a channel, of a joint's force.
 - **kept in**: where a run writes what it found. `model.xml` carries what MJCF can say, and what it carries needs no
-  wrapper: plain MuJoCo simulates it. `effects.yaml` lists the others. Both are named where it depends: a delay
+  wrapper: plain MuJoCo simulates it (from rest at a command of 0, see
+  [results.md](results.md#modelxml)). `effects.yaml` lists the others. Both are named where it depends: a delay
   shorter than a physics step, a lag of an actuator that has an activation already, or soil that resists wheels
   besides letting them sink is nothing that MJCF can say.
 """

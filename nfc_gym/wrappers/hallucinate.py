@@ -48,7 +48,7 @@ def checked_beta(beta: Any) -> float:
 
 def drawn(posterior: Source, samples: int) -> Fidelity:
     """Samples of a posterior, always the same ones: what the action means must not change from run to run."""
-    count = require_whole("samples", samples, 2)
+    count = require_whole("samples", samples, 1)
     return sampler_of(posterior, "psi", "Hallucinate").sample(count, np.random.default_rng(0))
 
 

@@ -137,6 +137,8 @@ def test_reset_options_are_checked() -> None:
         ({"terrain_id": np.nan}, "nan, want a whole number"),
         ({"heightfield": np.zeros((5, 5))}, r"shape \(5, 5\), want \(256, 256\)"),
         ({"heightfield": np.full((256, 256), np.nan)}, "not finite"),
+        ({"heightfield": "hill"}, "heightfield is 'hill', want a number or an array of numbers"),
+        ({"terrain_residual": [[0.0], [0.0, 1.0]]}, "terrain_residual is .*, want a number"),
         ({"heightfield": np.full((256, 256), 99.0)}, "-5 to 11 m"),
         ({"heightfield": np.zeros((256, 256)), "terrain_id": 1}, "give one of them"),
     ):

@@ -203,6 +203,11 @@ def test_bad_input_is_refused_by_name() -> None:
         Hallucinate(FakeEnv(), _samples(), space=["cube"])
     with pytest.raises(InputError, match="two samples"):
         Hallucinate(FakeEnv(), Fidelity(delta_s=np.zeros(7)), samples=1)
+    for samples in ("a", 2.5, -3):
+        with pytest.raises(InputError, match=f"samples is {samples!r}"):
+            Hallucinate(FakeEnv(), Fidelity(delta_s=np.zeros(7)), samples=samples)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="component 1 of delta_s: want"):
+        Hallucinate(FakeEnv(), Fidelity(delta_s=np.zeros(2)), components=[1, 2])  # type: ignore[list-item]
     with pytest.raises(InputError, match="nv = 7"):
         Hallucinate(FakeEnv(), Fidelity(delta_s=np.zeros(5)))
     with pytest.raises(InputError, match="force, state"):
