@@ -12,6 +12,7 @@ from rich.console import Console
 
 from nfc_gym.adaptation.policy import Policy, load_policy
 from nfc_gym.core.errors import InputError, MissingExtra
+from nfc_gym.core.files import require_writable
 from nfc_gym.simulate.machine import full_id
 
 VIDEOS, PICTURES = (".mp4", ".avi"), (".png", ".jpg", ".jpeg")
@@ -39,12 +40,17 @@ def play(
       For each episode `return`, `length`, where there is a goal `success` (it was reached at any time).
 
     Raises:
-      InputError: no such environment or policy, one that does not fit, or an `out` of another kind.
+      InputError: no such environment or policy, one that does not fit, an `out` of another kind, or nothing can be
+        written there.
       MissingExtra: nothing can be rendered here.
     """
     name, path = full_id(environment), None if out is None else Path(out)
     if path is not None and path.suffix.lower() not in VIDEOS + PICTURES:
         raise InputError(f"{path}: want a video ({', '.join(VIDEOS)}) or a picture ({', '.join(PICTURES)})")
+    if path is not None:
+        require_writable(path.absolute().parent)
+        if path.is_dir():
+            raise InputError(f"{path} is a folder: name the file to write in it")
     loaded = load_policy(name if policy is None else policy)
     look: dict[str, Any] = {} if path is None else {"render_mode": "rgb_array", "width": _SIZE[0], "height": _SIZE[1]}
     context = ["psi", "elevation"] if loaded.sight.cells else ["psi"]

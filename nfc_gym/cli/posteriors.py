@@ -11,7 +11,8 @@ from rich.console import Console
 
 from nfc_gym.cli.outcome import outcome, say_written
 from nfc_gym.cli.policies import Environment
-from nfc_gym.core import InputError, kinds
+from nfc_gym.core import InputError, Sampler, kinds, load_source
+from nfc_gym.core.files import require_writable
 
 if TYPE_CHECKING:
     from nfc_gym.inference.posterior import Window
@@ -72,14 +73,38 @@ def simulate(
             from nfc_gym.adaptation import load_policy
 
             mover = load_policy(policy).perceptron()  # plain arrays: any process can be sent them
+        source = None if proposal is None else _proposal(proposal, environment)
         run(
-            environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=proposal, policy=mover,
+            environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=source, policy=mover,
             policy_share=policy_share, motor=motor, ray=ray, console=Console(),
         )  # fmt: skip
         if maps:
             from nfc_gym.simulate.maps import keep_maps
 
             keep_maps(out, jobs, Console())
+
+
+def _proposal(file: Path, environment: str) -> Sampler:
+    """What psi is drawn from; of a posterior it is said here what is wrong with it, since here its file is known."""
+    source = load_source(file)
+    if file.suffix.lower() != ".safetensors":
+        return source
+    from nfc_gym.inference.posterior import NeuralPosterior
+    from nfc_gym.simulate.machine import Machine
+
+    if isinstance(source, NeuralPosterior):
+        machine, robot = Machine(environment), source.prior.robot
+        if robot != machine.kind.name:
+            raise InputError(
+                f"--proposal {file}: a posterior of the robot {robot!r}, and {machine.environment} is of "
+                f"{machine.kind.name!r}: choose one of that robot"
+            )
+        if source.kept is None:
+            raise InputError(
+                f"--proposal {file}: this posterior was given no window: give what "
+                f"`nfc-gym infer {file} window.npz --out given.safetensors` writes"
+            )
+    return source
 
 
 def train(
@@ -122,6 +147,7 @@ def train(
     """
     with outcome(ctx, resumes=True):
         kinds.require_kind(out, kinds.STRUCTURE if structure else kinds.POSTERIOR)
+        require_writable(out.absolute().parent)
         from nfc_gym.core import MissingExtra
         from nfc_gym.inference.windows import Manifest
         from nfc_gym.simulate.machine import Machine
@@ -161,6 +187,8 @@ def _told(posterior: Path) -> str:
 
     told = checkpoint.load(posterior)[2]["told"]
     mean, error = told["mean"], told["error"]
+    if told["windows"] < 2:  # whose spread is no standard error
+        return "; a single window was held out, too few to judge what a window tells of psi: simulate more of them"
     more = "" if mean > 2 * error else ", no more than the prior: simulate more windows, or motion that shows it"
     return (
         f"; of psi a window tells {mean:.3f} nats a parameter (standard error {error:.3f}, {told['windows']} windows "
@@ -189,8 +217,12 @@ def infer(
         int | None,
         typer.Option(min=500, metavar="N", help="Learn anew from N simulations of these commands: sharper, minutes."),
     ] = None,
-    device: Annotated[str, typer.Option(help="For --refine: auto, cpu or cuda.")] = "auto",
-    jobs: Annotated[int, typer.Option(min=0, help="For --refine: processes that simulate; 0 takes all cores.")] = 0,
+    device: Annotated[
+        str | None, typer.Option(help="For --refine: auto, cpu or cuda; default auto, a GPU where there is one.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=0, help="For --refine: processes that simulate; default 0, all cores.")
+    ] = None,
 ) -> None:
     """Say what psi could have made a window of motion, and draw from that posterior.
 
@@ -215,12 +247,18 @@ def infer(
 
         from nfc_gym.core import MissingExtra
 
+        mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
+        for option, value in (("--log", log), ("--until", until)):
+            if value is not None and not mapped:
+                raise InputError(f"{option} is of a mapping's logs, and {window} is no mapping file: leave it out")
+        for option, value in (("--device", device), ("--jobs", jobs)):
+            if value is not None and refine is None:
+                raise InputError(f"{option} {value} is for --refine: give --refine N too, or leave it out")
         try:
             from nfc_gym.inference import jobs as learning
         except ImportError as e:
             raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
 
-        mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
         seen = _window(posterior, window, log, until) if mapped else window
         anew = None
         if refine is not None:
@@ -228,8 +266,9 @@ def infer(
             from nfc_gym.simulate.refined import refined
 
             anew = partial(
-                refined, simulations=refine, seed=seed, jobs=jobs, device=learning.device_of(device), report=Spoken()
-            )
+                refined, simulations=refine, seed=seed, jobs=jobs or 0, device=learning.device_of(device or "auto"),
+                report=Spoken(),
+            )  # fmt: skip
         drawn, found = learning.infer(posterior, seen, samples=samples, seed=seed, out=out, refined=anew)
         table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
         for each in found:

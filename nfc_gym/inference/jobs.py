@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
+from zipfile import BadZipFile, is_zipfile
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
-from nfc_gym.core.files import replacing
+from nfc_gym.core.files import replacing, require_writable
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import StoredWindows
@@ -31,6 +31,8 @@ HELD_OUT = 0.05  # of the windows, by which epochs are compared
 JUDGED = 256  # of these, at most, by which the posterior is judged at the end
 _LEVEL = 0.9
 AS_WIDE = 0.9  # of the prior's own 90 % interval: told little or nothing
+_FARTHEST = 2.0  # in size, of an action: a log may command a little more than [-1, 1], raw commands are far beyond
+_FORM = "an .npz (numpy.savez) with `states` (n + 1, s) and `actions` (n, a)"
 
 
 def device_of(name: str) -> torch.device:
@@ -66,12 +68,13 @@ def train_posterior(
       noise: what multiplies the sensor noise that the windows' manifest assumes, for sensors that are better or worse.
 
     Raises:
-      InputError: no such windows, windows without maps where the network needs them, a name of another ending, or
-        something else than a posterior is there.
+      InputError: no such windows, windows without maps where the network needs them, a name of another ending,
+        something else than a posterior is there, or nothing can be written there.
     """
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: a posterior is kept in a file that ends in .safetensors")
     kinds.require_kind(out, kinds.POSTERIOR)
+    require_writable(out.absolute().parent)
     stored = Windows(folder, robot=prior.robot, psi_names=prior.names)
     if config.elevation and "map" not in stored.names:
         raise InputError(f"{folder}: the windows have no elevation maps; make them with `nfc-gym simulate ... --maps`")
@@ -107,10 +110,13 @@ def read_window(path: Path) -> Window:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays: dict[str, Any] = {k: file[k] for k in file.files}
+        with path.open("rb") as file:
+            if not is_zipfile(file):  # NumPy would take it for a pickle, and advise to load it as such
+                raise InputError(f"{path} is no .npz file: a window of motion is {_FORM}")
+        with np.load(path, allow_pickle=False) as archive:
+            arrays: dict[str, Any] = {k: archive[k] for k in archive.files}
     except (OSError, ValueError, EOFError, AttributeError, TypeError, BadZipFile) as e:
-        raise InputError(f"{path} is no .npz file ({e}); want one with `states` (n + 1, s), `actions` (n, a)") from None
+        raise InputError(f"{path} is no .npz file ({e}); want {_FORM}") from None
     missing = [k for k in ("states", "actions") if k not in arrays]
     if missing:
         raise InputError(f"{path}: no array {missing[0]!r}; there are: {', '.join(arrays) or 'none'}")
@@ -144,23 +150,49 @@ def infer(
       refined: makes of the posterior one given the window, `simulate.refined`; None gives it the window.
 
     Raises:
-      InputError: a damaged file, a window that is not the network's, another ending, or something else than that is
-        at `out`.
+      InputError: a damaged file, a window that is not the network's or whose actions are far outside [-1, 1], another
+        ending, something else than that is at `out`, or nothing can be written there.
     """
     if out is not None and out.suffix not in (".npz", ".safetensors"):
         raise InputError(f"{out}: draws are kept in .npz, the posterior given the window in .safetensors")
     if out is not None:
         kinds.require_kind(out, kinds.DRAWS if out.suffix == ".npz" else kinds.POSTERIOR)
+        require_writable(out.absolute().parent)
     found, seen = load(posterior), window if isinstance(window, Window) else read_window(window)
-    given = found.given(seen) if refined is None else refined(found, seen)
+    given = _given(found, seen, "window" if isinstance(window, Window) else str(window))
+    if refined is not None:
+        given = refined(found, seen)
     parts = [p for p in given.network.parts if p != "delta_e"]
     drawn = given.of(*parts).sample(samples, np.random.default_rng(seed))
     if out is not None and out.suffix == ".safetensors":
         given.save(out)
     elif out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
         with replacing(out) as part, part.open("wb") as file:
             np.savez(file, **{p: getattr(drawn, p) for p in parts})
     return drawn, told(given.prior, np.asarray(drawn.psi))
+
+
+def _given(posterior: NeuralPosterior, window: Window, name: str) -> NeuralPosterior:
+    """The posterior given a window; what is wrong with the window is said under its name.
+
+    A network answers motion that it has never seen with as much certainty as any other, so actions far outside [-1, 1]
+    are refused here: in those rows that count.
+    """
+    try:
+        given = posterior.given(window)
+    except InputError as e:
+        raise InputError(f"{name}: {str(e).removeprefix('window: ')}") from None
+    actions = np.asarray(window.actions, float)
+    first = len(actions) - posterior.network.sizes.horizon
+    far = np.argwhere(np.abs(actions[first:]) > _FARTHEST)
+    if len(far):
+        k, i = far[0]
+        raise InputError(
+            f"{name}: actions are what env.step takes, in [-1, 1]; actions[{first + k}, {i}] is "
+            f"{actions[first + k, i]:g}: raw commands, or other units?"
+        )
+    return given
 
 
 def told(prior: PriorBox, psi: Array) -> list[Told]:

@@ -86,7 +86,10 @@ class NeuralPosterior:
         states, actions = np.asarray(window.states, float), np.asarray(window.actions, float)
         for name, x, width in (("states", states, size.states), ("actions", actions, size.actions)):
             if x.ndim != 2 or x.shape[1] != width:
-                raise InputError(f"window: {name} must have shape (time, {width}), got {x.shape}")
+                raise InputError(
+                    f"window: {name} must have shape (time, {width}), got {x.shape}; "
+                    f"this posterior is of the robot {self.prior.robot!r}"
+                )
         if len(states) != len(actions) + 1:
             raise InputError(f"window: n + 1 states go with n actions, got {len(states)} and {len(actions)}")
         if len(actions) < size.horizon:
@@ -113,7 +116,8 @@ class NeuralPosterior:
         if self.kept is None:
             raise InputError(
                 f"the posterior of {self.prior.robot!r} was given no window: "
-                "call posterior.given(Window(states, actions))"
+                "call posterior.given(Window(states, actions)), or write the posterior given one by "
+                "`nfc-gym infer FILE window.npz --out given.safetensors`"
             )
         return self.kept
 

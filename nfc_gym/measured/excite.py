@@ -14,7 +14,7 @@ from rich.console import Console
 
 from nfc_gym.core import units
 from nfc_gym.core.errors import InputError
-from nfc_gym.core.files import write_whole
+from nfc_gym.core.files import require_writable, write_whole
 from nfc_gym.measured import questions
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.checks import require
@@ -118,6 +118,7 @@ def _outputs(out: Path, overwrite: bool) -> Path:
         raise InputError(f"--out {out}: the commands are a CSV file; name it so, {out.with_suffix('.csv').name}")
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: no such folder as {out.parent}")
+    require_writable(out.parent)
     for path in (out, out.with_suffix(".json"), out.with_suffix(".html")):
         if path.exists() and not overwrite:
             raise InputError(f"{path} exists: choose another --out, or say --overwrite to replace it")

@@ -1,9 +1,12 @@
 """`refined`: what a trained posterior says of one window, learned anew from simulations of that window's commands."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.posterior import NeuralPosterior, Window
@@ -14,7 +17,9 @@ from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.repeated import Repeated
 from nfc_gym.simulate.rounds import Simulator
 
+Array = NDArray[np.float64]
 BEGINNINGS = 2048  # windows of any motion, from which it is learned where this one may have begun
+_PORTIONS, _LEAST = 10, 100  # that windows are simulated in, to say how far it is, and windows of one
 
 
 def refined(
@@ -57,12 +62,44 @@ def refined(
     simulator = Simulator(environment, effects=0.0, jobs=jobs, noise=noise, names=("states", "actions"))
     rng = np.random.default_rng([seed, 2])
     report.message(f"simulates {BEGINNINGS} windows of any motion: where this one may have begun")
-    known = replace(simulator, names=("states", "start")).draw(BEGINNINGS, rng)
+    beginnings = replace(simulator, names=("states", "start"))
+    known = _in_portions(BEGINNINGS, lambda rows: beginnings.draw(len(rows), rng), report)
     again = Repeated.of(simulator, states, actions, {k: t.numpy() for k, t in known.items()})
     report.message(f"simulates {simulations} windows of these commands, in two rounds")
     training = training or TrainConfig(patience=10, seed=seed)
-    done = refine(posterior, window, again, halved(simulations, seed), training, device=device, report=report)
+    done = refine(
+        posterior, window, _Told(again, report), halved(simulations, seed), training, device=device, report=report
+    )
     learned = done.posterior
     assert isinstance(learned, NeuralPosterior)  # only draws of the posterior itself want a correction
     notes = posterior.notes | {"refined": simulations, "kept": done.kept[-1]}
     return NeuralPosterior(learned.network, learned.kept, notes)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """Simulates as `again` does, in portions, and says after each how far it is.
+
+    The portions depend on the number of windows alone, so that a seed gives the same bits at any number of jobs.
+    """
+
+    again: Repeated
+    report: Report
+
+    @property
+    def noise(self) -> Array:
+        """As of `Repeated.noise`."""
+        return self.again.noise
+
+    def __call__(self, psi: Array, rng: np.random.Generator) -> dict[str, Any]:
+        """As of `Repeated.__call__`."""
+        return _in_portions(len(psi), lambda rows: self.again(psi[rows], rng), self.report)
+
+
+def _in_portions(n: int, made: Callable[[NDArray[np.intp]], dict[str, Any]], report: Report) -> dict[str, Any]:
+    """A batch of n windows, of which `made` makes some at a time; the report is told after each portion."""
+    batches: list[dict[str, Any]] = []
+    for rows in np.array_split(np.arange(n), min(_PORTIONS, max(1, n // _LEAST))):
+        batches.append(made(rows))
+        report.message(f"{rows[-1] + 1} of {n} windows simulated")
+    return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}

@@ -137,7 +137,10 @@ def box_key(space: gym.Space, key: str | None, size: int) -> str | None:
             raise InputError(f"ResidualDynamics: delta_s of {size} entries wants {wanted}; {found}: {there}")
         return key
     if space.shape != (size,):
-        raise InputError(f"ResidualDynamics: delta_s has {size} entries where the observation has shape {space.shape}")
+        raise InputError(
+            f"ResidualDynamics: delta_s has {size} entries where the observation has shape {space.shape}; environments "
+            'of this package have `proprio`, of which their delta_s is, as a key of its own with context=["psi"]'
+        )
     return None
 
 

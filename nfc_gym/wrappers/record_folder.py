@@ -1,6 +1,7 @@
 """A folder of logs in the measured loop's format: the model, the mapping, and a Parquet file an episode."""
 
 import os
+import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from nfc_gym.wrappers.record_channels import columns, model_text, values
 
 Array = NDArray[np.float64]
 _NEEDED = ("pyarrow", "yaml")
+# Declared of what a simulation measures, which has no noise: fine enough that the motion is taken as it was recorded.
+_NOISE = {"m": 1e-4, "rad": 1e-4, "m/s": 1e-3, "rad/s": 1e-2}
 _SAMPLES = 8  # in a compared stretch, where control is slow: as many as 0.4 s at 20 Hz
 
 
@@ -29,7 +32,8 @@ class LogFolder:
 
     Raises:
       MissingExtra: Parquet or YAML cannot be written.
-      InputError: the model's MJCF is not at hand, or the folder holds logs of another model.
+      InputError: the model's MJCF is not at hand, the folder holds logs of another model, or nothing can be written
+        there.
     """
 
     def __init__(self, env: Any, sim: Any, path: str | os.PathLike[str], model_file: str | None) -> None:
@@ -41,7 +45,13 @@ class LogFolder:
         self.controls = [f"ctrl:{name}" for name in names(sim.nominal).actuators]
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"RecordLog: {self.folder} is a file; `path` is the folder that episodes are written to")
-        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=self.folder).close()
+        except OSError as e:
+            raise InputError(
+                f"RecordLog: {self.folder} cannot be written ({e.strerror or e}): choose another `path`"
+            ) from None
         self.count = len(list(self.folder.glob("episode_*.parquet")))
         self.text = ""
         self._heights: Array | None = None
@@ -121,5 +131,8 @@ def _parameter(p: Any, nominal: float) -> dict[str, Any]:
 
 def _channel(column: Any) -> dict[str, Any]:
     places = [column.name] if column.size == 1 else [f"{column.name}[{i}]" for i in range(column.size)]
-    quaternion = {"order": "wxyz"} if column.name.endswith(":quat") else {"unit": column.unit}
-    return {"columns": places, **quaternion}
+    quaternion = column.name.endswith(":quat")
+    told: dict[str, Any] = {"order": "wxyz"} if quaternion else {"unit": column.unit}
+    if quaternion or not column.name.startswith("sensor:"):
+        told["noise"] = _NOISE["rad" if quaternion else column.unit]
+    return {"columns": places, **told}

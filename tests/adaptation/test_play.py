@@ -37,6 +37,12 @@ def test_a_video_plays_in_real_time(tmp_path: Path) -> None:
 def test_bad_input_is_named(jackal: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"\.gif: want a video"):
         play.play("JackalFlat", jackal, tmp_path / "x.gif")
+    for at in ("/proc/none/x.png", "/proc/none/x.mp4"):
+        with pytest.raises(InputError, match="/proc/none cannot be written"):  # before the policy is looked for
+            play.play("JackalFlat", tmp_path / "gone.safetensors", at)
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(InputError, match=r"folder\.png is a folder"):
+        play.play("JackalFlat", jackal, tmp_path / "folder.png")
     with pytest.raises(InputError, match="cannot act in AntFlat"):
         play.play("AntFlat", jackal)
     policy = load_policy(jackal)

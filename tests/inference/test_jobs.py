@@ -1,6 +1,7 @@
 """`nfc-gym train` and `nfc-gym infer`, from a folder of windows to psi."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from nfc_gym.core import InputError
 from nfc_gym.core.posterior import load_source
 from nfc_gym.inference import jobs
 from nfc_gym.inference.config import NetworkConfig
+from nfc_gym.inference.posterior import Window
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig
 from nfc_gym.inference.windows import Windows
@@ -84,6 +86,7 @@ def test_the_command_trains_and_the_other_tells(windows: Path, motion: Path, tmp
                             "--no-delta-s", "--device", "cpu"])  # fmt: skip
     assert made.exit_code == 0, made.output
     assert "of psi a window tells" in made.output
+    assert "3 windows held out" in made.output
     found = run.invoke(app, ["infer", str(file), str(motion), "--samples", "50"])
     assert found.exit_code == 0, found.output
     assert "base_mass" in found.output
@@ -110,9 +113,101 @@ def test_a_window_that_is_none_is_refused(
     assert said in " ".join(done.output.split())
 
 
+def test_a_folder_for_the_draws_is_made_and_one_that_cannot_be_is_refused_at_once(
+    posterior: Path, motion: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "new" / "psi.npz"
+    jobs.infer(posterior, motion, samples=10, out=out)
+    assert load_source(out).sample(3, np.random.default_rng(0)).psi is not None
+    for name in ("psi.npz", "psi.safetensors"):
+        with pytest.raises(InputError, match="/proc/none cannot be written"):  # before the posterior is looked for
+            jobs.infer(tmp_path / "gone.safetensors", motion, out=Path("/proc/none") / name)
+
+
+def test_training_into_a_place_that_cannot_be_written_is_refused_at_once(prior: PriorBox, tmp_path: Path) -> None:
+    out = Path("/proc/none/x.safetensors")
+    with pytest.raises(InputError, match="/proc/none cannot be written"):  # before the windows are looked for
+        jobs.train_posterior(tmp_path / "gone", prior, out, SMALL, TrainConfig(), device="cpu")
+    for more in ([], ["--structure"]):
+        done = CliRunner().invoke(app, ["train", str(tmp_path / "gone"), "--out", str(out), *more])
+        assert done.exit_code == 2
+        assert "/proc/none cannot be written" in " ".join(done.output.split())
+
+
+def test_actions_of_other_units_are_refused_in_the_rows_that_count(
+    posterior: Path, motion: Path, tmp_path: Path
+) -> None:
+    with np.load(motion) as one:
+        states, actions = one["states"].copy(), one["actions"].copy()
+    actions[12, 0] = 1.2  # a log may command a little more than the machine takes
+    jobs.infer(posterior, Window(states, actions), samples=10)
+    actions[12, 0] = 30
+    file = tmp_path / "raw.npz"
+    for more in (0, 12):  # rows behind: the last 20 count, of 32 those from 12 on
+        np.savez(
+            file, states=np.concatenate([states, states[:more]]), actions=np.concatenate([actions, actions[:more]])
+        )
+        with pytest.raises(InputError, match=re.escape("in [-1, 1]; actions[12, 0] is 30: raw")) as caught:
+            jobs.infer(posterior, file)
+        assert str(caught.value).startswith(f"{file}: actions are what env.step takes")
+    longer = Window(np.concatenate([states, states[:13]]), np.concatenate([actions, np.zeros((13, 4))]))
+    jobs.infer(posterior, longer, samples=10)
+
+
+def test_a_window_of_another_robot_is_refused_by_its_files_name(posterior: Path, tmp_path: Path) -> None:
+    file = tmp_path / "jackal.npz"
+    np.savez(file, states=np.zeros((21, 15)), actions=np.zeros((20, 2)))
+    said = rf"^{file}: states must have shape \(time, 21\), got \(21, 15\); .* is of the robot 'quadcopter'"
+    with pytest.raises(InputError, match=said):
+        jobs.infer(posterior, file)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--log", "run_0", "--log is of a mapping's logs"),
+        ("--until", "1.5", "--until is of a mapping's logs"),
+        ("--device", "cpu", "--device cpu is for --refine"),
+        ("--jobs", "0", "--jobs 0 is for --refine"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(
+    posterior: Path, motion: Path, option: str, value: str, said: str
+) -> None:
+    done = CliRunner().invoke(app, ["infer", str(posterior), str(motion), option, value])
+    assert done.exit_code == 2
+    assert said in " ".join(done.output.split())
+
+
+def test_a_single_window_held_out_judges_nothing(tmp_path: Path) -> None:
+    simulate(ENV, 20, tmp_path / "few", jobs=1)
+    out = str(tmp_path / "q.safetensors")
+    made = CliRunner().invoke(app, ["train", str(tmp_path / "few"), "--out", out, "--encoder", "none", "--epochs", "1",
+                                    "--no-delta-s", "--device", "cpu"])  # fmt: skip
+    assert made.exit_code == 0, made.output
+    assert "a single window was held out, too few to judge" in made.output
+    assert "standard error" not in made.output
+
+
+def test_a_proposal_of_another_robot_or_without_a_window_is_told_as_that(posterior: Path, tmp_path: Path) -> None:
+    def said(environment: str) -> str:
+        out = str(tmp_path / "windows")
+        done = CliRunner().invoke(
+            app, ["simulate", environment, "--windows", "1", "--out", out, "--proposal", str(posterior)]
+        )
+        assert done.exit_code == 2, done.output
+        return " ".join(done.output.split())
+
+    assert "a posterior of the robot 'quadcopter', and nfc_gym/AntFlat-v0 is of 'ant'" in said("AntFlat")
+    assert f"`nfc-gym infer {posterior} window.npz --out given.safetensors`" in said("QuadcopterFlat")
+
+
 def test_files_that_are_something_else_are_refused(posterior: Path, motion: Path, tmp_path: Path) -> None:
     text = tmp_path / "w.npz"
     text.write_text("no archive")
+    with pytest.raises(InputError) as caught:
+        jobs.infer(posterior, text)
+    assert "pickle" not in str(caught.value)
     for at, said in ((text, "no .npz"), (tmp_path / "gone.npz", "no such file")):
         with pytest.raises(InputError, match=said):
             jobs.infer(posterior, at)

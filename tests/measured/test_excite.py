@@ -233,6 +233,7 @@ def test_the_report_advises_a_motion_for_what_it_cannot_tell_apart(mapping: Path
         (["{m}", "--fit", "{d}/nowhere"], "report.json does not exist; run close-loop"),
         (["{m}", "--out", "{d}/next.txt"], "the commands are a CSV file; name it so, next.csv"),
         (["{m}", "--out", "{d}/none/next.csv"], "no such folder"),
+        (["{m}", "--out", "/proc/next.csv"], "/proc cannot be written"),
         (["{m}", "--out", "{d}/fit_0.csv"], "fit_0.csv exists: choose another --out, or say --overwrite"),
     ],
 )

@@ -295,6 +295,12 @@ def test_bad_input_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
             RecordLog(FakeEnv(), tmp_path)
 
 
+def test_a_folder_that_cannot_be_made_or_written_is_refused() -> None:
+    for path in ("/proc/none", "/proc"):
+        with pytest.raises(InputError, match=f"RecordLog: {path} cannot be written .*: choose another `path`"):
+            RecordLog(FakeEnv(), path).reset()
+
+
 def test_two_recorders_have_two_folders(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="RecordLog around RecordLog: both record into"):
         RecordLog(RecordLog(FakeEnv(), tmp_path / "a"), tmp_path / "b" / ".." / "a")
