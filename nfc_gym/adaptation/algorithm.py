@@ -288,6 +288,7 @@ class _Run:
             return
         seed = mixed(self.config.seed, self.t, 3) % 2**31
         make = self._imagined(belief, hallucinate=False, staggered=False)
+        self.record.say(f"judges all weights so far in {self.config.judged} whole episodes of what is believed")
         with closing(make(self.config.judged, threads=self.threads, seed=seed)) as envs:
             yield Choice(
                 self.agent, lambda: evaluate(self.agent, envs, seed).returns, [m.state_dict() for m in self.past]

@@ -1,6 +1,7 @@
 """Watch a policy: episodes in its environment, as a video or a sheet of pictures, and what they came to."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.progress import Progress
 
 from nfc_gym.adaptation.policy import Policy, load_policy
 from nfc_gym.core.errors import InputError, MissingExtra
@@ -58,13 +60,17 @@ def play(
     loaded.require(env)
     console = console or Console()
     found, frames = [], []
-    for k in range(episodes):
-        keep = path is not None and (k == 0 or path.suffix.lower() in VIDEOS)
-        every = EVERY_VIDEO if path is None or path.suffix.lower() in VIDEOS else EVERY_SHEET
-        score, seen = episode(env, loaded, seed + k, every if keep else 0)
-        found.append(score)
-        frames += seen
-        console.print(f"episode {k}: " + ", ".join(f"{key} {value:.4g}" for key, value in score.items()))
+    steps = env.spec.max_episode_steps if env.spec else None
+    with Progress(*Progress.get_default_columns(), console=console, transient=True) as bar:
+        for k in range(episodes):
+            keep = path is not None and (k == 0 or path.suffix.lower() in VIDEOS)
+            every = EVERY_VIDEO if path is None or path.suffix.lower() in VIDEOS else EVERY_SHEET
+            task = bar.add_task(f"episode {k}", total=steps)
+            score, seen = episode(env, loaded, seed + k, every if keep else 0, partial(bar.advance, task))
+            bar.remove_task(task)
+            found.append(score)
+            frames += seen
+            console.print(f"episode {k}: " + ", ".join(f"{key} {value:.4g}" for key, value in score.items()))
     env.close()
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -75,9 +81,9 @@ def play(
 
 
 def episode(
-    env: Any, policy: Policy | Callable[[Any], Any], seed: int, every: int
+    env: Any, policy: Policy | Callable[[Any], Any], seed: int, every: int, told: Callable[[], None] = lambda: None
 ) -> tuple[dict[str, Any], list[Frame]]:
-    """One episode, and a frame each so many control steps; 0 renders nothing."""
+    """One episode, and a frame each so many control steps; 0 renders nothing. `told` is called after each step."""
     observation, info = env.reset(seed=seed)
     frames: list[Frame] = []
     total, length, over, reached = 0.0, 0, False, False
@@ -87,6 +93,7 @@ def episode(
         observation, reward, ended, truncated, info = env.step(policy(observation))
         total, length, over = total + float(reward), length + 1, bool(ended or truncated)
         reached |= bool(info.get("success", False))
+        told()
     score: dict[str, Any] = {"return": total, "length": length}
     return (score | {"success": reached} if "success" in info else score), frames
 

@@ -16,7 +16,7 @@ from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector,
 Array = NDArray[np.float64]
 # Standard deviations of the declared noise by which a channel's fit is off what was measured, from which on the motion
 # is one that a polynomial does not follow, as a wheel's speed that is another after each command.
-_FAR = 3.0
+_FAR = 5.0
 _FEWEST = 8  # rows of a channel from which its course is told without those that are masked
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 

@@ -17,7 +17,7 @@ from nfc_gym.wrappers.record_channels import columns, model_text, values
 Array = NDArray[np.float64]
 _NEEDED = ("pyarrow", "yaml")
 # Declared of what a simulation measures, which has no noise: fine enough that the motion is taken as it was recorded.
-_NOISE = {"m": 1e-4, "rad": 1e-4, "m/s": 1e-3, "rad/s": 1e-2}
+_NOISE = {"m": 1e-5, "rad": 1e-5, "m/s": 1e-3, "rad/s": 1e-2}
 _SAMPLES = 8  # in a compared stretch, where control is slow: as many as 0.4 s at 20 Hz
 
 
