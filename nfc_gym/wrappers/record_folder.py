@@ -16,8 +16,11 @@ from nfc_gym.wrappers.record_channels import columns, model_text, values
 
 Array = NDArray[np.float64]
 _NEEDED = ("pyarrow", "yaml")
-# Declared of what a simulation measures, which has no noise: fine enough that the motion is taken as it was recorded.
-_NOISE = {"m": 1e-5, "rad": 1e-5, "m/s": 1e-3, "rad/s": 1e-2}
+# Declared of what a simulation measures, which has no noise: fine enough that jumps are taken as they were recorded,
+# and coarse enough that a fit finds its way from where an effect is missing. Of joints, and of free bodies.
+_JOINT = {"rad": 1e-3, "m": 1e-4, "rad/s": 0.1, "m/s": 0.01}
+_BODY = {"m": 3e-5, "m/s": 1e-3, "rad/s": 0.01}
+_ATTITUDE = 1e-4  # rad
 _SAMPLES = 8  # in a compared stretch, where control is slow: as many as 0.4 s at 20 Hz
 
 
@@ -133,6 +136,7 @@ def _channel(column: Any) -> dict[str, Any]:
     places = [column.name] if column.size == 1 else [f"{column.name}[{i}]" for i in range(column.size)]
     quaternion = column.name.endswith(":quat")
     told: dict[str, Any] = {"order": "wxyz"} if quaternion else {"unit": column.unit}
-    if quaternion or not column.name.startswith("sensor:"):
-        told["noise"] = _NOISE["rad" if quaternion else column.unit]
+    kind = column.name.split(":")[0]
+    if quaternion or kind in ("joint", "body"):
+        told["noise"] = _ATTITUDE if quaternion else (_JOINT if kind == "joint" else _BODY)[column.unit]
     return {"columns": places, **told}
