@@ -67,16 +67,15 @@ def _turned(quat: Array) -> Array:
 def _smooth(log: Log, channel: Channel, values: Array, points: int, raw: bool) -> Local:
     index, wide = _measured(log, channel), values.reshape(len(log), -1)
     fit = local_polynomial(log.time[index], wide[index], log.time, points)
-    whole = channel.mask is not None or len(index) == len(log)
-    if raw and whole:
-        value = fit.value.copy()
-        value[index] = wide[index]
-        return replace(fit, value=value)
+    if channel.mask is None and len(index) < len(log):
+        return fit
     off = float(np.sqrt(np.square(wide[index] - fit.value[index]).mean()))
-    if channel.noise is None or off <= _FAR * channel.noise:
+    if not raw and (channel.noise is None or off <= _FAR * channel.noise):
         return fit
     value, gain = fit.value.copy(), fit.value_gain.copy()
-    value[index], gain[index] = wide[index], 1.0
+    value[index] = wide[index]
+    if not raw:
+        gain[index] = 1.0
     return replace(fit, value=value, value_gain=gain)
 
 
