@@ -248,12 +248,8 @@ def infer(
         from nfc_gym.core import MissingExtra
 
         mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
-        for option, value in (("--log", log), ("--until", until)):
-            if value is not None and not mapped:
-                raise InputError(f"{option} is of a mapping's logs, and {window} is no mapping file: leave it out")
-        for option, value in (("--device", device), ("--jobs", jobs)):
-            if value is not None and refine is None:
-                raise InputError(f"{option} {value} is for --refine: give --refine N too, or leave it out")
+        _require_used(mapped, f"of a mapping's logs, and {window} is no mapping file", log=log, until=until)
+        _require_used(refine is not None, "for --refine: give --refine N too", device=device, jobs=jobs)
         try:
             from nfc_gym.inference import jobs as learning
         except ImportError as e:
@@ -281,6 +277,13 @@ def infer(
             say_written(out, f"{samples} draws of {' and '.join(parts)}")
         elif out is not None:
             say_written(out, "the posterior given this window")
+
+
+def _require_used(used: bool, what: str, **options: object) -> None:
+    """Refuse options that were given and would do nothing."""
+    for name, value in options.items():
+        if value is not None and not used:
+            raise InputError(f"--{name} {value} is {what}, or leave it out")
 
 
 def _window(posterior: Path, mapping: Path, log: str | None, until: float | None) -> "Window":

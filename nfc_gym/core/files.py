@@ -60,8 +60,12 @@ def write_whole(path: Path, text: str) -> None:
         handle.write(text)
 
 
-def require_writable(path: Path) -> None:
+def require_writable(path: Path, option: str = "--out") -> None:
     """Find out, before any work is done, whether a file or folder could be written at `path`; nothing stays behind.
+
+    Args:
+      path: where.
+      option: by which it was given, for messages.
 
     Raises:
       InputError: a part of the path is a file, a folder cannot be written to, the disk is full, or the path looks like
@@ -75,14 +79,14 @@ def require_writable(path: Path) -> None:
             folder = folder.parent
         if not folder.is_dir():
             if folder == path:
-                raise InputError(f"{path} exists and is not a folder: choose another --out")
-            raise InputError(f"{path}: {folder} is a file, not a folder: choose another --out")
+                raise InputError(f"{path} exists and is not a folder: choose another {option}")
+            raise InputError(f"{path}: {folder} is a file, not a folder: choose another {option}")
         tempfile.TemporaryFile(dir=folder).close()
         free = shutil.disk_usage(folder).free
     except OSError as e:
-        raise InputError(f"{path} cannot be written ({e.strerror or e}): choose another --out") from None
+        raise InputError(f"{path} cannot be written ({e.strerror or e}): choose another {option}") from None
     if free < _ROOM:
         raise InputError(
             f"{path}: only {free / 1e6:.0f} MB are free there, and {_ROOM / 1e6:.0f} MB are wanted: "
-            "free some space or choose another --out"
+            f"free some space or choose another {option}"
         )

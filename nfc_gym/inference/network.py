@@ -215,9 +215,14 @@ class Network(Learner):
     @torch.no_grad()
     def calibrate(self, batch: Batch) -> None:
         """Take the density's width from windows that were not trained on, see `Density.calibrate`."""
-        given = self.encode(batch["states"], batch["actions"], batch.get("map"))
-        x = self.targets(batch)
-        self.density.calibrate(x if self.base is None else self.base.whiten(x, given.mean), given.features)
+        x, maps = self.targets(batch), batch.get("map")
+        each = zip(
+            batch["states"].split(_CHUNK), batch["actions"].split(_CHUNK),
+            [None] * len(x) if maps is None else maps.split(_CHUNK), strict=False,
+        )  # fmt: skip
+        given = [self.encode(*part) for part in each]
+        features, mean = (torch.cat([getattr(g, name) for g in given]) for name in ("features", "mean"))
+        self.density.calibrate(x if self.base is None else self.base.whiten(x, mean), features)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Mean loss of each head over a batch; their sum is what training brings down."""

@@ -120,7 +120,8 @@ def sequential(
         if r or begun is None:
             outcome = train(network, train_set, held_out, training, device=device, report=report, scales=scales)
             out.outcomes.append(outcome)
-            _calibrate(network, held_out, config.seed)
+            if network.density.widens:
+                _calibrate(network, held_out, config.seed)
         out.posterior = believed.now(network, rng)
         out.entropy.append(-float(told(out.posterior, drawn(out.posterior, config.samples, rng)).mean()))
         report.message(f"round {r + 1}: {len(train_set)} windows, posterior entropy {out.entropy[-1]:.3f} nats")
@@ -161,7 +162,8 @@ class _Beliefs:
 def _calibrate(network: Network, held_out: TensorWindows, seed: int) -> None:
     """Take the density's width from what was held out, with the sensors' noise of several passes."""
     device = next(network.parameters()).device
-    passes = [batch for k in range(_PASSES) for batch in held_out.batches(len(held_out), mixed(seed, k))]
+    turns = 1 if held_out.noise is None else _PASSES
+    passes = [batch for k in range(turns) for batch in held_out.batches(len(held_out), mixed(seed, k))]
     with seeded(seed, device):
         network.calibrate({name: torch.cat([p[name] for p in passes]).to(device) for name in passes[0]})
 

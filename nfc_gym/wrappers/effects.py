@@ -210,19 +210,15 @@ class Application:
 
     def _signals(self) -> dict[str, Any]:
         time = np.asarray(self.sim.bind("time"), float)
-        shape, signals = self.sim.shape, self.exogenous
-        return {TIME: time, **{n: _level(n, s(time) if callable(s) else s, shape) for n, s in signals.items()}}
+        signals = self.exogenous.items()
+        return {TIME: time, **{n: _level(n, s(time), self.sim.shape) if callable(s) else s for n, s in signals}}
 
 
-def _named(exogenous: Mapping[str, Signal] | None, shape: tuple[int, ...]) -> dict[str, Signal]:
-    """Signals by name, of which those that are no functions are levels."""
+def _named(exogenous: Mapping[str, Signal] | None, shape: tuple[int, ...]) -> dict[str, Any]:
+    """Functions of time by name, and levels (*shape,) for what is none."""
     if not isinstance(exogenous or {}, Mapping):
         raise InputError(f"ApplyEffects: exogenous maps names to numbers or functions of time, and is no {exogenous!r}")
-    signals = dict(exogenous or {})
-    for name, signal in signals.items():
-        if not callable(signal):
-            _level(name, signal, shape)
-    return signals
+    return {name: s if callable(s) else _level(name, s, shape) for name, s in (exogenous or {}).items()}
 
 
 def _level(name: str, value: Any, shape: tuple[int, ...]) -> Array:

@@ -1,7 +1,6 @@
 """A folder of logs in the measured loop's format: the model, the mapping, and a Parquet file an episode."""
 
 import os
-import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError, MissingExtra
-from nfc_gym.core.files import replacing, write_whole
+from nfc_gym.core.files import replacing, require_writable, write_whole
 from nfc_gym.physics.names import names
 from nfc_gym.wrappers.record_channels import columns, model_text, values
 
@@ -48,13 +47,8 @@ class LogFolder:
         self.controls = [f"ctrl:{name}" for name in names(sim.nominal).actuators]
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"RecordLog: {self.folder} is a file; `path` is the folder that episodes are written to")
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=self.folder).close()
-        except OSError as e:
-            raise InputError(
-                f"RecordLog: {self.folder} cannot be written ({e.strerror or e}): choose another `path`"
-            ) from None
+        require_writable(self.folder, "`path` of RecordLog")
+        self.folder.mkdir(parents=True, exist_ok=True)
         self.count = len(list(self.folder.glob("episode_*.parquet")))
         self.text = ""
         self._heights: Array | None = None

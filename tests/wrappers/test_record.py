@@ -301,7 +301,7 @@ def test_bad_input_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_folder_that_cannot_be_made_or_written_is_refused() -> None:
     for path in ("/proc/none", "/proc"):
-        with pytest.raises(InputError, match=f"RecordLog: {path} cannot be written .*: choose another `path`"):
+        with pytest.raises(InputError, match=f"^{path} cannot be written .*: choose another `path` of RecordLog"):
             RecordLog(FakeEnv(), path).reset()
 
 

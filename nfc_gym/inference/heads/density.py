@@ -16,7 +16,12 @@ class Density(nn.Module):
     Args:
       sizes: width of each block.
       features: F.
+
+    Attributes:
+      widens: whether `calibrate` has something to set.
     """
+
+    widens = False
 
     def __init__(self, sizes: Sequence[int], features: int) -> None:
         super().__init__()
@@ -40,7 +45,7 @@ class Density(nn.Module):
         raise NotImplementedError
 
     def calibrate(self, x: Tensor, features: Tensor) -> None:
-        """Take the width from pairs x (B, D) and features (B, F) that were not trained on, where the density has one.
+        """Take the width from pairs x (B, D) and features (B, F) that were not trained on, where it `widens`.
 
         What is learned from few windows is too sure of itself; how much so, windows that were held out tell.
         """
@@ -69,6 +74,7 @@ class Chain(Explicit):
         super().__init__(sizes, features)
         before = [sum(sizes[:i]) for i in range(len(sizes))]
         self.links = nn.ModuleList([make(size, features + b) for size, b in zip(sizes, before, strict=True)])
+        self.widens = any(cast(Density, link).widens for link in self.links)
 
     def log_prob(self, x: Tensor, features: Tensor, blocks: int | None = None) -> Tensor:
         """See `Density`."""

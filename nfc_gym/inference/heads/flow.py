@@ -19,6 +19,8 @@ class Flow(Explicit):
       transforms: how many.
     """
 
+    widens = True
+
     def __init__(self, size: int, features: int, hidden: int = 128, transforms: int = 4) -> None:
         super().__init__((size,), features)
         self.context = nn.Sequential(nn.Linear(features, hidden), nn.GELU())
