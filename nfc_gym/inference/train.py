@@ -179,6 +179,7 @@ class _Run:
                     break
                 if self.step % self.epoch_steps:
                     saved = self.save(file, began, saved)
+                    report.step(self.step, self.total, monotonic() - began)
             else:
                 self.end_epoch(report)
             saved = self.save(file, began, saved)

@@ -10,6 +10,7 @@ from scipy.stats import kstest, norm
 
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.inference.posterior import NeuralPosterior, Window
+from nfc_gym.inference.progress import Quiet
 from nfc_gym.inference.proposals import SLACK, Around, Corrected, Proposed, SequentialConfig, TruncatedPrior, told
 from nfc_gym.inference.sequential import sequential
 from nfc_gym.inference.train import TrainConfig, train
@@ -58,9 +59,7 @@ def test_rounds_close_in_and_end_where_they_no_longer_narrow() -> None:
     net = network(linear_windows(200), linear=True)
     heard: list[str] = []
 
-    class Heard:
-        def epoch(self, *args: object) -> None: ...
-
+    class Heard(Quiet):
         def message(self, text: str) -> None:
             heard.append(text)
 

@@ -10,6 +10,7 @@ from problems import box, gaussian, linear_windows, motion_windows, network
 
 from nfc_gym.core import InputError
 from nfc_gym.inference.data import StoredWindows, TensorWindows
+from nfc_gym.inference.progress import Quiet
 from nfc_gym.inference.train import TrainConfig, train
 
 QUICK = TrainConfig(epochs=4, batch=64, rate=2e-3, warmup=10, average=0.98)
@@ -98,9 +99,7 @@ def test_a_run_that_diverges_keeps_its_last_good_weights() -> None:
 
     said: list[str] = []
 
-    class Heard:
-        def epoch(self, *args: object) -> None: ...
-
+    class Heard(Quiet):
         def message(self, text: str) -> None:
             said.append(text)
 

@@ -15,6 +15,7 @@ import torch
 from nfc_gym.cli import app
 from nfc_gym.inference import Network, NetworkConfig, NeuralPosterior, PriorBox, Sizes, TrainConfig, Window, load
 from nfc_gym.inference.encoders.place import place_of
+from nfc_gym.inference.progress import Quiet
 from nfc_gym.simulate import Simulator, refined
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.repeated import Repeated
@@ -31,14 +32,11 @@ def untrained(environment: str = ENVIRONMENT) -> NeuralPosterior:
     return NeuralPosterior(network, notes={"environment": environment})
 
 
-class Heard:
+class Heard(Quiet):
     """Keeps what it is told."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
-
-    def epoch(self, done: int, of: int, train: float, held_out: float) -> None:
-        pass
 
     def message(self, text: str) -> None:
         self.said.append(text)
