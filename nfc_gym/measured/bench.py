@@ -19,7 +19,7 @@ from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.model import bare, compile_model, read_spec, registered
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.segments import Layout, servos
+from nfc_gym.measured.segments import Layout, served, servos
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, estimate_states
 from nfc_gym.measured.suspects import Witness
@@ -29,6 +29,7 @@ from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrid
 from nfc_gym.physics.effects.conditions import conditioned
 from nfc_gym.physics.parameters import ParameterSpace, parameters_from_toml
 from nfc_gym.physics.rollout import Plant
+from nfc_gym.physics.segments import Servo
 
 _MOMENTS = 1000  # at which typical magnitudes are taken
 _SAMPLES = 12_000  # of all logs together that an instant problem looks at; longer logs are thinned
@@ -61,6 +62,11 @@ class Bench:
     def mode(self) -> str:
         """What is predicted: rollout, inverse or forward."""
         return self.dataset.mapping.segments.mode
+
+    @property
+    def firmware(self) -> dict[str, Servo]:
+        """The firmware servos that make the commands, by `ctrl:<actuator>`; they act in roll-outs alone."""
+        return servos(self.plant.model, self.dataset.mapping.servo_laws) if self.mode == "rollout" else {}
 
     def problem(self, logs: Sequence[Log], most: int | None = None) -> Problem:
         """The problem of some logs, thinned to about `most` blocks, spread evenly."""
@@ -171,10 +177,10 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
 def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
     """Typical magnitudes along the logs: speeds and forces of the motion, and what its actuators push."""
     model = bench.plant.model
-    # The commands of a firmware servo are targets, from which no push can be told without its law.
-    served = any(c.servo is not None for c in bench.dataset.mapping.controls.values())
-    rolled = _rolled(bench, logs) if bench.mode == "rollout" and not served else None
-    measured = _measured(bench, logs)
+    firmware = bench.firmware
+    # The commands that a firmware servo makes are known along the measured motion alone.
+    rolled = _rolled(bench, logs) if bench.mode == "rollout" and not firmware else None
+    measured, goals = _measured(bench, logs)
     motion = rolled or measured
     needed, pushed, acting = _forces(model, motion)
     rms = lambda a: np.sqrt((a**2).mean(0))  # noqa: E731
@@ -191,12 +197,13 @@ def scales(bench: Bench, logs: Sequence[Log]) -> Scales:
         )
         for k in first.channels
     }
-    command = motion.ctrl.std(0) + 0.1 * np.abs(motion.ctrl).mean(0)
+    spread = lambda ctrl: ctrl.std(0) + 0.1 * np.abs(ctrl).mean(0)  # noqa: E731
     ends = [f(np.stack([f(bench.states[log.name].qpos, 0) for log in logs]), 0) for f in (np.min, np.max)]
     push = _known_push(bench, logs, measured) if rolled else None
     return Scales(
-        force, rms(motion.qvel), command, rms(acting), first.interval, exogenous, channels, ends[0], ends[1], push
-    )
+        force, rms(motion.qvel), spread(goals if firmware else motion.ctrl), rms(acting), first.interval, exogenous,
+        channels, ends[0], ends[1], push, spread(measured.ctrl) if firmware else None,
+    )  # fmt: skip
 
 
 def _forces(model: mujoco.MjModel, motion: "_Motion") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -246,18 +253,23 @@ class _Motion:
     ctrl: np.ndarray
 
 
-def _measured(bench: Bench, logs: Sequence[Log]) -> _Motion:
-    """The motion as estimated from the logs; joints that no channel shows stand still."""
+def _measured(bench: Bench, logs: Sequence[Log]) -> tuple[_Motion, np.ndarray]:
+    """The motion as estimated from the logs; joints that no channel shows stand still. And the logs' commands (n, nu).
+
+    The motion's commands are those that reach the actuators: in roll-outs what firmware servos make of their goals.
+    """
     model = bench.plant.model
     parts = []
     for log in logs:
         s = bench.states[log.name]
         rows = np.linspace(0, len(log) - 1, min(len(log), max(20, _MOMENTS // len(logs)))).astype(int)
-        u = np.zeros((len(rows), model.nu))
-        for key, values in log.controls.items():
-            u[:, actuator_names(model).index(key.removeprefix("ctrl:"))] = values[rows]
-        parts.append((s.qpos[rows], s.qvel[rows], s.qacc[rows], u))
-    return _Motion(*(np.concatenate(a) for a in zip(*parts, strict=True)))
+        asked, reached = np.zeros((2, len(rows), model.nu))
+        for commands, into in ((log.controls, asked), ({**log.controls, **served(log, s, bench.firmware)}, reached)):
+            for key, values in commands.items():
+                into[:, actuator_names(model).index(key.removeprefix("ctrl:"))] = values[rows]
+        parts.append((s.qpos[rows], s.qvel[rows], s.qacc[rows], reached, asked))
+    *motion, goals = (np.concatenate(a) for a in zip(*parts, strict=True))
+    return _Motion(*motion), goals
 
 
 def _rolled(bench: Bench, logs: Sequence[Log]) -> _Motion | None:

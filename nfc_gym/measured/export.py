@@ -1,7 +1,7 @@
 """Effects as plain data, and the corrected model as MJCF that plain MuJoCo loads."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +56,16 @@ def unpack(data: dict[str, Any], plant: Plant) -> tuple[Plant, Array]:
     return whole, np.concatenate([plant.space.vector(psi), *(theta for _, theta in pairs)])
 
 
-def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None = None) -> tuple[str, list[Effect]]:
+def corrected(
+    spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None = None, firmware: Collection[str] = ()
+) -> tuple[str, list[Effect]]:
     """MJCF text with psi and every effect that MJCF can say, and the effects that it cannot.
 
     Effects that only edit model fields are carried through those fields, in the order in which they act. Others are
     carried by a structural edit of their own (a delay, a lag) where they have one; all the rest stays outside. The
     commands of an actuator pass through effects of one kind alone: outside effects would act before all that the model
-    carries, and see another command than they were fitted with.
+    carries, and see another command than they were fitted with. Of an actuator whose commands a firmware makes of goals
+    the model takes the drive's effects alone (`Effect.on_drive`): what happens to a goal happens outside.
 
     Args:
       spec: the model as it was given; its objects have the names of the plant's, which may lack some of them.
@@ -70,6 +73,7 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None =
       x: (size,) full parameter vector.
       folder: where the text will be written: files of meshes and textures are then named as seen from there, else by
         their whole paths.
+      firmware: actuators with a firmware servo.
 
     Returns:
       The text, in whose comment stands which inertias are not as they were found, since no body can have them; and
@@ -106,8 +110,9 @@ def corrected(spec: mujoco.MjSpec, plant: Plant, x: Array, folder: Path | None =
     carried += [e for e, t in pairs if e not in carried and not e.on_command and e.spec(spec, t)]
     outside = [e for e in effects if e not in carried and not e.on_command]
     if not any(e.family in READ_COMMANDS for e in outside):
-        spec, on_commands = _on_commands(spec, [(e, t) for e, t in pairs if e.on_command])
-        carried += on_commands
+        on_commands = [(e, t) for e, t in pairs if e.on_command and (e.on_drive or set(e.where).isdisjoint(firmware))]
+        spec, by_spec = _on_commands(spec, on_commands)
+        carried += by_spec
     for mark, at in marks.items():
         numeric = next((n for n in spec.numerics if n.name == mark), None) or spec.add_numeric(name=mark, size=len(at))
         numeric.data = at

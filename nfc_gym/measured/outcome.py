@@ -170,7 +170,8 @@ def _noise(bench: Bench, fold: Fold) -> list[dict[str, Any]]:
 def write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, Any]) -> None:
     """All outputs or none; `report.json` last, since it marks a finished run."""
     calibrated, extended = final
-    xml, outside = corrected(bench.spec, extended.plant, extended.x, out)
+    firmware = [c.removeprefix("ctrl:") for c in bench.firmware]
+    xml, outside = corrected(bench.spec, extended.plant, extended.x, out, firmware)
     rows = {e["id"]: e for e in report["effects"]} | {e["id"]: {**e, "proposal": True} for e in report["proposals"]}
     listed = [rows[e.id] for e, _ in effects_of(extended.plant, extended.x, outside)]
     effects = {

@@ -207,6 +207,11 @@ def servos(model: mujoco.MjModel, laws: Mapping[str, tuple[str, float]]) -> dict
     return out
 
 
+def served(log: Log, states: States, laws: Mapping[str, Servo]) -> dict[str, Array]:
+    """`ctrl:<actuator>` -> (T,) what its firmware servo made of its goals, by the measured motion."""
+    return {k: law.command(log.controls[k], states.qpos, states.qvel, log.servo[k]) for k, law in laws.items()}
+
+
 def lay(
     model: mujoco.MjModel,
     logs: Sequence[Log],
@@ -240,6 +245,7 @@ def lay(
     for key in logs[0].known:
         name, _, of = key.rpartition(":")
         known[(name, tuple(of.split("+")) if of else ())] = lane(lambda log, k=key: log.known[k], held)
+    past = _Backwards(model, tuple(logs), tuple(states), where, layout, laws, linear)
     servo = []
     for key, law in laws.items():
         terms = {n: lane(lambda log, k=key, n=n: log.servo[k][n], held) for n in ("gain", "supply", "damping")}
@@ -256,7 +262,7 @@ def lay(
         known=known,
         servo=servo,
         condition=np.array([logs[i].condition for i in where.log]),
-        past=Past(_Backwards(model, tuple(logs), tuple(states), where, layout, linear), np.arange(len(where.log))),
+        past=Past(past, np.arange(len(where.log))),
         channels=frozenset(logs[0].channels),
     )
 
@@ -304,6 +310,7 @@ class _Backwards:
     states: tuple[States, ...]
     where: Cut
     layout: Layout
+    laws: Mapping[str, Servo]
     linear: frozenset[str]
 
     def __call__(self, index: NDArray[np.intp]) -> Before:
@@ -321,6 +328,7 @@ class _Backwards:
         """(n, B, nu) commands up to where histories `begin`, s after the starts, and the length of their steps, s.
 
         B is that of all of the cut's starts, whichever are asked for: parts of a problem predict what the whole does.
+        What is slow is the drive's: of a firmware servo the commands are those that it made of its goals.
         """
         model, where = self.model, self.where
         starts = np.array([self.logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)]) + begin
@@ -330,16 +338,19 @@ class _Backwards:
         count = min(whole, most)
         lead, step = np.zeros((len(index), count, model.nu)), longest / count if count else 0.0
         for i in np.unique(where.log[index]) if count else ():
-            rows, inputs = np.flatnonzero(where.log[index] == i), self.logs[i].inputs
+            rows, log, inputs = np.flatnonzero(where.log[index] == i), self.logs[i], self.logs[i].inputs
             edges = starts[index[rows], None] - np.arange(count, -1, -1) * step
+            made_of_goals = served(log, self.states[i], self.laws)
             for key, values in inputs.controls.items():
                 a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, key.removeprefix("ctrl:"))
-                linear = key in self.linear
+                linear, time = key in self.linear, inputs.time
+                if key in made_of_goals:  # which is known where the motion is
+                    linear, time, values = False, log.time, made_of_goals[key]
                 if count == whole:
-                    made = commanded(inputs.time, values, edges[:, :-1].ravel(), step, linear).reshape(len(rows), count)
+                    made = commanded(time, values, edges[:, :-1].ravel(), step, linear).reshape(len(rows), count)
                 else:  # a roll-out holds through each of its steps what is interpolated too
-                    time = np.arange(inputs.time[0], inputs.time[-1], self.layout.dt) if linear else inputs.time
-                    made = _thinned(time, resample(inputs.time, values, time, linear), edges)
+                    fine = np.arange(time[0], time[-1], self.layout.dt) if linear else time
+                    made = _thinned(fine, resample(time, values, fine, linear), edges)
                 lead[rows, :, a] = made
         return lead, step
 

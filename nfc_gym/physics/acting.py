@@ -4,7 +4,7 @@ The calibrator's roll-outs, the wrapper around one environment and the one aroun
 through this class, so that the same effect makes the same numbers in each.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import mujoco
@@ -99,18 +99,32 @@ class Acting:
         """Hidden states of commands begin anew with the next one, but for the slow ones."""
         self.memories = [m if e.slow else _ANEW for m, (e, _) in zip(self.memories, self.commanding, strict=True)]
 
-    def command(self, ctrl: Array, exogenous: Mapping[str, Array], dt: float | None = None) -> Array:
+    def command(
+        self, ctrl: Array, exogenous: Mapping[str, Array], dt: float | None = None,
+        serve: Callable[[Array], Array] | None = None,
+    ) -> Array:  # fmt: skip
         """The command (..., nu) of a step after the effects on it; the first one settles their hidden states.
 
         Args:
           ctrl: (..., nu).
           exogenous: signals, (...,) each.
           dt: how long it is held, default a physics step.
+          serve: what a firmware makes of goals (..., nu): the effects of a drive (`Effect.on_drive`) act behind it, all
+            others before. Without it all act in their order.
         """
         dt = dt or self.dt
-        for slot, (effect, theta) in enumerate(self.commanding):
-            if len(self.memories) == slot:
-                self.memories.append(_ANEW)
+        slots = range(len(self.commanding))
+        if serve is None:
+            return self._affected(slots, ctrl, exogenous, dt)
+        before, behind = ([k for k in slots if self.commanding[k][0].on_drive is on] for on in (False, True))
+        return self._affected(behind, serve(self._affected(before, ctrl, exogenous, dt)), exogenous, dt)
+
+    def _affected(self, slots: Iterable[int], ctrl: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
+        """Commands after some of the effects on them."""
+        if not self.memories:
+            self.memories = [_ANEW] * len(self.commanding)
+        for slot in slots:
+            effect, theta = self.commanding[slot]
             if self.memories[slot] is _ANEW:
                 self.memories[slot] = effect.state0(ctrl.shape[:-1], ctrl, theta, dt)
             elif self.fresh is not None:

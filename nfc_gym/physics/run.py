@@ -3,6 +3,7 @@
 import copy
 from collections import deque
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Protocol
 
 import mujoco
@@ -97,10 +98,11 @@ class Run:
                 varying.append((bound, values))
         return varying
 
-    def _command(self, k: int, exogenous: Mapping[str, Array]) -> Array:
-        """Command of step k (negative in the history) after the effects on it."""
+    def _command(self, k: int, exogenous: Mapping[str, Array], q: Array, v: Array) -> Array:
+        """Command of step k (negative in the history) after the effects on it; firmware servos see the state."""
         ctrl = self._tile(self.segments.ctrl[:, self.segments.history + k])
-        return self.acting.command(ctrl, exogenous)
+        serve = partial(self._serve, k, q=q, v=v) if self.segments.servo else None
+        return self.acting.command(ctrl, exogenous, serve=serve)
 
     def _exogenous(self, k: int) -> dict[str, Array]:
         signals = self.segments.exogenous
@@ -108,14 +110,10 @@ class Run:
 
     def _serve(self, k: int, ctrl: Array, q: Array, v: Array) -> Array:
         """Firmware servos turn targets into commands."""
-        if not self.segments.servo:
-            return ctrl
-        ctrl = ctrl.copy()
-        at = self.segments.history + k
+        ctrl, at = ctrl.copy(), self.segments.history + k
         for servo, terms in self.segments.servo:
-            wish = self._tile(terms["gain"][:, at]) * (ctrl[:, servo.actuator] - q[:, servo.qpos])
-            wish = wish - self._tile(terms["damping"][:, at]) * v[:, servo.dof]
-            ctrl[:, servo.actuator] = self._tile(terms["supply"][:, at]) * np.clip(wish, -servo.limit, servo.limit)
+            now = {name: self._tile(term[:, at]) for name, term in terms.items()}
+            ctrl[:, servo.actuator] = servo.command(ctrl[:, servo.actuator], q, v, now)
         return ctrl
 
     def roll(self) -> Trajectory:
@@ -163,7 +161,7 @@ class Run:
         if self.acting.commanding:
             ctrl = np.empty((batch.nsim, steps, self.plant.model.nu))
             for k in range(steps):
-                ctrl[:, k] = self._command(k, self._exogenous(k))
+                ctrl[:, k] = self._command(k, self._exogenous(k), self.qpos, self.qvel)  # no servo looks at them
         else:
             ctrl = self._tile(self.segments.ctrl[:, self.segments.history :])
         self._settle(ctrl[:, 0])
@@ -193,16 +191,17 @@ class Run:
             return  # nothing that remembers
         recent = deque[Array](maxlen=longest + 1)
         # Without an effect on them commands are the same for every parameter vector.
-        alike = not (acting.commanding or tracking)
+        alike = not (acting.commanding or tracking or segments.servo)
         act = np.zeros((len(segments), model.na)) if alike else self.act
         for k in range(-segments.history, 0):
-            exogenous = self._exogenous(k)
-            ctrl = segments.ctrl[:, segments.history + k] if alike else self._command(k, exogenous)
+            exogenous, q, v = self._exogenous(k), self.qpos, self.qvel
+            if past is not None and (tracking or segments.servo):
+                q, v = self._true(*map(self._tile, past.motion(k + segments.history)))
+            ctrl = segments.ctrl[:, segments.history + k] if alike else self._command(k, exogenous, q, v)
             recent.append(ctrl)
             self.activations.advance(delayed(model, recent, segments.dt), act, settle=k == -segments.history)
-            if past is not None and tracking:
-                q, v = self._true(*map(self._tile, past.motion(k + segments.history)))
-                acting.recall(q, v, self._serve(k, ctrl, q, v), exogenous)
+            if tracking:
+                acting.recall(q, v, ctrl, exogenous)
         if alike and segments.history:
             self.act[...] = self._tile(act)
             recent = deque(map(self._tile, recent))
@@ -214,7 +213,7 @@ class Run:
         batch, exogenous = self.batch, self._exogenous(k)
         for bound, values in self.varying:
             write_field(self.fields, bound, self._tile(values[:, self.segments.history + k]))
-        self.ctrl[...] = self._serve(k, self._command(k, exogenous), self.qpos, self.qvel)
+        self.ctrl[...] = self._command(k, exogenous, self.qpos, self.qvel)
         if first:
             self._settle(self.ctrl)
         if self.acting.pushing:

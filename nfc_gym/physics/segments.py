@@ -20,6 +20,11 @@ class Servo:
     dof: int
     limit: float
 
+    def command(self, goal: Array, qpos: Array, qvel: Array, terms: Mapping[str, Array]) -> Array:
+        """(...,) what it makes of goals (...,) at states (..., nq), (..., nv); `gain`, `supply`, `damping` (...,)."""
+        wish = terms["gain"] * (goal - qpos[..., self.qpos]) - terms["damping"] * qvel[..., self.dof]
+        return terms["supply"] * np.clip(wish, -self.limit, self.limit)
+
 
 @dataclass(frozen=True)
 class Segments:

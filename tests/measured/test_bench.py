@@ -36,6 +36,17 @@ def test_the_largest_push_is_what_the_servo_made_of_the_error_it_saw(build: Buil
     assert not found.push[1:].any()  # nothing drives the base
 
 
+def test_behind_a_firmware_servo_a_drive_is_sized_by_what_the_servo_makes(build: Build, machine: str) -> None:
+    """Goals of a radian become commands of 20 sin(0.05) N m; the goal's own effects keep the goal's size."""
+    model = re.sub(r'<position name="servo"[^>]*/>', '<motor name="servo" joint="hinge"/>', machine)
+    goal = "{column: goal, unit: rad}"
+    served = goal.replace("}", ", servo: {joint: hinge, gain: 10}}")
+    dataset = require(build(None, (goal, served), model=model))[0]
+    found = scales(make_bench(dataset, 1), dataset.logs)
+    assert found.drive[0] == pytest.approx(PUSH / np.sqrt(2), rel=0.2)
+    assert found.command[0] == pytest.approx(1 / np.sqrt(2), rel=0.2)
+
+
 def test_a_limit_is_sized_alike_whether_or_not_the_motor_has_a_filter(build: Build, machine: str) -> None:
     """Of a motor behind a fast filter the force is that of its command, and not of a state of zero."""
     found = {}

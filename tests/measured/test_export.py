@@ -357,6 +357,16 @@ def machine_of_files(folder: Path) -> Path:
     return folder / "machine.xml"
 
 
+def test_what_happens_to_a_firmware_servos_goal_stays_outside_of_the_model() -> None:
+    """The model's own delay would be one of the commands that the firmware makes."""
+    case = Case(arm(LIMITED), [DELAY, ("saturation", "m", {"removed": 0.2})])
+    assert not case.export()[1]
+    text, outside = corrected(case.spec, case.plant, case.x, firmware=["m"])
+    assert [e.family for e in outside] == ["delay"]
+    made = mujoco.MjModel.from_xml_string(text)
+    np.testing.assert_allclose(made.actuator("m").ctrlrange, [-0.64, 0.64])
+
+
 def test_the_model_loads_from_where_it_is_written(tmp_path: Path) -> None:
     case = Case(machine_of_files(tmp_path / "pro & 'ject'"), [], (mass(3.0),))
     out = tmp_path / "pro & 'ject'/results/run"

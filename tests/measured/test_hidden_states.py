@@ -17,7 +17,7 @@ from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
-from nfc_gym.physics.segments import Segments
+from nfc_gym.physics.segments import Segments, Servo
 
 DT, EVERY, LEVEL, TRANSITION = 0.005, 2, 0.25, 0.15
 SD_Q, SD_V = 5e-4, 5e-3
@@ -139,6 +139,42 @@ def test_a_drive_is_as_warm_as_all_of_a_long_log_made_it(
     assert _off(warm, log, linear) < 1e-5
     monkeypatch.setattr(segments, "_ROOM", 0)
     assert _off(warm, log, linear) < 1.5e-3
+
+
+def served(seconds: float) -> Log:
+    """A firmware servo swings the bob for a minute, its drive fades as it warms up: a plain loop, and no noise."""
+    fade, slow, reference = THERMAL[1]
+    data, heat = mujoco.MjData(MODEL), None
+    t = np.arange(round(seconds / DT / EVERY)) * DT * EVERY
+    goal, q, v = 0.8 * np.sin(2 * t) + 0.3 * np.sin(5 * t), np.empty(len(t)), np.empty(len(t))
+    for k in range(len(t)):
+        q[k], v[k] = data.qpos[0], data.qvel[0]
+        for _ in range(EVERY):
+            made = float(np.clip(4 * (goal[k] - data.qpos[0]) - 0.1 * data.qvel[0], -0.9, 0.9))
+            target = (made / reference) ** 2
+            heat = target if heat is None else target + np.exp(-DT / slow) * (heat - target)
+            data.ctrl[0] = made * (1 - fade * heat)
+            mujoco.mj_step(MODEL, data)
+    terms = {"gain": np.full(len(t), 4.0), "supply": np.ones(len(t)), "damping": np.full(len(t), 0.1)}
+    channels = {"joint:hinge:pos": Channel(q, "rad", 1e-6), "joint:hinge:vel": Channel(v, "rad/s", 1e-5)}
+    return Log("served", t, {"ctrl:motor": goal}, channels, {"exo:time": t}, servo={"ctrl:motor": terms})
+
+
+def test_behind_a_firmware_servo_a_drive_is_as_warm_as_what_the_servo_made(
+    warm: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which is known at every other step; as warm as goals would make it, it is off by sixty times as much."""
+    log, laws = served(20.0), {"ctrl:motor": Servo(0, 0, 0, 0.9)}
+    states, layout = estimate_states(MODEL, log, raw=True), Layout(0.2, 0.5, (0.2,), 0.2, DT, put_off=False)
+
+    def off() -> float:
+        problem = RolloutProblem(MODEL, [log], [states], layout, laws)
+        residual = problem.residual(warm, THERMAL[1][None])[0, problem.time_of > 2, 0]
+        return float(np.abs(residual).max())
+
+    assert off() < 2e-3
+    monkeypatch.setattr(segments, "served", lambda *_: {})
+    assert off() > 5e-2
 
 
 def test_thinned_commands_keep_what_laws_need() -> None:

@@ -223,6 +223,32 @@ def test_firmware_servo_closes_its_loop_at_every_step() -> None:
         np.testing.assert_array_equal(t.qpos[0, 0, k + 1], data.qpos)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_effects_of_a_drive_act_behind_its_firmware_servo_and_those_of_a_goal_before_it(order: int) -> None:
+    joint = MODEL.joint("shoulder")
+    servo = Servo(MODEL.actuator("push").id, int(joint.qposadr[0]), int(joint.dofadr[0]), 0.5)
+    segments = zoo_segments(MODEL, 8, size=1, history=0)
+    shape = segments.ctrl.shape[:2]
+    terms = {"gain": np.full(shape, 3.0), "supply": np.full(shape, 1.5), "damping": np.full(shape, 0.2)}
+    effects = [build("dead_zone", "push", {"width": 0.2}), build("offset", "push", {"offset": 0.1})][::order]
+    for effect, _ in effects:
+        effect.bind(MODEL)
+    plant = plant_of(MODEL, *(e for e, _ in effects))
+    theta = np.concatenate([theta for _, theta in effects])[None]
+    t = plant.shoot(theta, replace(segments, servo=[(servo, terms)]))
+    data = mujoco.MjData(MODEL)
+    data.qpos[:], data.qvel[:] = segments.qpos[0], segments.qvel[0]
+    for k in range(segments.steps):
+        data.ctrl[:] = segments.ctrl[0, k]
+        wish = 3.0 * (data.ctrl[servo.actuator] + 0.1 - data.qpos[servo.qpos]) - 0.2 * data.qvel[servo.dof]
+        made = 1.5 * np.clip(wish, -0.5, 0.5)
+        data.ctrl[servo.actuator] = made - np.clip(made, -0.2, 0.2)
+        if k == 0:
+            Activations(MODEL, segments.dt).advance(data.ctrl, data.act, settle=True)
+        mujoco.mj_step(MODEL, data)
+        np.testing.assert_allclose(t.qpos[0, 0, k + 1], data.qpos, rtol=0, atol=1e-12)
+
+
 def test_rows_that_blow_up_are_marked_and_leave_the_others_alone() -> None:
     segments = zoo_segments(MODEL, 9)
     space = ParameterSpace(MODEL, [Parameter("k", "jnt_stiffness", ("rail",), "N/m", -1e9, 1e9)])

@@ -108,7 +108,7 @@ class Scales:
     Attributes:
       force: (nv,) generalised force, N or N m.
       speed: (nv,) speed of each degree of freedom, m/s or rad/s.
-      command: (nu,) spread of each command, in its own unit.
+      command: (nu,) spread of each command, in its own unit; of a firmware servo's goal.
       actuation: (nu,) force of each actuator, in its own unit.
       interval: median time between samples, s.
       exogenous: names of the exogenous signals that the logs carry, with their median value.
@@ -116,6 +116,7 @@ class Scales:
       low, high: (nq,) bounds of the motion's coordinates, None where unknown.
       push: (nv,) force of its actuators that each degree of freedom is known to have seen at most, 0 or None where
         nothing is known.
+      served: (nu,) spread of what firmware servos make of their goals, None where there are no such servos.
     """
 
     force: Array
@@ -128,6 +129,12 @@ class Scales:
     low: Array | None = None
     high: Array | None = None
     push: Array | None = None
+    served: Array | None = None
+
+    @property
+    def drive(self) -> Array:
+        """(nu,) spread of what reaches each drive."""
+        return self.command if self.served is None else self.served
 
 
 @dataclass
@@ -203,6 +210,8 @@ class Effect(ABC):
     MODULATES: ClassVar[tuple[str, ...]] = ()
     # Whether the hidden state of `action` outlives the history before a segment: it then begins where the log does.
     slow: ClassVar[bool] = False
+    # Of an effect on commands: whether it is the drive's, behind a firmware servo, and not on the way of its goal.
+    on_drive: ClassVar[bool] = False
     # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
     PARAMS: ClassVar[tuple[Param, ...]] = ()
     # Of an effect at several places: the same at each of them alone, with bounds and sizes that fit that place.

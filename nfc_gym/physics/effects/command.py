@@ -40,9 +40,10 @@ class _OnCommand(Effect):
     def bind(self, model: mujoco.MjModel) -> None:
         self.rows = index(actuator_ids(model, self.where))
 
-    @staticmethod
-    def _spread(model: mujoco.MjModel, scales: Scales, where: Sequence[str]) -> float:
-        return max(float(np.median(np.abs(scales.command[actuator_ids(model, where)]))), 1e-6)
+    @classmethod
+    def _spread(cls, model: mujoco.MjModel, scales: Scales, where: Sequence[str]) -> float:
+        commands = scales.drive if cls.on_drive else scales.command
+        return max(float(np.median(np.abs(commands[actuator_ids(model, where)]))), 1e-6)
 
 
 class Offset(_OnCommand):
@@ -99,6 +100,7 @@ class Offset(_OnCommand):
 class DeadZone(_OnCommand):
     """Commands within +- width do nothing, larger ones lose it. Not for position servos: their zero is no rest."""
 
+    on_drive = True
     family = "dead_zone"
     summary = "Dead zone of the command"
     PARAMS = (Param("width", "1", 0.0, 1e3, probes=(0.05,)),)
@@ -130,6 +132,7 @@ class Saturation(_OnCommand):
     no limit, and a limit above every force that occurs changes nothing.
     """
 
+    on_drive = True
     family = "saturation"
     summary = "Saturation below the model's limits"
     PARAMS = (Param("removed", "1", 0.0, 0.95, probes=(0.2, 0.5), resolution=0.005, natural=True),)
@@ -232,6 +235,7 @@ class SupplySag(_OnCommand):
         Param("exponent", "1", -1.0, 4.0, probes=(1.0, 2.0), resolution=0.02),
         Param("reference", "V", 1e-3, 1e4, probes=(12.0,), shape=True),
     )
+    on_drive = True
     divisible = False  # drives of one make on one battery; one that gives less than the others has lost force
     SETTINGS = ("signal",)
     signal = "exo:supply"

@@ -20,7 +20,7 @@ _HOOKS = (
     "spec", "model", "action", "rest", "follow", "friction", "modulate", "force", "demand", "sense", "unsense", "chart",
     "unchart",
 )  # fmt: skip
-_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "slow", "driven")
+_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "slow", "driven", "on_drive")
 
 
 class Each(Effect):

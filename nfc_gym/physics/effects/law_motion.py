@@ -92,7 +92,7 @@ class LawCommand(_Linear):
             for i, name in enumerate(actuator_names(model)):
                 if name and _tree(model, i) in (-1, int(model.dof_treeid[dof])):
                     of = command_unit(model, i)
-                    size = force / max(float(scales.command[i]), 1e-6)
+                    size = force / max(float(scales.drive[i]), 1e-6)
                     out.append(cls((place, name), cls.sized(size, unit if of == "1" else f"{unit}/({of})")))
         return out
 

@@ -26,6 +26,7 @@ class Thermal(Effect):
     summary = "Drive fades as it warms up"
     covers = ("loss", "gain")  # heat that hardly changes while the log lasts
     slow = True  # it warms up over minutes
+    on_drive = True
     PARAMS = (
         Param("fade", "1", 0.0, 0.9, probes=(0.05, 0.2), resolution=0.002),
         Param("time_constant", "s", 0.05, 300.0, probes=(0.5, 3.0, 20.0), shape=True),
@@ -60,7 +61,7 @@ class Thermal(Effect):
         known = actuator_names(model)
         out: list[Effect] = []
         for where in actuator_places(model, plain(model)):
-            size = max(float(np.max(scales.command[[known.index(n) for n in where]])), 1e-6)
+            size = max(float(np.max(scales.drive[[known.index(n) for n in where]])), 1e-6)
             # The reference only sets the unit of heat: free, it would be the fade under another name.
             fixed = {"probes": (size,), "low": size * (1 - 1e-3), "high": size * (1 + 1e-3)}
             out.append(cls(where, sized(cls.PARAMS, reference=fixed)))
