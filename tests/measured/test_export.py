@@ -130,6 +130,7 @@ DRAG = ("drag_linear", "a", {"x": 2.0, "y": 2.0, "z": 2.0})
 CASES: dict[str, tuple[Any, ...]] = {
     # a servo's damping, given as a ratio, is that of the nominal model
     "dampratio, gain": (arm(SERVO, joint=WIDE), [gain(0.5)]),
+    "dampratio, turned round": (arm(SERVO, joint=WIDE), [gain(-0.5)]),
     "dampratio, payload": (arm(SERVO, joint=WIDE), [("payload", "a", {"mass": 2.0} | TIP)]),
     "dampratio, armature": (arm(SERVO, joint=WIDE), [ROTOR]),
     "dampratio, mass": (arm(SERVO, joint=WIDE), [], (mass(1.5),)),

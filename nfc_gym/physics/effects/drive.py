@@ -146,7 +146,11 @@ class Gain(Effect):
         scale_force(fields, self.rows, self.factor(theta))
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
-        _scale_spec(spec, self.where, float(self.factor(theta)))
+        factor = float(self.factor(theta))
+        # A servo's damping turned round is read as a damping ratio, which MJCF writes as a positive biasprm[2].
+        if factor < 0 and any(spec.actuator(name).biasprm[2] < 0 for name in self.where):
+            return False
+        _scale_spec(spec, self.where, factor)
         return True
 
     def demand(self, force: Array, theta: Array, ctx: Context) -> Array:
