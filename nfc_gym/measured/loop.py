@@ -256,7 +256,8 @@ def _fold(
         lead, word = ("UNEXPLAINED", "") if outcome["verdict"] == "unexplained" else ("", "left unexplained")
         tell(f"{word} at {left['coordinate']}: {left['description']}", lead=lead)
     for finding in outcome["findings"]:
-        tell(finding["text"])
+        if finding["kind"] != "check":  # which was said before all else
+            tell(finding["text"])
     return outcome
 
 
