@@ -101,6 +101,7 @@ def test_the_command_trains_and_the_other_tells(windows: Path, motion: Path, tmp
         ({"states": np.zeros((21, 21))}, "no array 'actions'"),
         ({"states": np.zeros((11, 21)), "actions": np.zeros((10, 4))}, "trained on windows of 20"),
         ({"states": np.full((21, 21), np.nan), "actions": np.zeros((20, 4))}, "nan"),
+        ({"states": np.full((21, 21), "a"), "actions": np.zeros((20, 4))}, "states holds no numbers"),
     ],
 )
 def test_a_window_that_is_none_is_refused(
