@@ -122,7 +122,8 @@ def read_window(path: Path) -> Window:
         raise InputError(f"{path}: no array {missing[0]!r}; there are: {', '.join(arrays) or 'none'}")
     for name in ("states", "actions", "elevation"):
         if name in arrays and arrays[name].dtype.kind not in "fiub":
-            raise InputError(f"{path}: {name} holds no numbers, but values like {arrays[name].ravel()[:1]}; want {_FORM}")
+            like = arrays[name].ravel()[:1]
+            raise InputError(f"{path}: {name} holds no numbers, but values like {like}; want {_FORM}")
     return Window(arrays["states"], arrays["actions"], arrays.get("elevation"))
 
 
