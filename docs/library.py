@@ -8,7 +8,8 @@ import numpy as np
 
 from nfc_gym.measured.export import corrected
 from nfc_gym.physics.effects import FAMILIES, complete_inertia, propose
-from nfc_gym.physics.effects.base import Effect, Param, Scales
+from nfc_gym.physics.effects.base import Effect, Scales
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.physics.effects import Effect, build
-from nfc_gym.physics.effects.base import Param
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.residuals import candidates, sizes

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from nfc_gym.adaptation.extended import Calibrated
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured.model import compile_model, read_spec
-from nfc_gym.physics.effects.base import Array, Effect, Param
+from nfc_gym.physics.effects.base import Array, Effect
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.fields import ModelFields, names_of, rows_of
 from nfc_gym.physics.names import names
 from nfc_gym.physics.parameters import Parameter, ParameterSpace

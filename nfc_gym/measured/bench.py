@@ -25,8 +25,9 @@ from nfc_gym.measured.states import States, estimate_states
 from nfc_gym.measured.suspects import Witness
 from nfc_gym.physics.activations import Activations
 from nfc_gym.physics.effects import complete_inertia, propose
-from nfc_gym.physics.effects.base import Effect, Scales, actuator_names, overrides
+from nfc_gym.physics.effects.base import Effect, Scales, overrides
 from nfc_gym.physics.effects.conditions import conditioned
+from nfc_gym.physics.effects.lookup import actuator_names
 from nfc_gym.physics.parameters import ParameterSpace, parameters_from_toml
 from nfc_gym.physics.rollout import Plant
 from nfc_gym.physics.segments import Servo

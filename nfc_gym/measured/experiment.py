@@ -20,8 +20,8 @@ from nfc_gym.measured.room import room
 from nfc_gym.measured.segments import commanded, servos
 from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.measured.states import States, channel_noise
-from nfc_gym.physics.effects.base import actuator_names
 from nfc_gym.physics.effects.generic import TIME
+from nfc_gym.physics.effects.lookup import actuator_names
 from nfc_gym.physics.rollout import Plant
 from nfc_gym.physics.segments import Segments, Trajectory
 

@@ -16,8 +16,9 @@ from nfc_gym.measured.instant import InstantProblem, still
 from nfc_gym.measured.metric import Metric
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.shooting import RolloutProblem
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces
 from nfc_gym.physics.effects.law import Law
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.rollout import Plant
 
 CLOCK = "impulse:clock"  # physics steps since the segment began

@@ -18,8 +18,9 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.smoothing import covered, moving_average
 from nfc_gym.measured.states import States, channel_noise
-from nfc_gym.physics.effects.base import Context, actuator_names
+from nfc_gym.physics.effects.base import Context
 from nfc_gym.physics.effects.conditions import Conditioned
+from nfc_gym.physics.effects.lookup import actuator_names
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]

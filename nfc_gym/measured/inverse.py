@@ -13,8 +13,9 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.measured.recent import Recent
-from nfc_gym.physics.effects.base import Context, Effect, Forces, actuator_names, overrides
+from nfc_gym.physics.effects.base import Context, Effect, Forces, overrides
 from nfc_gym.physics.effects.drive import arm_of
+from nfc_gym.physics.effects.lookup import actuator_names
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import resolve, write_field
 from nfc_gym.physics.past import trace

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
-from nfc_gym.physics.effects.base import actuator_names
+from nfc_gym.physics.effects.lookup import actuator_names
 
 Array = NDArray[np.float64]
 _ADDED = 0.2  # of an actuator's room that a feed-forward may use: the rest is the controller's

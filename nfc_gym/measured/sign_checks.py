@@ -18,8 +18,8 @@ from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.shooting import RolloutProblem
-from nfc_gym.physics.effects.base import actuator_names
 from nfc_gym.physics.effects.drive import on_scalar
+from nfc_gym.physics.effects.lookup import actuator_names
 
 Array = NDArray[np.float64]
 

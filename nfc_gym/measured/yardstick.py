@@ -25,7 +25,8 @@ from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
 from nfc_gym.measured.owned import Data, Owned, owned
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
-from nfc_gym.physics.effects.base import Effect, Param
+from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.effects.param import Param
 
 Array = NDArray[np.float64]
 HOPE = 0.25  # of the gain that a law must reach: what a cheap look must promise for a dear one to be worth its time

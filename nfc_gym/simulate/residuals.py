@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from nfc_gym.envs.simulations import Simulations
 from nfc_gym.physics.acting import Acting
 from nfc_gym.physics.effects import FAMILIES, Effect, Scales, propose
-from nfc_gym.physics.effects.base import TIME, Param, overrides
+from nfc_gym.physics.effects.base import TIME, overrides
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.simulate import motion
 from nfc_gym.simulate.draws import Array, between, geometric

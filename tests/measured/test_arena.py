@@ -14,9 +14,9 @@ from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.rounds import Contest
 from nfc_gym.measured.settle import slack
-from nfc_gym.physics.effects.base import Param
 from nfc_gym.physics.effects.friction import Coulomb
 from nfc_gym.physics.effects.inertial import Payload
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
 
 

@@ -8,7 +8,8 @@ import pytest
 from machines import candidates, probe, zoo
 
 from nfc_gym.physics.effects import Context, Effect, Forces
-from nfc_gym.physics.effects.base import index, limited, overrides
+from nfc_gym.physics.effects.base import overrides
+from nfc_gym.physics.effects.lookup import index, limited
 
 MODEL = zoo()
 CANDIDATES = candidates(MODEL)

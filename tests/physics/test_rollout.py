@@ -9,7 +9,8 @@ from machines import candidates, plant_of, probe, zoo, zoo_segments
 
 from nfc_gym.physics.activations import Activations
 from nfc_gym.physics.effects import Effect, build
-from nfc_gym.physics.effects.base import Context, Forces, Param
+from nfc_gym.physics.effects.base import Context, Forces
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant

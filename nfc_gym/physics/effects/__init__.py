@@ -11,7 +11,7 @@ from nfc_gym.core import units
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import DragLinear, DragQuadratic
 from nfc_gym.physics.effects.backlash import Backlash
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
 from nfc_gym.physics.effects.command import DeadZone, Offset, Saturation, SupplySag
 from nfc_gym.physics.effects.drive import Gain, Loss, TorqueSpeed
 from nfc_gym.physics.effects.everywhere import ALL, everywhere
@@ -27,6 +27,7 @@ from nfc_gym.physics.effects.law_motion import LawCommand, LawCross, LawPolynomi
 from nfc_gym.physics.effects.law_place import LawFrictionByPlace, LawHeight, LawPlace
 from nfc_gym.physics.effects.law_waves import LawHarmonic, LawWave
 from nfc_gym.physics.effects.load import ExternalForce, Slope, Wind
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import slid
 from nfc_gym.physics.effects.rotor import GroundEffect, RotorDrag
 from nfc_gym.physics.effects.sensors import Misalignment, SensorBias, SensorDelay, SensorGain

@@ -13,7 +13,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import base_bodies, body_ids, sized
 from nfc_gym.physics.state import components, cross_parts, joined, root, rotate_back_parts, rotate_parts
 

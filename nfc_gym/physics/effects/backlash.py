@@ -10,20 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import (
-    Array,
-    Context,
-    Effect,
-    Forces,
-    Param,
-    Scales,
-    actuator_names,
-    index,
-    joint_dofs,
-    limited,
-)
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
 from nfc_gym.physics.effects.drive import on_scalar, plain
 from nfc_gym.physics.effects.hysteresis import excursion
+from nfc_gym.physics.effects.lookup import actuator_names, index, joint_dofs, limited
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import angle_unit, joint_places, sized, with_joint_units, with_units
 
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)

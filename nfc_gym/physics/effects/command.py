@@ -9,18 +9,10 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import (
-    Array,
-    Context,
-    Effect,
-    Param,
-    Scales,
-    actuator_ids,
-    actuator_names,
-    index,
-    limited,
-)
+from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
 from nfc_gym.physics.effects.drive import ENDLESS, actuator_places, command_unit, is_position, plain
+from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, index, limited
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized, with_units
 from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, shift_range
 from nfc_gym.physics.fields import ModelFields

@@ -10,17 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import (
-    Array,
-    Context,
-    Effect,
-    Forces,
-    Param,
-    Scales,
-    actuator_ids,
-    actuator_names,
-    groups,
-)
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
+from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, groups
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import scale_rows, sized
 from nfc_gym.physics.fields import ModelFields
 

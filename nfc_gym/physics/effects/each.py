@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Rows, overrides
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, overrides
 from nfc_gym.physics.effects.conditions import Conditioned
+from nfc_gym.physics.effects.lookup import Rows
 from nfc_gym.physics.fields import ModelFields
 
 if TYPE_CHECKING:

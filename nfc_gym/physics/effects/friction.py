@@ -14,7 +14,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Rows, Scales, index, joint_dofs
+from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
+from nfc_gym.physics.effects.lookup import Rows, index, joint_dofs
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import (
     angle_unit,
     force_unit,

@@ -13,8 +13,9 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Forces, Scales
 from nfc_gym.physics.effects.hysteresis import dahl, excursion
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import joint_scales, sized, with_joint_units
 from nfc_gym.physics.fields import names_of, object_id
 

@@ -11,8 +11,9 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales
+from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
 from nfc_gym.physics.effects.ground import OnGround, roamed
+from nfc_gym.physics.effects.param import Param
 
 _MOST = 3.0  # of the logarithm of a grip's factor
 _EDGE = 1.2  # half-widths of the ground that the logs roamed, beyond which the grip stays as it is there

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales
+from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.fields import ModelFields, names_of
 

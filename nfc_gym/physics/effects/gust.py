@@ -7,7 +7,8 @@ import numpy as np
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
-from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Forces, Scales
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import body_ids, sized
 
 _STARTS, _LENGTHS = (0.05, 0.25, 0.45, 0.65, 0.85), (0.1, 0.4)  # probed, as shares of a log

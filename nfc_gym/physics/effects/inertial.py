@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Effect, Param, Scales
+from nfc_gym.physics.effects.base import Array, Effect, Scales
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import body_ids, gyration, moving_bodies, sized
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.state import quat_multiply, rotate_back

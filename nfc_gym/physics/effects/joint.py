@@ -5,7 +5,9 @@
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index, joint_dofs
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
+from nfc_gym.physics.effects.lookup import index, joint_dofs
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import (
     angle_unit,
     force_unit,

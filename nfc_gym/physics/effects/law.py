@@ -19,8 +19,9 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
 from nfc_gym.physics.effects.generic import TIME, coordinates
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import turns
 from nfc_gym.physics.state import rotate
 

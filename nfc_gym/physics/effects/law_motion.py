@@ -5,10 +5,12 @@
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales, actuator_ids, actuator_names
+from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
 from nfc_gym.physics.effects.drive import command_unit
 from nfc_gym.physics.effects.generic import TIME
 from nfc_gym.physics.effects.law import Law, OfVariable, degrees, kind_of, pushed, time_of, turns
+from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.words import with_spread
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)

@@ -5,9 +5,10 @@
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales
+from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
 from nfc_gym.physics.effects.ground import ground_geoms, touching_geoms
 from nfc_gym.physics.effects.law import OfVariable, degrees, ends_of, kind_of, pushed
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.words import with_spread
 
 _SLIDE, _FREE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_FREE)

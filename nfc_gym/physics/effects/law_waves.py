@@ -5,9 +5,10 @@
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Context, Effect, Param, Scales
+from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
 from nfc_gym.physics.effects.generic import TIME
 from nfc_gym.physics.effects.law import Law, OfVariable, degrees, ends_of, kind_of, pushed, time_of
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.words import with_spread
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)

@@ -9,7 +9,9 @@ import numpy as np
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index, joint_dofs
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
+from nfc_gym.physics.effects.lookup import index, joint_dofs
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import (
     body_ids,
     force_unit,

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Param, Scales, groups, joint_dofs
+from nfc_gym.physics.effects.base import Array, Scales
+from nfc_gym.physics.effects.lookup import groups, joint_dofs
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.fields import ModelFields, names_of
 
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)

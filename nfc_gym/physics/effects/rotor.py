@@ -7,7 +7,9 @@ import numpy as np
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, index
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
+from nfc_gym.physics.effects.lookup import index
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import body_ids, gyration, sized
 from nfc_gym.physics.fields import names_of
 from nfc_gym.physics.state import components, joined, rotate_parts

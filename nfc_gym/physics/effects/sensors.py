@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, overrides
+from nfc_gym.physics.effects.base import Array, Effect, Scales, overrides
 from nfc_gym.physics.effects.each import Each
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.fields import object_id
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, rotate, rotate_back, vector_to_quat

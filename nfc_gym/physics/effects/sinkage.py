@@ -8,8 +8,10 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, groups
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
 from nfc_gym.physics.effects.ground import OnGround, ground_geoms, touching_geoms
+from nfc_gym.physics.effects.lookup import groups
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.slip import wheels
 from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.state import cross

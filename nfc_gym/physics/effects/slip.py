@@ -23,7 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Param, Scales, groups
+from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
+from nfc_gym.physics.effects.lookup import groups
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.state import cross
 

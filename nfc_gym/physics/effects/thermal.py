@@ -8,8 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import Array, Effect, Param, Scales, actuator_ids, actuator_names, index
+from nfc_gym.physics.effects.base import Array, Effect, Scales
 from nfc_gym.physics.effects.drive import actuator_places, plain
+from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, index
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.recurrence import chased
 

@@ -10,19 +10,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nfc_gym.physics.effects.base import (
-    Array,
-    Context,
-    Effect,
-    Param,
-    Rows,
-    Scales,
-    actuator_ids,
-    actuator_names,
-    index,
-    limited,
-)
+from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
 from nfc_gym.physics.effects.drive import actuator_places
+from nfc_gym.physics.effects.lookup import Rows, actuator_ids, actuator_names, index, limited
+from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.effects.ranges import narrow_ranges, range_of
 from nfc_gym.physics.recurrence import chased
