@@ -13,9 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import VectorEnv
 from rich.console import Console
 from torch import nn
 
@@ -27,19 +25,19 @@ from nfc_gym.adaptation.digests import of_detector, of_posterior
 from nfc_gym.adaptation.earned import RATE, chance, require_home
 from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portable, spread
+from nfc_gym.adaptation.given import check_fit, episode_of, run_folder, simulator_of, with_task
 from nfc_gym.adaptation.hallucination import hallucination
 from nfc_gym.adaptation.imagined import imagined, require_parts
 from nfc_gym.adaptation.network import Gaussian
 from nfc_gym.adaptation.optimise import optimise, pi_h_for
 from nfc_gym.adaptation.record import Record, in_words
-from nfc_gym.adaptation.sight import Sight, VectorSight
+from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute
 from nfc_gym.adaptation.weights import of_weights
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
 from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.random import mixed
-from nfc_gym.simulate.machine import full_id
 from nfc_gym.wrappers.anomaly import opened
 
 STATE = "state.safetensors"
@@ -165,14 +163,14 @@ class _Run:
     ) -> None:  # fmt: skip
         check_fit(agent, world)
         self.agent, self.world, self.config, self.threads, self.cluster = agent, world, config, threads, cluster
-        self.environment = _simulator_of(world, environment)
-        self.episode = _episode(config, world, self.environment)
-        self.settings, self.home = _with_task(settings, world), home
+        self.environment = simulator_of(world, environment)
+        self.episode = config.episode or episode_of(world, self.environment)
+        self.settings, self.home = with_task(settings, world), home
         self.detector, self.threshold = opened(detector, threshold)
         self.inference = inference_of(posterior)
         require_width(posterior, world.unwrapped.psi_space)
         require_spoken(posterior, config.parts)
-        self.folder = None if folder is None else _made(Path(folder))
+        self.folder = None if folder is None else run_folder(Path(folder))
         self.record = Record(None if self.folder is None else self.folder / "log", console)
         self.pi_h: Gaussian | None = None
         self.past = [copy.deepcopy(weights_of(agent))]  # what was deployed
@@ -361,72 +359,3 @@ class _Run:
                 "begin anew, or choose another folder"
             )
         self._remember()
-
-
-def _simulator_of(world: Any, environment: str | None) -> str:
-    """Full id of the simulator of a world."""
-    spec = getattr(world, "spec", None)
-    if environment is None and spec is None:
-        raise InputError(
-            "adapt: the world was not made by gymnasium.make and names no simulator: give its id, as in "
-            "environment='nfc_gym/JackalFlat-v0'"
-        )
-    return full_id(environment or spec.id)  # type: ignore[union-attr]
-
-
-def _episode(config: AdaptConfig, world: Any, environment: str) -> int:
-    """Control steps of an episode in the imagined worlds."""
-    spec = getattr(world, "spec", None) or gymnasium.spec(environment)
-    return config.episode or spec.max_episode_steps or 1000
-
-
-def _with_task(settings: Mapping[str, Any], world: Any) -> dict[str, Any]:
-    """Settings of a simulator under which it asks for what a world does.
-
-    Raises:
-      InputError: they name another task.
-    """
-    task, first = world.unwrapped.robot.task, world.unwrapped.robot.tasks[0]
-    given = settings.get("task", task) or first
-    if given != task:
-        raise InputError(f"adapt: settings has the task {given!r}, and the world's is {task!r}: leave it out")
-    return {**settings} if task == first else {**settings, "task": task}
-
-
-def _made(folder: Path) -> Path:
-    """The folder of a run, with its place for curves, made where it is not there yet."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"adapt: {folder} is a file; `folder` is where trajectories and state are kept")
-    try:
-        (folder / "log").mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise InputError(f"adapt: folder {folder} cannot be written ({e.strerror or e}); choose another one") from None
-    return folder
-
-
-def check_fit(agent: Agent, world: Any) -> None:
-    """Refuse an agent that cannot act in a world.
-
-    Raises:
-      InputError: it is no agent, the world is a vector environment or none of this package's, of another robot, or has
-        another action; the agent's actor does not take what the world shows, or wants more; its actions are discrete.
-    """
-    if not isinstance(agent, Agent):
-        raise InputError(
-            f"adapt: want an Agent(actor, loss, sight), got {type(agent).__name__}; ppo_agent(policy) makes one"
-        )
-    if isinstance(world, VectorEnv) or not hasattr(world.unwrapped, "psi_space"):
-        raise InputError("adapt: the world is one environment of this package, single, with wrappers around it")
-    theirs, mine = Sight.of(world), agent.sight
-    if (mine.proprio, mine.goal) != (theirs.proprio, theirs.goal):
-        raise InputError(f"adapt: the agent is of another robot than {theirs.environment}: {mine.says()}")
-    if mine.cells is not None and theirs.cells is None:
-        raise InputError(f"adapt: the agent looks at elevation, and {theirs.environment} is flat ground")
-    try:
-        size = agent.action_size()
-    except RuntimeError as e:
-        raise InputError(f"adapt: the agent's actor does not take an observation of ({mine.size},): {e}") from e
-    if world.action_space.shape != (size,):
-        raise InputError(
-            f"adapt: the agent's actions have {size} entries, those of {theirs.environment} {world.action_space.shape}"
-        )
