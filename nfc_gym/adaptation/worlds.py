@@ -34,9 +34,9 @@ class VectorStaggered(VectorWrapper):
         self._left = np.zeros(env.num_envs, int)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset; a reset of all draws new ends."""
+        """Reset; one without a mask draws new ends, one with it is what follows an end, though it be of all."""
         mask = (options or {}).get("reset_mask")
-        if mask is None or np.all(mask):
+        if mask is None:
             self._left = self._rng.integers(1, self._longest + 1, self.num_envs)
         else:
             self._left[np.asarray(mask)] = 0
