@@ -1,14 +1,17 @@
 """What reaches the actuators along a log: its commands, after the effects on them and what the model makes late."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from nfc_gym.measured.instant import Track
-from nfc_gym.physics.activations import Activations, delayed_course, longest_delay
+from nfc_gym.physics.activations import LED_BY, Activations, delayed_course, longest_delay
 from nfc_gym.physics.effects.base import Effect, overrides
+from nfc_gym.physics.fields import ModelFields
+from nfc_gym.physics.parameters import split_field
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -39,18 +42,36 @@ def delivered(plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Delivered
 
     Commands go on from row to row of the log as each is held; what remembers them goes on in steps of the physics.
     """
-    pairs = zip(plant.effects, plant.split(x)[1], strict=True)
-    commanding = [(e, theta) for e, theta in pairs if overrides(e, "action")]
+    psi, thetas = plant.split(x)
+    commanding = [(e, theta) for e, theta in zip(plant.effects, thetas, strict=True) if overrides(e, "action")]
     effects = [e for e, _ in commanding]
     # Most parameter vectors of a fit differ in what no command feels.
-    each, where = np.unique(
-        np.concatenate([np.zeros((len(x), 0)), *(theta for _, theta in commanding)], 1), axis=0, return_inverse=True
-    )
-    courses = _Courses(plant, effects, tracks, each)
+    felt = psi if _led_by(plant) else psi[:, :0]
+    each, where = np.unique(np.concatenate([felt, *(t for _, t in commanding)], 1), axis=0, return_inverse=True)
+    courses = _Courses(plant, effects, tracks, each[:, felt.shape[1] :])
     turn = max(1, _AT_ONCE // courses.size)
-    parts = [courses.under(each[i : i + turn]) for i in range(0, len(each), turn)]
+    parts = [
+        courses.under(some[:, felt.shape[1] :], _fields(plant, some[:, : felt.shape[1]]))
+        for some in (each[i : i + turn] for i in range(0, len(each), turn))
+    ]
     whole = [np.concatenate(arrays)[where.reshape(-1)] for arrays in zip(*parts, strict=True)]
     return [Delivered(*(a[:, i, : len(t.time)] for a in whole)) for i, t in enumerate(tracks)]
+
+
+def _led_by(plant: Plant) -> bool:
+    """Whether psi changes what the model's own filters and delays make of commands."""
+    model = plant.model
+    remembers = bool(model.na) or bool(longest_delay(model))
+    return remembers and any(split_field(p.field)[0] in LED_BY for p in plant.space.parameters)
+
+
+def _fields(plant: Plant, psi: Array) -> dict[str, Array]:
+    """Of `LED_BY` those that psi (P, d) writes to, (P, 1, nu, ...) each; none where nothing is felt of it."""
+    if not psi.shape[1]:
+        return {}
+    fields = ModelFields(Batch(plant.model, len(psi), 1))
+    plant.space.write(fields, psi)
+    return {name: np.array(values)[:, None] for name, values in fields.touched.items() if name in LED_BY}
 
 
 class _Courses:
@@ -94,16 +115,16 @@ class _Courses:
         cuts = np.cumsum([len(e.params) for e in self.effects])[:-1]
         return [np.repeat(th[:, None], tracks, 1) for th in np.split(thetas, cuts, axis=1)][: len(self.effects)]
 
-    def under(self, thetas: Array) -> tuple[Array, Array, Array]:
+    def under(self, thetas: Array, fields: Mapping[str, Array]) -> tuple[Array, Array, Array]:
         """(P, L, T, nu), (P, L, T, nu), (P, L, T, na): see `Delivered`."""
         model, shape = self.model, (len(thetas), *self.ctrl.shape)
         ctrl = np.broadcast_to(self.ctrl, shape)
         signals = {k: np.broadcast_to(s, shape[:-1]) for k, s in self.signals.items()}
         for effect, theta in zip(self.effects, self._split(thetas, shape[1]), strict=True):
             ctrl = effect.course(ctrl, theta, signals, self.step)
-        passed = delayed_course(model, ctrl, self.step) if self.late else ctrl
+        passed = delayed_course(model, ctrl, self.step, fields) if self.late else ctrl
         at = slice(None, None, self.every)
-        act = Activations(model, self.step).course(passed)[..., at, :]
+        act = Activations(model, self.step, fields).course(passed)[..., at, :]
         ctrl, passed = np.ascontiguousarray(ctrl[..., at, :]), np.ascontiguousarray(passed[..., at, :])
         return ctrl, passed, np.ascontiguousarray(act)
 

@@ -96,8 +96,9 @@ class Acting:
             self.base[name] = live.copy() if rows is None else _merged(live, base, rows)
 
     def settle_quick(self) -> None:
-        """Hidden states of commands begin anew with the next one, but for the slow ones."""
-        self.memories = [m if e.slow else _ANEW for m, (e, _) in zip(self.memories, self.commanding, strict=True)]
+        """Hidden states of commands begin anew with the next one, but for those that go on at any step (`span`)."""
+        pairs = zip(self.memories, self.commanding, strict=False)
+        self.memories = [m if e.span(theta) else _ANEW for m, (e, theta) in pairs]
 
     def command(
         self, ctrl: Array, exogenous: Mapping[str, Array], dt: float | None = None,

@@ -1,6 +1,6 @@
 """What MuJoCo keeps of past commands, made for roll-outs that start in the middle of a log."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -9,10 +9,13 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.physics.recurrence import chased
+from nfc_gym.physics.recurrence import FORGOTTEN, chased
 
 Array = NDArray[np.float64]
 _INTEGRATOR, _AFFINE = int(mujoco.mjtDyn.mjDYN_INTEGRATOR), int(mujoco.mjtBias.mjBIAS_AFFINE)
+_NONE: Mapping[str, Array] = {}
+# Model fields that decide what becomes of commands before actuators feel them.
+LED_BY = tuple(f"actuator_{n}" for n in ("dynprm", "ctrllimited", "ctrlrange", "actlimited", "actrange", "delay"))
 _JOINT, _SLIDE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -37,36 +40,60 @@ class Activations:
       model: MuJoCo's dynamics of the types `filter` and `filterexact` are followed, and taken as exact, and those of
         the type `integrator`.
       dt: step, s.
+      fields: model fields of each simulation, (..., nu, k), where they differ from the model's (`ModelFields.touched`).
     """
 
-    def __init__(self, model: mujoco.MjModel, dt: float) -> None:
+    def __init__(self, model: mujoco.MjModel, dt: float, fields: Mapping[str, Array] = _NONE) -> None:
         self._dt, self._sums, self._servos = dt, integrators(model), on_servos(model)
+        self._model, self._fields = model, fields
         kinds = [int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)]
         filters = np.flatnonzero(np.isin(model.actuator_dyntype, kinds))
         self._of, self._filters = np.concatenate([filters, self._sums]), len(filters)
         self._at = model.actuator_actadr[self._of]
-        self._clip, self._bound = (_ends(model, self._of, kind) for kind in ("ctrl", "act"))
-        self._keep = np.exp(-dt / np.maximum(model.actuator_dynprm[filters, 0], 1e-9))
-        self._carried, self._reach = _carried(model, self._servos), _ends(model, self._servos, "act")
+        self._clip, self._bound = (self._ends(self._of, kind) for kind in ("ctrl", "act"))
+        self._late = np.maximum(self._field("actuator_dynprm")[..., filters, 0], 1e-9)
+        self._keep = np.exp(-dt / self._late)
+        self._carried, self._reach = _carried(model, self._servos), self._ends(self._servos, "act")
         self._targets, self._count = model.actuator_actadr[self._servos], model.na
 
     def __bool__(self) -> bool:
         """Whether the model has any."""
         return len(self._of) > 0
 
-    def advance(self, ctrl: Array, act: Array, settle: bool = False) -> None:
+    @property
+    def differ(self) -> bool:
+        """Whether the same commands may lead to other states in some simulations than in others."""
+        return bool(self) and any(name in self._fields for name in LED_BY)
+
+    @property
+    def span(self) -> float:
+        """Seconds of past commands that the filters' states depend on."""
+        return FORGOTTEN * float(np.max(self._late, initial=0.0))
+
+    def _field(self, name: str) -> Array:
+        return self._fields.get(name, getattr(self._model, name))
+
+    def _ends(self, of: NDArray[np.intp], kind: str) -> tuple[Array, Array]:
+        """(low, high) of actuators' `ctrl` or `act` ranges, infinite where there are none."""
+        limited = self._field(f"actuator_{kind}limited")[..., of].astype(bool)
+        ends = self._field(f"actuator_{kind}range")[..., of, :]
+        return np.where(limited, ends[..., 0], -np.inf), np.where(limited, ends[..., 1], np.inf)
+
+    def advance(self, ctrl: Array, act: Array, settle: bool = False, dt: float | None = None) -> None:
         """One step of the states (..., na) under commands (..., nu), in place.
 
         Args:
           settle: the commands have been held for ever; integrators stay as they are.
+          dt: of this step, s; default as of all.
         """
         if not self:
             return
         wish, old, cut = np.clip(ctrl[..., self._of], *self._clip), act[..., self._at], self._filters
         new = wish.copy()
         if not settle:
-            new[..., :cut] += self._keep * (old[..., :cut] - wish[..., :cut])
-        new[..., cut:] = old[..., cut:] if settle else old[..., cut:] + self._dt * wish[..., cut:]
+            keep = self._keep if dt is None else np.exp(-dt / self._late)
+            new[..., :cut] += keep * (old[..., :cut] - wish[..., :cut])
+        new[..., cut:] = old[..., cut:] if settle else old[..., cut:] + (dt or self._dt) * wish[..., cut:]
         act[..., self._at] = np.clip(new, *self._bound)
 
     def course(self, ctrl: Array) -> Array:
@@ -75,12 +102,13 @@ class Activations:
         if not self:
             return out
         self.advance(ctrl[..., 0, :], out[..., 0, :], settle=True)
-        wish, cut, at = np.clip(ctrl[..., :-1, self._of], *self._clip), self._filters, self._at
+        least, most = (end[..., None, :] for end in self._clip)
+        wish, cut, at = np.clip(ctrl[..., :-1, self._of], least, most), self._filters, self._at
         start = out[..., 0, at]
         sums = np.cumsum(np.concatenate([start[..., None, cut:], self._dt * wish[..., cut:]], -2), -2)
         filtered = chased(wish[..., :cut], np.broadcast_to(self._keep, start[..., :cut].shape), start[..., :cut])
         led = np.concatenate([filtered, sums[..., 1:, :]], -1)
-        low, high = self._bound
+        low, high = (end[..., None, :] for end in self._bound)
         if (led >= low).all() and (led <= high).all():
             out[..., 1:, at] = led
             return out
@@ -126,13 +154,6 @@ class Activations:
         engine.act[..., self._targets] = np.clip(held, *self._reach)
 
 
-def _ends(model: mujoco.MjModel, of: NDArray[np.intp], kind: str) -> tuple[Array, Array]:
-    """(low, high) of actuators' `ctrl` or `act` ranges, infinite where there are none."""
-    limited = getattr(model, f"actuator_{kind}limited")[of].astype(bool)
-    low, high = getattr(model, f"actuator_{kind}range")[of].T
-    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
-
-
 def _carried(model: mujoco.MjModel, of: NDArray[np.intp]) -> Array:
     """(n, nv) share of a joint's load in each actuator's force; 0 where another moves the same joint, or no joint."""
     out = np.zeros((len(of), model.nv))
@@ -150,32 +171,44 @@ def longest_delay(model: mujoco.MjModel) -> int:
     return int(np.max(model.actuator_history[:, 0], initial=0))
 
 
-def delayed(model: mujoco.MjModel, commands: Sequence[Array], dt: float) -> Array:
+def delayed(model: mujoco.MjModel, commands: Sequence[Array], dt: float, fields: Mapping[str, Array] = _NONE) -> Array:
     """The command (..., nu) that MuJoCo's native delays let through of `commands`, the latest last."""
-    latest = out = commands[-1]
-    for i, share, ages in _lateness(model, dt):
-        if out is latest:
-            out = latest.copy()
-        old, young = (commands[max(len(commands) - 1 - age, 0)][..., i] for age in ages)
+    late, last = list(_lateness(model, dt, fields)), len(commands) - 1
+    if any(older.ndim for _, _, older in late):
+        return _let_through(np.stack(commands, -2), late, np.array([last]))[..., 0, :]
+    out = commands[-1].copy() if late else commands[-1]
+    for i, share, older in late:
+        old, young = (commands[max(last - age, 0)][..., i] for age in (int(older), int(older) - 1))
         out[..., i] = old + share * (young - old)
     return out
 
 
-def delayed_course(model: mujoco.MjModel, ctrl: Array, dt: float) -> Array:
+def delayed_course(model: mujoco.MjModel, ctrl: Array, dt: float, fields: Mapping[str, Array] = _NONE) -> Array:
     """What `delayed` lets through along a whole course of commands (..., T, nu); the first was held since ever."""
-    out, at = ctrl.copy(), np.arange(ctrl.shape[-2])
-    for i, share, ages in _lateness(model, dt):
-        old, young = (ctrl[..., np.maximum(at - age, 0), i] for age in ages)
-        out[..., i] = old + share * (young - old)
+    return _let_through(ctrl, list(_lateness(model, dt, fields)), np.arange(ctrl.shape[-2]))
+
+
+def _let_through(ctrl: Array, late: Sequence[tuple[int, Array, NDArray[np.intp]]], at: NDArray[np.intp]) -> Array:
+    """(..., n, nu) at some steps (n,) of a course (..., T, nu)."""
+    out = ctrl[..., at, :].copy()
+    for i, share, older in late:
+        own = np.broadcast_to(ctrl[..., i], (*np.broadcast_shapes(ctrl.shape[:-2], older.shape), ctrl.shape[-2]))
+        ages = np.broadcast_to(older[..., None], (*own.shape[:-1], 1))
+        old, young = (np.take_along_axis(own, np.clip(at - ages + k, 0, at), -1) for k in (0, 1))
+        out[..., i] = old + share[..., None] * (young - old)
     return out
 
 
-def _lateness(model: mujoco.MjModel, dt: float) -> Iterator[tuple[int, float, tuple[int, int]]]:
-    """Actuators that delay their commands, the younger sample's share, and ages in steps of the older and younger."""
-    for i in np.flatnonzero((model.actuator_history[:, 0] > 0) & (model.actuator_delay > 0)):
-        steps = float(model.actuator_delay[i]) / dt
-        older = int(np.ceil(steps - 1e-9))
-        yield int(i), older - steps if model.actuator_history[i, 1] else 0.0, (older, older - 1)  # else held
+def _lateness(
+    model: mujoco.MjModel, dt: float, fields: Mapping[str, Array]
+) -> Iterator[tuple[int, Array, NDArray[np.intp]]]:
+    """Actuators that delay commands, the share (...,) of the younger of two samples, and the older one's age, steps."""
+    delay = fields.get("actuator_delay", model.actuator_delay)
+    for i in np.flatnonzero(model.actuator_history[:, 0] > 0):
+        steps = delay[..., i] / dt
+        if (steps > 0).any():
+            older = np.ceil(steps - 1e-9).astype(np.intp)
+            yield int(i), older - steps if model.actuator_history[i, 1] else np.zeros_like(steps), older  # else held
 
 
 def fill_delays(model: mujoco.MjModel, commands: Sequence[Array], history: Array) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+FORGOTTEN = 8.0  # time constants after which a state shows no more of where it began
 _NONE = 1e-18  # of a gap: what is left of it adds nothing to a number
 
 

@@ -4,6 +4,7 @@ import copy
 from collections import deque
 from collections.abc import Mapping
 from functools import partial
+from math import ceil
 from typing import Any, Protocol
 
 import mujoco
@@ -63,13 +64,13 @@ class Run:
         self.plant, self.segments, self.sensors, self.count = plant, segments, sensors, count
         self.copies = np.tile(np.arange(len(segments)), count)
         model = plant.model
-        self.activations = Activations(model, segments.dt)
         self.thetas = plant.split(rows)[1]
         self.batch = (Batch if sensors else _Unsensed)(model, len(rows), plant.nthread)
         self.fields = ModelFields(self.batch, model)
         self.varying = self._write_known()
         plant.write(self.fields, rows)
         self.fields.commit()
+        self.activations = Activations(model, segments.dt, self.fields.touched)
         q, v = self._true(self._tile(segments.qpos), self._tile(segments.qvel))
         # Live views: asking the batch for them anew costs as much as stepping a small machine.
         self.qpos, self.qvel, self.ctrl, self.act = (self.batch.bind(n) for n in ("qpos", "qvel", "ctrl", "act"))
@@ -177,13 +178,6 @@ class Run:
     def _remember(self) -> None:
         """Lead the hidden states through what was commanded and measured before the starts."""
         segments, past, acting = self.segments, self.segments.past, self.acting
-        if past is not None and segments.history and any(e.slow for e, _ in acting.commanding):
-            lead, step = past.lead
-            signals = self._exogenous(-segments.history)
-            for k in range(lead.shape[1]):
-                acting.command(self._tile(lead[:, k]), signals, step)
-            if lead.shape[1]:  # a log may begin no sooner than the history does
-                acting.settle_quick()
         model = self.plant.model
         tracking = past is not None and bool(acting.tracking)
         longest = longest_delay(model)
@@ -191,15 +185,18 @@ class Run:
             return  # nothing that remembers
         recent = deque[Array](maxlen=longest + 1)
         # Without an effect on them commands are the same for every parameter vector.
-        alike = not (acting.commanding or tracking or segments.servo)
+        alike = not (acting.commanding or tracking or segments.servo or self.activations.differ)
         act = np.zeros((len(segments), model.na)) if alike else self.act
+        led = self._lead(act, alike)
         for k in range(-segments.history, 0):
             exogenous, q, v = self._exogenous(k), self.qpos, self.qvel
             if past is not None and (tracking or segments.servo):
                 q, v = self._true(*map(self._tile, past.motion(k + segments.history)))
             ctrl = segments.ctrl[:, segments.history + k] if alike else self._command(k, exogenous, q, v)
             recent.append(ctrl)
-            self.activations.advance(delayed(model, recent, segments.dt), act, settle=k == -segments.history)
+            self.activations.advance(
+                delayed(model, recent, segments.dt, self.fields.touched), act, settle=k == -segments.history and not led
+            )
             if tracking:
                 acting.recall(q, v, ctrl, exogenous)
         if alike and segments.history:
@@ -207,6 +204,27 @@ class Run:
             recent = deque(map(self._tile, recent))
         if recent and longest:
             fill_delays(model, recent, self.batch.bind("history"))
+
+    def _lead(self, act: Array, alike: bool) -> bool:
+        """Lead what remembers more than the history holds through the commands before it; whether there were any.
+
+        Args:
+          act: actuators' states, of the segments where commands are `alike` in all rows, else of the rows.
+        """
+        segments, past, acting = self.segments, self.segments.past, self.acting
+        span = max([self.activations.span, *(e.span(theta) for e, theta in acting.commanding)])
+        if past is None or not segments.history or span <= segments.history * segments.dt:
+            return False
+        lead, step = past.lead
+        if not lead.shape[1]:  # a log may begin no sooner than the history does
+            return False
+        signals = {} if alike else self._exogenous(-segments.history)
+        first = max(lead.shape[1] - ceil(min((span - segments.history * segments.dt) / step, lead.shape[1])), 0)
+        for k in range(first, lead.shape[1]):
+            ctrl = lead[:, k] if alike else acting.command(self._tile(lead[:, k]), signals, step)
+            self.activations.advance(ctrl, act, settle=k == first, dt=step)
+        acting.settle_quick()
+        return True
 
     def _advance(self, k: int, first: bool) -> None:
         """One physics step under the command of step k."""

@@ -15,7 +15,7 @@ from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build
-from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
 from nfc_gym.physics.segments import Segments, Servo
 
@@ -139,6 +139,39 @@ def test_a_drive_is_as_warm_as_all_of_a_long_log_made_it(
     assert _off(warm, log, linear) < 1e-5
     monkeypatch.setattr(segments, "_ROOM", 0)
     assert _off(warm, log, linear) < 1.5e-3
+
+
+LAG = build("lag", "motor", {"time_constant": 0.3})
+FILTER = PENDULUM.replace("<motor ", '<general dyntype="filterexact" dynprm="0.03" actearly="true" ')
+
+
+def late(seconds: float) -> Log:
+    """Commands that arrive with a lag of 0.3 s, in a plain loop and without noise."""
+    data, t = mujoco.MjData(MODEL), np.arange(round(seconds / DT / EVERY)) * DT * EVERY
+    u = 0.7 * np.sin(3 * t) + 0.5 * np.sin(1.1 * t)
+    y, q, v = u[0], np.empty(len(t)), np.empty(len(t))
+    for k in range(len(t)):
+        q[k], v[k] = data.qpos[0], data.qvel[0]
+        for _ in range(EVERY):
+            y = u[k] + np.exp(-DT / LAG[1][0]) * (y - u[k])
+            data.ctrl[0] = y
+            mujoco.mj_step(MODEL, data)
+    channels = {"joint:hinge:pos": Channel(q, "rad", 1e-6), "joint:hinge:vel": Channel(v, "rad/s", 1e-5)}
+    return Log("late", t, {"ctrl:motor": u}, channels, {"exo:time": t})
+
+
+@pytest.mark.parametrize("kind", ["effect", "filter"])
+def test_what_is_later_than_the_history_is_led_through_the_commands_before_it(kind: str) -> None:
+    """A lag, and a model's own filter whose time constant is a parameter; 0.5 s hold less than two of 0.3 s."""
+    log, model = late(12.0), mujoco.MjModel.from_xml_string(FILTER if kind == "filter" else PENDULUM)
+    psi = [Parameter("tau", "actuator_dynprm[0]", ("motor",), "s", 0.005, 0.5)] if kind == "filter" else []
+    effects = [] if kind == "filter" else [LAG[0]]
+    plant = Plant(model, ParameterSpace(model, psi), effects, nthread=1)
+    states, layout = estimate_states(model, log, raw=True), Layout(0.2, 0.5, (0.2,), 0.2, DT, put_off=False)
+    problem = RolloutProblem(model, [log], [states], layout)
+    true, other = (np.abs(problem.residual(plant, np.array([[tau]]))[0][:, 0]).max() for tau in (0.3, 0.25))
+    assert true < 2e-4
+    assert other > 100 * true
 
 
 def served(seconds: float) -> Log:

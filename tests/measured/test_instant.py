@@ -151,6 +151,28 @@ def test_activations_get_to_where_steps_of_the_physics_lead_them(actuator: str, 
     np.testing.assert_allclose(forward(cart(actuator), log, linear=linear), wanted, atol=1e-9)
 
 
+LATE = (
+    '<general name="motor" joint="slide" dyntype="filterexact" dynprm="{tau}" delay="{delay}" nsample="9"'
+    ' interp="linear" ctrlrange="-{most} {most}" ctrllimited="true"/>'
+)
+OF_LATE = {"tau": ("actuator_dynprm[0]", 0.01, 0.5), "delay": ("actuator_delay", 0.0, 0.03)}
+OF_LATE["most"] = ("actuator_ctrlrange[1]", 0.1, 9.0)
+
+
+@pytest.mark.parametrize(("name", "values"), [("tau", (0.05, 0.2)), ("delay", (0.012, 0.027)), ("most", (0.4, 1.3))])
+def test_what_leads_the_models_own_filters_may_be_a_parameter(name: str, values: tuple[float, float]) -> None:
+    """It then does what it does as written in the model, in several parameter vectors at once."""
+    nominal = {"tau": 0.03, "delay": 0.02, "most": 2.0}
+    log = pushed(np.random.default_rng(8).normal(size=60) ** (2 if name == "most" else 1), 5 * STEP)
+    field, low, high = OF_LATE[name]
+    plant = plant_of(cart(LATE.format(**nominal)), psi=(Parameter(name, field, ("motor",), "1", low, high),))
+    problem = ForwardProblem(plant.model, [log], [estimate_states(plant.model, log)], 0.2, 1)
+    found = problem.along(plant, np.array(values)[:, None], problem.tracks)[0][..., 0]
+    for value, own in zip(values, found, strict=True):
+        wanted = forward(cart(LATE.format(**{**nominal, name: value})), log)
+        np.testing.assert_allclose(own, wanted, atol=1e-9)
+
+
 def test_parameter_vectors_that_differ_in_what_no_command_feels_share_their_commands() -> None:
     model = cart()
     mass = Parameter("mass", "actuator_gainprm[0]", ("motor",), "1", 0.1, 9.0)

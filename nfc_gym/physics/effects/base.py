@@ -139,8 +139,6 @@ class Effect(ABC):
     SETTINGS: ClassVar[tuple[str, ...]] = ()
     # Model fields that `modulate` writes to.
     MODULATES: ClassVar[tuple[str, ...]] = ()
-    # Whether the hidden state of `action` outlives the history before a segment: it then begins where the log does.
-    slow: ClassVar[bool] = False
     # Of an effect on commands: whether it is the drive's, behind a firmware servo, and not on the way of its goal.
     on_drive: ClassVar[bool] = False
     # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
@@ -258,6 +256,14 @@ class Effect(ABC):
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         """Hidden state before the first command; `ctrl` (..., nu) is that command, held since ever."""
         return None
+
+    def span(self, theta: Array) -> float:
+        """Seconds of past commands that the hidden state of `action` depends on, of a state that goes on at any step.
+
+        Where it is longer than the history before a segment, the state is led there through the commands before it, in
+        coarse steps. 0 of a state that must begin anew where steps get another length.
+        """
+        return 0.0
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float

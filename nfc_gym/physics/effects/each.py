@@ -21,7 +21,7 @@ _HOOKS = (
     "spec", "model", "action", "rest", "follow", "friction", "modulate", "force", "demand", "sense", "unsense", "chart",
     "unchart",
 )  # fmt: skip
-_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "slow", "driven", "on_drive")
+_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "driven", "on_drive")
 
 
 class Each(Effect):
@@ -89,6 +89,10 @@ class Each(Effect):
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         """See `Effect`."""
         return [m.state0(shape, ctrl, t, dt) for m, t in zip(self.members, self._theta(theta), strict=True)]
+
+    def span(self, theta: Array) -> float:
+        """See `Effect`."""
+        return max(m.span(t) for m, t in self.apart(theta))
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float

@@ -27,7 +27,6 @@ class Thermal(Effect):
     family = "thermal"
     summary = "Drive fades as it warms up"
     covers = ("loss", "gain")  # heat that hardly changes while the log lasts
-    slow = True  # it warms up over minutes
     on_drive = True
     PARAMS = (
         Param("fade", "1", 0.0, 0.9, probes=(0.05, 0.2), resolution=0.002),
@@ -40,6 +39,9 @@ class Thermal(Effect):
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         return (ctrl[..., self.rows] / theta[..., 2:3]) ** 2
+
+    def span(self, theta: Array) -> float:
+        return np.inf  # it warms up over minutes
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float

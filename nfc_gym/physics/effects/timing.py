@@ -16,7 +16,7 @@ from nfc_gym.physics.effects.lookup import Rows, actuator_ids, actuator_names, i
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.effects.ranges import narrow_ranges, range_of
-from nfc_gym.physics.recurrence import chased
+from nfc_gym.physics.recurrence import FORGOTTEN, chased
 
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
 
@@ -67,6 +67,9 @@ class Lag(_Late):
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
         return self._commands(ctrl)
+
+    def span(self, theta: Array) -> float:
+        return FORGOTTEN * float(np.max(theta[..., 0], initial=0.0))
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
