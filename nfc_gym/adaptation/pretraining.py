@@ -30,6 +30,7 @@ from nfc_gym.adaptation.ppo import ONWARD, Diverged, OnPolicy, PPOConfig, clippe
 from nfc_gym.adaptation.record import Episodes, Record, in_words
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.threads import limit_threads
+from nfc_gym.adaptation.weights import of_weights
 from nfc_gym.adaptation.worlds import robot_of, training_env, vector_env
 from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError, NfcError
@@ -76,7 +77,9 @@ def recipe_of(environment: str, onward: bool = False, task: str | None = None) -
     recipe = RECIPES[robot_of(environment)]
     if task == "figure8":  # a lap takes longer than the way to a goal
         recipe = replace(recipe, episode=Recipe.episode)
-    return replace(recipe, ppo=ONWARD) if onward else recipe
+    if onward:  # no more exploring than from nothing: a humanoid's weight is 0
+        return replace(recipe, ppo=replace(ONWARD, entropy=min(ONWARD.entropy, recipe.ppo.entropy)))
+    return recipe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,6 +205,7 @@ class Run:
         self.threads = threads if cluster is None else 0  # in this process
         self.steps, self.elapsed = 0, 0.0
         self.started: dict[str, Any] | None = None
+        self.start: str | None = None  # what tells the policy to begin with from others
         self.episodes = Episodes()
         torch.manual_seed(training.seed)
         make = partial(
@@ -225,6 +229,8 @@ class Run:
     def go_on(self, path: Path, steps: int, seconds: float | None, start: Policy | None = None) -> None:
         """Train up to so many steps in all, from the state beside `path` if there is one; then judge and save."""
         state = path.with_name(path.name + ".training")
+        if start is not None:
+            self.start = f"{start.sight.environment}, weights {of_weights(start.network)}"
         if state.is_file():
             self.load_state(state)
             over = self.steps >= steps
@@ -336,7 +342,10 @@ class Run:
 
     def load_state(self, path: Path) -> None:
         """The inverse."""
-        plain = resume.load(path, self._modules(), self.learner.optimiser, self._described())
+        of = self._described()
+        if "start" not in resume.described(path):  # a state of before that was written down
+            del of["start"]
+        plain = resume.load(path, self._modules(), self.learner.optimiser, of)
         self.steps, self.elapsed, self.episodes.count = plain["steps"], plain["elapsed"], plain["episodes"]
         self.started = plain.get("started")
 
@@ -344,4 +353,5 @@ class Run:
         return {"network": self.network, "reward": self.learner.power}
 
     def _described(self) -> dict[str, Any]:
-        return {**asdict(self.training), "ppo": asdict(self.recipe.ppo), "episode": self.recipe.episode}
+        how = {"ppo": asdict(self.recipe.ppo), "episode": self.recipe.episode}
+        return {"start": self.start, **asdict(self.training), **how}

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,7 +18,7 @@ from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.network import ActorCritic, Sizes
 from nfc_gym.adaptation.policy import Policy, taught
 from nfc_gym.adaptation.ppo import Diverged
-from nfc_gym.adaptation.pretraining import ONWARD, Run, Training
+from nfc_gym.adaptation.pretraining import ONWARD, RECIPES, Run, Training, recipe_of
 from nfc_gym.adaptation.record import Episodes, Record
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.worlds import vector_env
@@ -89,6 +90,41 @@ def test_a_run_that_stopped_goes_on_and_one_with_other_arguments_does_not(tmp_pa
     assert again.network.scale.count == count, "nothing was left to do"
     with pytest.raises(InputError, match=r"another run .*seed 0, now 1"):
         pretrain("JackalFlat", path, steps=4096, seed=1, **SMALL)
+
+
+def test_another_policy_to_begin_with_is_another_run(
+    tmp_path: Path, jackal: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Told by its weights, wherever its file lies; a state of before that was written down is read as it was."""
+    monkeypatch.setattr(Run, "save", lambda *_: None)  # whole episodes, to judge by
+    other = load_policy(jackal)
+    with torch.no_grad():
+        next(other.network.parameters()).add_(0.01)
+    other.save(tmp_path / "other.safetensors")
+    (tmp_path / "copy.safetensors").write_bytes(jackal.read_bytes())
+    run = partial(pretrain, "JackalFlat", tmp_path / "p.safetensors", steps=16, envs=1, threads=1, device="cpu")
+    run(start=jackal)
+    run(start=tmp_path / "copy.safetensors")
+    told = r"another run \(start 'nfc_gym/JackalFlat-v0, weights \w+', now "
+    with pytest.raises(InputError, match=told + "'nfc_gym/JackalFlat-v0, weights"):
+        run(start=tmp_path / "other.safetensors")
+    with pytest.raises(InputError, match=told + "not given"):
+        run()
+    state = tmp_path / "p.safetensors.training"
+    with safe_open(state, "pt") as file:
+        metadata = file.metadata()
+    before = json.loads(metadata["state"])
+    del before["of"]["start"]
+    save_file(weights(state), state, {**metadata, "state": json.dumps(before)})
+    run(start=jackal)
+
+
+@pytest.mark.parametrize("robot", RECIPES)
+def test_going_on_from_weights_explores_no_more_than_from_nothing(robot: str) -> None:
+    environment = f"nfc_gym/{robot.capitalize()}Rough-v0"
+    first, onward = (recipe_of(environment, there).ppo for there in (False, True))
+    assert onward.entropy == min(first.entropy, ONWARD.entropy)
+    assert onward.rate == ONWARD.rate < first.rate
 
 
 def test_the_state_on_disk_is_all_that_going_on_needs(tmp_path: Path) -> None:
