@@ -2,17 +2,19 @@
 
 import operator
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 from zlib import crc32
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.wrappers.order import beneath, check_order, kind
+from nfc_gym.wrappers.rows import mode_of
 
 
 def _rebuild(cls: type, env: Any, kwargs: dict[str, Any]) -> Any:
@@ -97,6 +99,24 @@ class _Common(RecordConstructorArgs):
         self.rng = np.random.default_rng(entropy)
         return self.rng
 
+    @contextmanager
+    def refusable(self, *undo: Callable[[], None]) -> Iterator[None]:
+        """A reset that may be refused once the wrapper has drawn for it: its stream then stands where it stood.
+
+        Args:
+          undo: called then, to put back what else was changed for the episode that does not begin.
+        """
+        rng, state = self.rng, None if self.rng is None else self.rng.bit_generator.state
+        try:
+            yield
+        except BaseException:
+            self.rng = rng
+            if rng is not None:
+                rng.bit_generator.state = state
+            for each in undo:
+                each()
+            raise
+
 
 class EnvWrapper(_Common, gym.Wrapper):
     """Base of the wrappers around one environment. A pickle or a deep copy must be reset before it steps."""
@@ -125,6 +145,11 @@ class VectorEnvWrapper(_Common, VectorWrapper):
         self.require(env)
         self._open(env, arguments)
         VectorWrapper.__init__(self, env)
+
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """Of the environment; TorchRL asks for it here."""
+        return mode_of(self.env)
 
     def vet(self, seed: Any, options: Any) -> None:
         """Refuse what the environment would refuse of a reset, before anything is drawn or forgotten for it."""

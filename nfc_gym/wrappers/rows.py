@@ -14,12 +14,17 @@ from numpy.typing import NDArray
 Mask = NDArray[np.bool_]
 
 
+def mode_of(env: VectorEnv) -> AutoresetMode:
+    """How a vector environment begins the next episodes; one that does not say is taken for Gymnasium's default."""
+    return AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+
+
 class Rows:
     """Follows the episodes of a vector environment from outside."""
 
     def __init__(self, env: VectorEnv) -> None:
         self.n = env.num_envs
-        self.mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        self.mode = mode_of(env)
         self.done: Mask = np.zeros(self.n, bool)
 
     def reset(self, options: Any) -> Mask:

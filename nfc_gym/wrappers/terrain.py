@@ -183,9 +183,9 @@ class ResidualTerrain(EnvWrapper):
 class VectorResidualTerrain(VectorEnvWrapper):
     """`ResidualTerrain` around a vector environment on `mujoco.batch`; arguments as there.
 
-    Its simulations choose from a pool of maps. Each map of the pool gets a residual of its own at every `reset` of
-    all environments, for which the batch is built anew (tens of ms for 1000 simulations); with a single sample,
-    only at the first. Autoresets choose among the maps as before.
+    Its simulations choose from a pool of maps. Each map of the pool gets a residual of its own at every `reset` without
+    a `reset_mask`, for which the batch is built anew (tens of ms for 1000 simulations); with a single sample, only at
+    the first. Autoresets, and resets of those whose episodes ended, choose among the maps as before.
     """
 
     def __init__(self, env: VectorEnv, source: Source) -> None:
@@ -209,12 +209,17 @@ class VectorResidualTerrain(VectorEnvWrapper):
         return self._delta.copy()
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Draw residuals where all environments are reset, then reset."""
+        """Draw residuals where all environments begin anew, then reset."""
         self.vet(seed, options)
-        mask = (options or {}).get("reset_mask")
-        everyone, rng = mask is None or bool(np.all(mask)), self.stream(seed)
-        if self._delta is None or (everyone and not self._constant):
-            self._delta = self.draws.draw(len(self.perceived), rng)
-            truth = [(m.heights + d).astype(np.float32) for m, d in zip(self.perceived, self._delta, strict=True)]
-            self.env.unwrapped.set_terrains(truth, self.perceived)
-        return self.env.reset(seed=seed, options=options)
+        # A mask names those whose episodes ended, also where these happen to be all.
+        mask, first = (options or {}).get("reset_mask"), self._delta is None
+        if first and mask is not None and not np.all(mask):
+            raise InputError("VectorResidualTerrain: the first reset must be of all environments, got a reset_mask")
+        with self.refusable():
+            rng = self.stream(seed)
+            if first or (mask is None and not self._constant):
+                delta = self.draws.draw(len(self.perceived), rng)
+                truth = [(m.heights + d).astype(np.float32) for m, d in zip(self.perceived, delta, strict=True)]
+                self.env.unwrapped.set_terrains(truth, self.perceived)
+                self._delta = delta
+            return self.env.reset(seed=seed, options=options)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from cases import BASE, IDS, ONE_MAP, SINGLE, made, play, robot_of, same, wrapped
 
+from nfc_gym.wrappers import VectorPerturbSignals, VectorRandomizePsi
+
 JACKAL, ANT = "nfc_gym/JackalFlat-v0", "nfc_gym/AntFlat-v0"
 GOALS = [name for name in IDS if robot_of(name) in ("Jackal", "Quadcopter")]
 
@@ -161,6 +163,14 @@ def test_torchrls_specs_of_wrapped_environments(name: str, torchrl: Any, sources
     env = torchrl.envs.GymWrapper(wrapped(name, gym.make(BASE, **ONE_MAP), sources))
     torchrl.envs.check_env_specs(env)
     assert env.rollout(3).shape == (3,)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_torchrls_specs_of_wrapped_vectors(mode: str, torchrl: Any) -> None:
+    envs = VectorRandomizePsi(gym.make_vec(JACKAL, num_envs=2, autoreset_mode=mode, context=["psi"]), 0.5)
+    many = torchrl.envs.GymWrapper(VectorPerturbSignals(envs, {"proprio": {"sd": 0.1}}))
+    torchrl.envs.check_env_specs(many)
+    assert many.rollout(3).shape == (2, 3)
 
 
 def test_torchrls_workers_and_collector(torch: Any, torchrl: Any) -> None:

@@ -164,6 +164,13 @@ def _roll(envs: gym.vector.VectorEnv) -> list:
     return out
 
 
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_the_mode_of_autoreset_is_the_environments(mode: gym.vector.AutoresetMode) -> None:
+    """TorchRL asks for it."""
+    envs = gym.wrappers.vector.ClipReward(_vector(autoreset_mode=mode), -1, 1)  # which does not say it
+    assert VectorPerturbSignals(envs, {}).autoreset_mode is mode
+
+
 def test_psi_is_drawn_for_each_episode_of_each_row() -> None:
     envs = VectorRandomizePsi(_vector(), 0.5)
     envs.reset(seed=1)
@@ -515,3 +522,61 @@ def test_a_reset_that_is_refused_changes_nothing(bad: dict[str, Any]) -> None:
         out += [env.step(np.zeros((N, 2)))[0], env.reset(options={"reset_mask": np.arange(N) > 0})[0]]
         shown.append([*out, env.step(np.zeros((N, 2)))[0]])
     same(shown[1], shown[0])
+
+
+def _grounds(samples: np.ndarray, n: int = N) -> Any:
+    made = gym.make_vec(ROUGH_ID, num_envs=n, context=["psi"], terrain_pool=2, autoreset_mode="Disabled")
+    return VectorResidualTerrain(made, samples)
+
+
+def test_ground_that_is_refused_is_drawn_again() -> None:
+    """Too high a residual: nothing was drawn, and the next reset does not begin without one."""
+    envs = _grounds(np.full((256, 256), 50.0))
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"maps\[0\] reaches"):
+            envs.reset(seed=0)
+        with pytest.raises(InputError, match="at the first reset"):
+            envs.delta_e  # noqa: B018 (raises)
+    some = _grounds(np.stack([np.zeros((256, 256)), np.full((256, 256), 50.0)]))
+    some.reset(seed=next(s for s in range(99) if _level(some, s)))
+    before = some.env.unwrapped.batch
+    stream = some.rng.bit_generator.state
+    with pytest.raises(InputError, match="reaches"):
+        some.reset(seed=next(s for s in range(99) if not _level(some, s)))
+    assert some.env.unwrapped.batch is before
+    assert some.rng.bit_generator.state == stream
+    assert not some.delta_e.any()
+    some.step(np.zeros((N, 2)))
+
+
+def _level(envs: Any, seed: int) -> bool:
+    """Whether a reset with a seed draws level ground for every map."""
+    kept, envs.rng = envs.rng, None
+    level = not envs.draws.draw(2, envs.stream(seed)).any()
+    envs.rng = kept
+    return level
+
+
+@pytest.mark.parametrize("n", [1, N])
+def test_a_mask_of_all_keeps_the_ground(n: int) -> None:
+    envs = _grounds(np.arange(5.0)[:, None, None] * np.ones((256, 256)) / 10, n)
+    envs.reset(seed=0, options={"reset_mask": np.ones(n, bool)})
+    batch, residual = envs.unwrapped.batch, envs.delta_e
+    envs.step(np.zeros((n, 2)))
+    envs.reset(options={"reset_mask": np.ones(n, bool)})
+    assert envs.unwrapped.batch is batch
+    same(envs.delta_e, residual)
+    envs.reset()
+    assert envs.unwrapped.batch is not batch
+
+
+def test_the_first_ground_is_that_of_all() -> None:
+    """The environment itself was reset before it was wrapped, and would take the mask."""
+    bare = gym.make_vec(ROUGH_ID, num_envs=N, context=["psi"], terrain_pool=2, autoreset_mode="Disabled")
+    bare.reset(seed=0)
+    batch = bare.unwrapped.batch
+    envs = VectorResidualTerrain(bare, np.full((256, 256), 0.1))
+    with pytest.raises(InputError, match="first reset must be of all"):
+        envs.reset(options={"reset_mask": np.arange(N) > 0})
+    assert bare.unwrapped.batch is batch
+    bare.step(np.zeros((N, 2)))
