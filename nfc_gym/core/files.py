@@ -3,9 +3,11 @@
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
+from secrets import token_hex
 
 from nfc_gym.core.errors import InputError
 
@@ -21,7 +23,44 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is a {'folder' if path.is_dir() else 'device'}, not a file: choose another")
-    part = path.with_name(f".{path.name}.part")
+    with _becoming(path, _part(path)) as part:
+        yield part
+
+
+@contextmanager
+def numbered(folder: Path, name: Callable[[int], str], first: int) -> Iterator[tuple[int, Path]]:
+    """The next free number of a series of files, and a path to write that one to, as of `replacing`.
+
+    Several processes may add to one series: each number is one's own from the beginning of the writing on, also of one
+    that was killed amid it.
+
+    Args:
+      folder: of the files.
+      name: of the file with a number.
+      first: number to begin the search with.
+    """
+    for number in count(first):
+        path = folder / name(number)
+        part = path.with_name(f".{path.name}.part")
+        try:
+            part.touch(exist_ok=False)
+        except FileExistsError:  # being written by another process
+            continue
+        if not path.exists():
+            break
+        part.unlink()
+    with _becoming(path, part):
+        yield number, part
+
+
+def _part(path: Path) -> Path:
+    """A file beside `path` that nobody else writes to, who may be about to replace it too."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{token_hex(4)}.part")
+
+
+@contextmanager
+def _becoming(path: Path, part: Path) -> Iterator[Path]:
+    """Put a written part in the place of its file, or away."""
     try:
         yield part
         with open(part, "rb") as handle:
@@ -38,7 +77,7 @@ def write_together(folder: Path, texts: Mapping[str, str]) -> None:
     All are written beside the old ones first, so that a full disk changes nothing. The last one marks that the others
     are there: it is gone while they are replaced.
     """
-    parts = {name: folder / f".{name}.part" for name in texts}
+    parts = {name: _part(folder / name) for name in texts}
     try:
         for name, text in texts.items():
             with open(parts[name], "w", encoding="utf-8", newline="\n") as handle:

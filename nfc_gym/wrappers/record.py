@@ -94,6 +94,8 @@ class RecordLog(_Recording, EnvWrapper):
     velocities of joints and free bodies, sensors (with the sensor effects of `ApplyEffects`). A file is there once its
     episode is over (its end, the next reset, or `close`), and whole; episodes of less than two steps leave none.
 
+    Environments of several processes, as of an `AsyncVectorEnv`, may record into one folder.
+
     A folder holds one `model.xml`, and the ground is part of it. An environment on rough ground draws a map of its pool
     at each reset, so that the second episode would need another model: make it with `terrain_pool=1`, or reset it with
     the same `options={"terrain_id": ...}` each time. Where a `Hallucinate` chooses the ground (delta_e), it is that of

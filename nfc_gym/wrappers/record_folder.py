@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError, MissingExtra
-from nfc_gym.core.files import replacing, require_writable, write_whole
+from nfc_gym.core.files import numbered, require_writable, write_whole
 from nfc_gym.physics.names import names
 from nfc_gym.wrappers.record_channels import columns, model_text, values
 
 Array = NDArray[np.float64]
 _NEEDED = ("pyarrow", "yaml")
+_MODEL = "model.xml"
 # Declared of what a simulation measures, which has no noise: fine enough that jumps are taken as they were recorded,
 # and coarse enough that a fit finds its way from where an effect is missing. Of joints, and of free bodies.
 _JOINT = {"rad": 1e-3, "m": 1e-4, "rad/s": 0.1, "m/s": 0.01}
@@ -29,7 +30,8 @@ class LogFolder:
     Args:
       env: whose MJCF and psi are written.
       sim: its simulation.
-      path: the folder; made here. Episodes are numbered after those that it already holds.
+      path: the folder; made here. Episodes are numbered after those that it already holds; several processes may write
+        to it.
       model_file: the environment's MJCF, where it does not say itself.
 
     Raises:
@@ -49,7 +51,7 @@ class LogFolder:
             raise InputError(f"RecordLog: {self.folder} is a file; `path` is the folder that episodes are written to")
         require_writable(self.folder, "`path` of RecordLog")
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.count = len(list(self.folder.glob("episode_*.parquet")))
+        self.count = self._there()
         self.text = ""
         self._heights: Array | None = None
 
@@ -59,15 +61,22 @@ class LogFolder:
         if self.text and _equal(heights, self._heights):  # writing a heightfield as text takes a tenth of a second
             return
         text = model_text(self.env, self.sim.nominal, self.model_file)
-        file = self.folder / "model.xml"
-        if self.count and file.is_file() and file.read_text(encoding="utf-8") != text:
+        if self.count:
+            self._require_model(text)
+        if text != self.text:
+            write_whole(self.folder / _MODEL, text)
+        self.text, self._heights = text, heights
+
+    def _require_model(self, text: str) -> None:
+        file = self.folder / _MODEL
+        if file.is_file() and file.read_text(encoding="utf-8") != text:
             raise InputError(
                 f"RecordLog: {self.folder} holds logs of another model, or of the same on other ground: record into "
                 'another folder, or hold the ground by reset(options={"terrain_id": ...})'
             )
-        if text != self.text:
-            write_whole(file, text)
-        self.text, self._heights = text, heights
+
+    def _there(self) -> int:
+        return len(list(self.folder.glob("episode_*.parquet")))
 
     def write(self, record: dict[str, Array]) -> None:
         """One episode: `time` (T,), and qpos, qvel, ctrl, sensordata (T, ...); then the mapping."""
@@ -82,11 +91,10 @@ class LogFolder:
                 series = sense(column.name, series, self.sim.duration())
             wide = pa.FixedSizeListArray.from_arrays(np.ascontiguousarray(series).reshape(-1), column.size)
             table[column.name] = series[:, 0] if column.size == 1 else wide
-        while (file := self.folder / f"episode_{self.count:04d}.parquet").exists():  # of another recorder
-            self.count += 1
-        with replacing(file) as part:
+        self._require_model(self.text)  # another process may have begun with its own at the same time
+        with numbered(self.folder, "episode_{:04d}.parquet".format, self.count) as (number, part):
             pq.write_table(pa.table(table), part)
-        self.count += 1
+        self.count = number + 1
         self._map()
 
     def _map(self) -> None:
@@ -97,11 +105,11 @@ class LogFolder:
         rows = [] if space is None else [_parameter(p, n) for p, n in zip(space.parameters, space.nominal, strict=True)]
         mapping = {
             "version": 1,
-            "model": "model.xml",
+            "model": _MODEL,
             "parameters": rows,
             "logs": [{"path": "episode_*.parquet"}],
             # Fewer than three episodes cannot be dealt out whole to fitting, choosing and verifying.
-            "split": {"by": "log" if self.count >= 3 else "time"},
+            "split": {"by": "log" if self._there() >= 3 else "time"},
             "time": {"column": "time", "unit": "s"},
             "controls": {n: {"column": n, "unit": "1"} for n in self.controls},
             "channels": {c.name: _channel(c) for c in self.columns},

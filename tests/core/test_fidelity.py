@@ -87,3 +87,12 @@ def test_files_are_whole_or_as_before(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
     write_whole(path, "second")
     assert path.read_text() == "second"
+
+
+def test_two_may_replace_a_file_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with replacing(path) as outer:
+        outer.write_text("outer")
+        write_whole(path, "inner")
+    assert path.read_text() == "outer"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]

@@ -8,7 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from fakes import FakeEnv, NoModel, roll, same
+from fakes import CUBE, FakeEnv, NoModel, roll, same
 from machines import make
 
 import nfc_gym  # noqa: F401 (registers the ids)
@@ -231,6 +231,52 @@ def test_files_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monkey
     env.step(np.zeros(1))
     env.close()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["episode_0000.parquet", "mapping.yaml", "model.xml"]
+
+
+def test_recorders_that_write_at_once_take_no_number_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pyarrow.parquet as pq
+
+    envs = [RecordLog(FakeEnv(), tmp_path) for _ in range(3)]
+    for k, env in enumerate(envs):
+        env.reset(seed=0)
+        for _ in range(k + 2):
+            env.step(np.zeros(1))
+    write, waiting = pq.write_table, envs[1:]
+
+    def amid(table: object, path: object) -> None:
+        if waiting:  # another one begins while this one has begun
+            waiting.pop().flush()
+        write(table, path)
+
+    monkeypatch.setattr(pq, "write_table", amid)
+    envs[0].flush()
+    files = sorted(p.name for p in tmp_path.iterdir())
+    assert files == [*(f"episode_000{k}.parquet" for k in range(3)), "mapping.yaml", "model.xml"]
+    assert {len(read_table(tmp_path / name)["time"]) for name in files[:3]} == {2, 3, 4}
+    assert "by: log" in (tmp_path / "mapping.yaml").read_text()
+
+
+def test_processes_record_into_one_folder(tmp_path: Path) -> None:
+    made = lambda: gym.wrappers.TimeLimit(RecordLog(FakeEnv(), tmp_path), 3)  # noqa: E731
+    envs = gym.vector.AsyncVectorEnv([made] * 3, context="fork")
+    envs.reset(seed=0)
+    for _ in range(15):
+        envs.step(np.zeros((3, 1)))
+    envs.close()
+    files = [f"episode_{k:04d}.parquet" for k in range(12)]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [*files, "mapping.yaml", "model.xml"]
+
+
+def test_recorders_that_begin_at_once_have_one_model(tmp_path: Path) -> None:
+    other = FakeEnv(CUBE.replace('mass="1"', 'mass="2"'))
+    one, two = (RecordLog(env, tmp_path) for env in (FakeEnv(), other))
+    one.reset(seed=0)
+    two.reset(seed=0)  # the folder holds no episode yet
+    for _ in range(2):
+        one.step(np.zeros(1))
+    with pytest.raises(InputError, match="holds logs of another model"):
+        one.flush()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model.xml"]
 
 
 def test_episodes_are_numbered_on_and_short_ones_leave_nothing(tmp_path: Path) -> None:
