@@ -28,10 +28,12 @@ from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.digests import of_detector, of_network
 from nfc_gym.adaptation.normal import Normal, quiet_trajectories
 from nfc_gym.adaptation.relearning import relearned
+from nfc_gym.adaptation.settings import require_number
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
 from nfc_gym.adaptation.weights import digest, flat
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_whole
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference import detector_file
 from nfc_gym.inference.contrast import Contrast
 from nfc_gym.inference.data import WindowSet
@@ -46,6 +48,7 @@ from nfc_gym.simulate.machine import MOTOR, full_id
 Array = NDArray[np.float64]
 REPORT, STATE = "learned.json", "state.safetensors"
 RATE = 0.05  # false-positive rate of windows, where a detector does not say which it was set for
+_OF = {"posterior": ("simulations", "effects", "motor"), "detector": ("rate",)}  # settings of one part alone
 _TOLD = 256  # windows by which a set is told from another of its size
 _TRAINING = TrainConfig(epochs=20, batch=128, rate=1e-4, warmup=20, average=0.99, patience=5)
 
@@ -71,8 +74,12 @@ class LearnConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.simulations < 100:
-            raise InputError(f"learning: simulations must be 100 or more, got {self.simulations}")
+        for name, least in (("simulations", 100), ("seed", 0)):
+            require_whole(f"learning: {name}", getattr(self, name), least)
+        require_number("learning: effects", self.effects, 0, 1, "a share")
+        require_number("learning: motor", self.motor, 0, what="a share of the actions' range")
+        if self.rate is not None and not 0 < require_number("learning: rate", self.rate, 0, 1, "a share") < 1:
+            raise InputError(f"learning: rate must lie between 0 and 1, got {self.rate:g}")
 
 
 @dataclass
@@ -130,7 +137,8 @@ def learn_from_mission(
     told = quiet if console is None else Spoken(console)
     out, report = Learned(old, watch, {}), {"of": of}
     if watch is not None:
-        rate = config.rate or (watch.calibration.rate if watch.calibration else RATE)
+        calibrated = watch.calibration.rate if watch.calibration else RATE
+        rate = calibrated if config.rate is None else config.rate
         out.detector, report["detector"] = normality.tuned(
             watch, trajectories, normal, rate, training=config.training, beside=beside,
             folder=_part(folder, "detector", of), report=told, seed=config.seed, device=device_of(device),
@@ -196,7 +204,9 @@ def _described(
     if beside is not None:
         first = next(iter(beside.batches(min(len(beside), _TOLD), None)), {})
         told["beside"] = digest(len(beside), *flat(first))
-    return json.loads(json.dumps({**asdict(config), **told}))
+    # What is said of a part that is left out changes nothing.
+    unused = [name for part, names in _OF.items() if told[part] == "none" for name in names]
+    return json.loads(json.dumps({k: v for k, v in asdict(config).items() if k not in unused} | told))
 
 
 def _part(folder: Path | None, name: str, of: dict[str, Any]) -> Path | None:

@@ -40,12 +40,12 @@ def learn(
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For what was learned. Default: RUN/learned.")] = None,
     normal: Annotated[
-        Normal,
+        Normal | None,
         typer.Option(
-            help="The detector learns from trajectories without any alarm; or from windows without one, for "
-            "anomalies that come and go."
+            help="The detector learns from trajectories without any alarm, which is the default; or from windows "
+            "without one, for anomalies that come and go."
         ),
-    ] = Normal.trajectories,
+    ] = None,
     rate: Annotated[
         float | None,
         typer.Option(help="Wanted share of false alarms. Default: what the detector was set for, or 0.05."),
@@ -55,11 +55,17 @@ def learn(
         typer.Option(metavar="DIR", help="Windows of `nfc-gym simulate` to mix in, so that nothing is forgotten."),
     ] = None,
     simulations: Annotated[
-        int, typer.Option(metavar="N", min=100, help="Windows simulated for the posterior along the mission's motion.")
-    ] = 4096,
+        int | None,
+        typer.Option(
+            metavar="N", min=100, help="Windows simulated for the posterior along the mission's motion. Default: 4096."
+        ),
+    ] = None,
     effects: Annotated[
-        float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of them with an effect that the model lacks.")
-    ] = 0.5,
+        float | None,
+        typer.Option(
+            metavar="SHARE", min=0, max=1, help="Share of them with an effect that the model lacks. Default: 0.5."
+        ),
+    ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the windows, at most.")] = 20,
     environment: Annotated[
         str | None, typer.Option(metavar="ID", help="Of the simulator. Default: the one that RUN names.")
@@ -83,6 +89,8 @@ def learn(
     with outcome(ctx, resumes=True):
         if posterior is None and detector is None:
             raise InputError("there is nothing to train: give --posterior FILE, --detector FILE or both")
+        _require_used("posterior", posterior is not None, simulations=simulations, effects=effects)
+        _require_used("detector", detector is not None, rate=rate, normal=normal)
         folder = mission / "learned" if out is None else out
         kinds.require_kind(folder, kinds.LEARNED)
         kinds.require_kind(folder / "posterior.safetensors", kinds.POSTERIOR)
@@ -94,7 +102,8 @@ def learn(
         from nfc_gym.inference.data import StoredWindows
         from nfc_gym.inference.windows import Windows
 
-        config = LearnConfig(rate=rate, simulations=simulations, effects=effects, seed=seed)
+        given = {"rate": rate, "simulations": simulations, "effects": effects}
+        config = LearnConfig(seed=seed, **{k: v for k, v in given.items() if v is not None})
         learned = learn_from_mission(
             mission, posterior=posterior, detector=detector, environment=environment,
             normal=quiet_windows if normal is Normal.windows else quiet_trajectories,
@@ -103,6 +112,13 @@ def learn(
             folder=folder, jobs=jobs, device=device, console=Console(stderr=True),
         )  # fmt: skip
         _print_learned(learned.report, folder)
+
+
+def _require_used(part: str, there: bool, **options: object) -> None:
+    """Refuse options of a part that is left out: they would do nothing."""
+    for name, value in options.items():
+        if value is not None and not there:
+            raise InputError(f"--{name} {value} is for the {part}: give --{part} FILE too, or leave it out")
 
 
 def _print_learned(report: Mapping[str, Any], folder: Path) -> None:

@@ -328,6 +328,41 @@ def test_a_mission_too_short_for_the_posterior_is_said(mission: list[Trajectory]
     assert "too little motion: 8 windows of 20 control steps" in learned.report["posterior"]["why"]
 
 
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"simulations": 1}, "simulations is 1, want a whole number, 100 or more"),
+        ({"simulations": 200.5}, "simulations is 200.5, want a whole number"),
+        ({"seed": -1}, "seed is -1, want a whole number, 0 or more"),
+        ({"rate": 0.0}, "rate must lie between 0 and 1, got 0"),
+        ({"rate": 1}, "rate must lie between 0 and 1, got 1"),
+        ({"rate": "a"}, "rate is 'a'; want a share, from 0 to 1"),
+        ({"effects": 1.5}, "effects is 1.5; want a share, from 0 to 1"),
+        ({"effects": float("nan")}, "effects is nan; want a share, from 0 to 1"),
+        ({"motor": -0.1}, "motor is -0.1; want a share of the actions' range, 0 or more"),
+    ],
+)
+def test_settings_that_cannot_be_are_named(wrong: dict[str, Any], told: str) -> None:
+    with pytest.raises(InputError, match=f"learning: {told}"):
+        LearnConfig(**wrong)
+
+
+def test_settings_of_a_part_that_is_left_out_are_not_compared(tmp_path: Path) -> None:
+    mission = [cart(200, k, 4.0) for k in range(3)]
+
+    def learned(**settings: Any) -> Any:
+        return learn_from_mission(
+            mission, detector=watch, environment=JACKAL, config=LearnConfig(**settings), folder=tmp_path
+        ).report
+
+    watch = WindowDetector(Replay(JACKAL, draws=2))
+    first = learned()
+    assert {"simulations", "effects", "motor"}.isdisjoint(first["of"])
+    assert learned(simulations=200, effects=0.1, motor=0.0) == json.loads(json.dumps(first))
+    with pytest.raises(InputError, match=r"other settings \(rate\)"):
+        learned(rate=0.1)
+
+
 def test_bad_input_is_named(mission: list[Trajectory], posterior: NeuralPosterior, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no mission; want a folder"):
         learn_from_mission(tmp_path, posterior=posterior)
@@ -339,8 +374,6 @@ def test_bad_input_is_named(mission: list[Trajectory], posterior: NeuralPosterio
         learn_from_mission(Dataset(), posterior=posterior, environment=JACKAL)
     with pytest.raises(InputError, match="the posterior is of 'quadcopter'"):
         learn_from_mission(mission, posterior=posterior, environment="AntFlat")
-    with pytest.raises(InputError, match="simulations must be 100 or more"):
-        LearnConfig(simulations=1)
     (tmp_path / "learned.json").write_text("{")
     with pytest.raises(InputError, match="no report of what was learned"):
         learn(mission, posterior, tmp_path)

@@ -88,7 +88,8 @@ def test_options_reach_what_learns(mission: Path, tmp_path: Path, monkeypatch: p
         return Learned(None, None, report)
 
     monkeypatch.setattr(afterwards, "learn_from_mission", learn_from_mission)
-    words = ["--posterior", "p.safetensors", "--normal", "windows", "--simulations", "200", "--effects", "0.25"]
+    words = ["--posterior", "p.safetensors", "--detector", "d.safetensors", "--normal", "windows"]
+    words += ["--simulations", "200", "--effects", "0.25"]
     done = call(mission, tmp_path, *words, "--rate", "0.01", "--seed", "4", "--jobs", "2", "--environment", "AntFlat")
     assert done.exit_code == 0, done.output
     assert "posterior gain over the prior, nats a parameter 0.125 (standard error 0.02)" in plain(done.stdout)
@@ -98,8 +99,8 @@ def test_options_reach_what_learns(mission: Path, tmp_path: Path, monkeypatch: p
     assert (config.rate, config.simulations, config.effects, config.seed) == (0.01, 200, 0.25, 4)
     assert config.training.epochs == 3
     assert options == {
-        "mission": mission, "posterior": Path("p.safetensors"), "detector": None, "environment": "AntFlat",
-        "normal": quiet_windows, "beside": None, "folder": tmp_path, "jobs": 2, "device": "cpu",
+        "mission": mission, "posterior": Path("p.safetensors"), "detector": Path("d.safetensors"),
+        "environment": "AntFlat", "normal": quiet_windows, "beside": None, "folder": tmp_path, "jobs": 2, "device": "cpu",
     }  # fmt: skip
 
 
@@ -114,7 +115,12 @@ def test_what_cannot_be_learned_is_said(mission: Path, tmp_path: Path) -> None:
         (tmp_path, given, "no mission; want a folder that `adapt(..., folder=...)` wrote"),
         (mission, ("--posterior", str(mission / "given.safetensors")), "format 'nfc_gym-detector-1'"),
         (mission, (*given, "--beside", str(tmp_path)), "manifest.json"),
-        (mission, (*given, "--rate", "2"), "must lie between 0 and 1, got 2"),
+        (mission, (*given, "--rate", "2"), "rate is 2.0; want a share, from 0 to 1"),
+        (mission, (*given, "--rate", "0"), "rate must lie between 0 and 1, got 0"),
+        (mission, (*given, "--simulations", "200"), "--simulations 200 is for the posterior: give --posterior FILE"),
+        (mission, (*given, "--effects", "0.5"), "--effects 0.5 is for the posterior"),
+        (mission, ("--posterior", "p", "--rate", "0.01"), "--rate 0.01 is for the detector: give --detector FILE too"),
+        (mission, ("--posterior", "p", "--normal", "windows"), "--normal windows is for the detector"),
     ):
         refused = call(folder, tmp_path / "other", *more)
         assert refused.exit_code == 2, refused.output
