@@ -52,8 +52,9 @@ def examine(dataset_path: Path | str) -> tuple[Dataset | None, list[Finding]]:
     findings: list[Finding] = []
     model: mujoco.MjModel | None = None
     try:
-        model = compile_model(read_spec(mapping.model_file, path.parent), mapping.model_file)
-        findings += model_findings(mapping, model)
+        spec = read_spec(mapping.model_file, path.parent)
+        model = compile_model(spec, mapping.model_file)
+        findings += model_findings(mapping, spec, model)
     except InputError as e:
         findings.append(_finding("model", str(e).removeprefix("model ")))
     dataset, found = _logs(mapping, path, model)

@@ -12,22 +12,25 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured import asset_files
 from nfc_gym.measured.fit import Fit
-from nfc_gym.measured.frozen import freeze
+from nfc_gym.measured.frozen import freeze, freeze_inertia
 from nfc_gym.measured.moments import mend
 from nfc_gym.physics.effects.air import hull, hull_mark
 from nfc_gym.physics.effects.base import Effect, overrides
-from nfc_gym.physics.effects.inertial import Moved
+from nfc_gym.physics.effects.inertial import Moved, complete_inertia
 from nfc_gym.physics.effects.places import body_ids
 from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.effects.timing import command_limits
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.physics.parameters import ParameterSpace
+from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 _HOOKS_BEYOND = ("spec", "friction", "follow", "modulate", "force", "sense", "unsense")
 READ_COMMANDS = ("backlash", "law_command")  # families whose laws of force read `Context.ctrl`
 _SOFTNESS = ("dof_solref", "dof_solimp")
+_SHAPES = {"geom_size", "geom_pos", "geom_quat"}
+_OFF = 0.1  # of the way to a parameter's highest value, for a look at whether MJCF says it
+_KEPT, _ROUNDED, _HAIR = 0.01, 1e-5, 1e-9  # of a change, of a value, of what is none: it may come back so much changed
 
 
 def pack(fitted: Fit) -> dict[str, Any]:
@@ -103,9 +106,7 @@ def corrected(
     moved = {b for e in effects if isinstance(e, Moved) for b in body_ids(model, e.where).tolist()}
     moved |= set(np.flatnonzero((model.body_ipos != centres).any(1)).tolist())  # by psi
     marks |= {hull_mark(model.body(b).name): hulls[b] for b in moved}
-    spec.copy_back(model)
-    for body in spec.bodies:  # which MuJoCo does not copy
-        body.gravcomp = model.body_gravcomp[body.id]
+    _say(spec, model, fields)
     carried = [e for e, _ in by_fields]
     carried += [e for e, t in pairs if e not in carried and not e.on_command and e.spec(spec, t)]
     outside = [e for e in effects if e not in carried and not e.on_command]
@@ -123,6 +124,63 @@ def corrected(
         spec.comment = "\n".join(filter(None, [spec.comment, *told]))
     text = spec.to_xml() if folder is None else asset_files.relative(spec.to_xml(), folder)
     return text, [own for own, e in zip(plant.effects, effects, strict=True) if e not in carried]
+
+
+def unsaid(spec: mujoco.MjSpec, parameters: Sequence[Parameter]) -> list[str]:
+    """Names of parameters whose values MJCF cannot say: MuJoCo derives them from others, or makes others of them.
+
+    Args:
+      spec: the model as it was given, which compiles.
+      parameters: each is written a little off its nominal value, and looked for in what is loaded again.
+    """
+    spec = spec.copy()
+    complete_inertia(spec)
+    model = freeze(spec)
+    asset_files.absolute(spec, model)
+    if not _lost(spec, model, parameters):
+        return []
+    return [p.name for p in parameters if _lost(spec, model, [p])]
+
+
+def _lost(spec: mujoco.MjSpec, model: mujoco.MjModel, parameters: Sequence[Parameter]) -> bool:
+    """Whether a model with these parameters off their nominal values is another one after it was written and read."""
+    spec, moved = spec.copy(), copy.copy(model)
+    space, fields = ParameterSpace(model, parameters), ModelFields(moved, model)
+    space.write(fields, space.nominal + np.where(space.high > space.nominal, _OFF * (space.high - space.nominal), 0.0))
+    wanted = {name: np.array(values, float) for name, values in fields.touched.items()}
+    fields.commit()
+    try:
+        _say(spec, moved, fields)
+        made = mujoco.MjModel.from_xml_string(spec.to_xml())
+    except ValueError:
+        return True
+    for name, values in wanted.items():
+        found = np.asarray(getattr(made.opt if name.startswith("opt.") else made, name.removeprefix("opt.")))
+        if found.shape != values.shape:
+            return True
+        change = np.abs(values - fields.nominal(name))
+        if (np.abs(found - values) > _KEPT * change + _ROUNDED * np.abs(values) + _HAIR).any():
+            return True
+    return False
+
+
+def _say(spec: mujoco.MjSpec, model: mujoco.MjModel, fields: ModelFields) -> None:
+    """Write into a spec what was written into the model that it compiled to."""
+    if _SHAPES & fields.touched.keys():  # of which the compiler would make other inertias
+        freeze_inertia(spec, model)
+    spec.copy_back(model)
+    # What MuJoCo does not copy:
+    for body in spec.bodies:
+        body.gravcomp = model.body_gravcomp[body.id]
+    if "actuator_delay" in fields.touched:
+        for actuator in spec.actuators:
+            actuator.delay = model.actuator_delay[actuator.id]
+    if "jnt_actfrcrange" in fields.touched:
+        for joint in spec.joints:
+            joint.actfrcrange = model.jnt_actfrcrange[joint.id]
+    if "tendon_lengthspring" in fields.touched:
+        for tendon in spec.tendons:
+            tendon.springlength = model.tendon_lengthspring[tendon.id]
 
 
 def _edits_fields_alone(effect: Effect) -> bool:

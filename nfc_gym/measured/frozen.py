@@ -11,7 +11,8 @@ def freeze(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Write into a spec what compilation makes of it, wherever a later compilation could make something else of it.
 
     These are the damping that a servo's `dampratio` or a joint's `springdamper` asks for, which depends on inertia; the
-    ranges that a servo takes over from its joint; and inertias where an option of the compiler changes them.
+    ranges that a servo takes over from its joint; the rest lengths of tendons, which are those of the reference pose;
+    and inertias where an option of the compiler changes them.
 
     Returns:
       The compiled model, which is the same before and after.
@@ -28,8 +29,10 @@ def freeze(spec: mujoco.MjSpec) -> mujoco.MjModel:
             joint.stiffness = [model.jnt_stiffness[joint.id], *np.asarray(joint.stiffness)[1:]]
             joint.damping = [model.dof_damping[at], *np.asarray(joint.damping)[1:]]
             joint.springdamper = 0.0, 0.0
+    for tendon in spec.tendons:
+        tendon.springlength = model.tendon_lengthspring[tendon.id]
     if _recomputes_inertia(spec.compiler):
-        _freeze_inertia(spec, model)
+        freeze_inertia(spec, model)
     return spec.compile()
 
 
@@ -50,7 +53,8 @@ def _recomputes_inertia(compiler: mujoco.MjsCompiler) -> bool:
     return bounded or bool(compiler.balanceinertia) or compiler.inertiafromgeom == _INFERRED
 
 
-def _freeze_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+def freeze_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Write a compiled model's masses and inertias into its spec, so that they no longer follow from its geoms."""
     for body in spec.bodies[1:]:  # without the world
         i = int(body.id)
         body.explicitinertial = bool(model.body_mass[i] > 0)

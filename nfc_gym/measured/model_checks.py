@@ -10,6 +10,7 @@ from nfc_gym.core import InputError
 from nfc_gym.core.units import si_unit
 from nfc_gym.measured.buffers import too_short
 from nfc_gym.measured.channels import ChannelName, parse_channel
+from nfc_gym.measured.export import unsaid
 from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.observe import observer
@@ -19,15 +20,15 @@ from nfc_gym.measured.yaml_marks import suggest
 from nfc_gym.physics.activations import integrators, on_servos
 from nfc_gym.physics.effects.drive import command_unit
 from nfc_gym.physics.fields import ModelFields, names_of
-from nfc_gym.physics.parameters import COMPOUND, ParameterSpace, resolve, split_field
+from nfc_gym.physics.parameters import COMPOUND, Parameter, ParameterSpace, resolve, split_field
 
 _OBJ = mujoco.mjtObj
 _GOALS = ("rad", "m", "rad/s", "m/s")  # units that servos are commanded in, and nothing else
 MOST_STEPS = 100_000  # of a segment with its history; usual are a hundred
 
 
-def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
-    """Everything in the mapping that the model does not have, or has otherwise."""
+def model_findings(mapping: Mapping, spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[Finding]:
+    """Everything in the mapping that the model does not have, or has otherwise; `model` is what `spec` compiled to."""
     names = {
         "joint": names_of(model, _OBJ.mjOBJ_JOINT, model.njnt),
         "body": names_of(model, _OBJ.mjOBJ_BODY, model.nbody),
@@ -54,7 +55,7 @@ def model_findings(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]
             if channel.axes and max(channel.axis_indices or ()) >= size:
                 yield Finding("error", where, f"axes {list(channel.axes)} where the sensor has {size} components")
     yield from unmeasured(mapping, model)
-    yield from _fields(mapping, model)
+    yield from _fields(mapping, spec, model)
     yield from _steps(mapping, model)
     for short in too_short(model, float(model.opt.timestep)):
         yield Finding(
@@ -129,14 +130,28 @@ def _joint_unit(where: str, parsed: ChannelName, unit: str, model: mujoco.MjMode
         yield Finding("error", where, f"joint {parsed.object!r} {kind}, but the unit is {unit!r}", f"want {wanted}")
 
 
-def _fields(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
+def _fields(mapping: Mapping, spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[Finding]:
+    right: dict[str, str] = {}
+    every: list[Parameter] = []
     for i, entry in enumerate(mapping.parameters):
         where = f"parameters.{i} ({entry.name})"
         try:
             for parameter in entry.expand():
                 ParameterSpace(model, [parameter])
+                right[parameter.name] = where
+                every.append(parameter)
         except (InputError, IndexError) as e:
             yield Finding("error", where, str(e), _field_advice(entry.field, model))
+    try:
+        ParameterSpace(model, every)
+        lost = unsaid(spec, every)
+    except InputError as e:
+        lost = []
+        yield Finding("error", "parameters", str(e))
+    for name in lost:
+        field = next(p.field for p in every if p.name == name)
+        message = f"{field} is nothing that model.xml can say: MuJoCo derives it from other fields, or changes it"
+        yield Finding("error", right[name], message, "name what it is made of")
     for entry in mapping.known:
         try:
             resolve(model, entry.field, entry.of)

@@ -96,6 +96,12 @@ COMPOUND = {
     "servo_kp": ("actuator_gainprm", _write_servo_kp),
     "geom_restitution": ("geom_solref", _write_restitution),
 }
+# What they set alone: of a body's inertia, which follows its mass, one moment may be a parameter of its own.
+_CELLS: dict[str, tuple[tuple[str, int | None], ...]] = {
+    "servo_kv": (("actuator_gainprm", 0), ("actuator_biasprm", 2)),
+    "servo_kp": (("actuator_gainprm", 0), ("actuator_biasprm", 1)),
+    "geom_restitution": (("geom_solref", 0), ("geom_solref", 1)),
+}
 _READ = {"servo_kv": ("actuator_gainprm", 0), "servo_kp": ("actuator_gainprm", 0)}
 _WIDE = 100  # characters of a `repr` on one line
 _ANY, _AT_LEAST_0 = (-np.inf, np.inf), (0.0, np.inf)
@@ -144,6 +150,8 @@ def resolve(model: mujoco.MjModel, field: str, of: Sequence[str]) -> _Bound:
     array = getattr(owner, key, None)
     if not isinstance(array, np.ndarray):
         raise InputError(f"field {field!r} is not an array field of MjModel (or one of {', '.join(COMPOUND)})")
+    if array.dtype.kind == "i":
+        raise InputError(f"field {field!r} holds whole numbers, by which the model is built: they cannot be written")
     if name.startswith("opt."):
         if component is None or component >= len(array):
             raise InputError(f"field {field!r}: name one of its {len(array)} components, for instance {name}[0]")
@@ -195,6 +203,20 @@ def _require_possible(p: Parameter, bound: _Bound, value: Array) -> None:
         raise InputError(f"parameter {p.name!r} is {float(wrong[0]):g}{unit}, want {want}")
 
 
+def _require_apart(parameters: Sequence[Parameter], bounds: Sequence[_Bound]) -> None:
+    """Refuse two parameters that write the same number."""
+    first: dict[tuple[str, int, int | None], str] = {}
+    for p, bound in zip(parameters, bounds, strict=True):
+        rows = [0] if bound.rows is None else bound.rows.tolist()
+        cells = _CELLS.get(bound.name, ((bound.name, bound.component),))
+        for cell in ((name, row, component) for name, component in cells for row in rows):
+            other = first.setdefault(cell, p.name)
+            if other != p.name:
+                raise InputError(
+                    f"parameters {other!r} and {p.name!r} write the same number, of {p.field}: leave one out"
+                )
+
+
 class ParameterSpace:
     """An ordered box of parameters bound to one model.
 
@@ -214,11 +236,14 @@ class ParameterSpace:
     def __init__(self, model: mujoco.MjModel, parameters: Sequence[Parameter]) -> None:
         self.parameters = tuple(parameters)
         self._bound = [resolve(model, p.field, p.of) for p in parameters]
+        # Compound fields first: a mass scales all of an inertia, of which one moment may be a parameter of its own.
+        self._order = sorted(range(len(self._bound)), key=lambda i: self._bound[i].name not in COMPOUND)
         self.names = tuple(p.name for p in parameters)
         self.units = tuple(p.unit for p in parameters)
         twice = {n for n in self.names if self.names.count(n) > 1}
         if twice:
             raise InputError(f"parameters named twice: {', '.join(sorted(twice))}")
+        _require_apart(parameters, self._bound)
         possible = [_SOLID if b.name == "body_mass" else _POSSIBLE.get(b.name, _ANY) for b in self._bound]
         self.least, self.most = np.reshape(np.array(possible, float), (-1, 2)).T
         self.low = np.array([p.low for p in parameters], float)
@@ -271,8 +296,8 @@ class ParameterSpace:
         psi = np.asarray(psi, float)
         if psi.shape[-1:] != (len(self),):
             raise InputError(f"psi must end in {len(self)} values ({', '.join(self.names)}), got shape {psi.shape}")
-        for i, (p, bound) in enumerate(zip(self.parameters, self._bound, strict=True)):
-            value = psi[..., i]
+        for i in self._order:
+            p, bound, value = self.parameters[i], self._bound[i], psi[..., i]
             if not np.isfinite(value).all():
                 raise InputError(f"parameter {p.name!r} is not finite")
             if bound.name == "body_mass":

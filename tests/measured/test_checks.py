@@ -154,6 +154,22 @@ def test_a_mapping_that_does_not_fit_model_or_logs(build: Build, edit: tuple[str
 
 
 @pytest.mark.parametrize(
+    ("field", "of", "words"),
+    [
+        ("dof_invweight0", "hinge", ["model.xml can say", "derives it from other fields"]),
+        ("jnt_axis[0]", "hinge", ["jnt_axis[0] is nothing that model.xml can say"]),
+        ("jnt_qposadr", "hinge", ["whole numbers"]),
+        ("body_mass", "bob", ["'mass' and 'other' write the same number, of body_mass"]),
+    ],
+)
+def test_a_parameter_that_no_corrected_model_could_have(build: Build, field: str, of: str, words: list[str]) -> None:
+    other = f"\n  - {{name: other, field: '{field}', of: [{of}], unit: '1', low: 0.001, high: 2, nominal: 0.1}}\nlogs:"
+    found = "\n".join(errors(build(None, ("\nlogs:", other))))
+    for word in words:
+        assert word in found
+
+
+@pytest.mark.parametrize(
     ("actuator", "unit", "wanted"),
     [
         ('position name="servo" joint="hinge" kp="1"', "N m", "want rad"),

@@ -127,7 +127,21 @@ BOUNDED = '<motor name="m" joint="j" gear="2" forcerange="-0.8 0.8"/>'
 STRENGTH = Parameter("strength", "actuator_gainprm[0]", ("m",), "1", 0.1, 5.0)
 CENTRE = Parameter("centre", "body_ipos[0]", ("a",), "m", -1.0, 1.0)
 DRAG = ("drag_linear", "a", {"x": 2.0, "y": 2.0, "z": 2.0})
+DENSE = arm().replace('mass=".5"', 'density="600"')
+THICK = Parameter("size", "geom_size[0]", ("rod",), "m", 0.01, 0.3), 0.05
+HELD = '<motor name="m" joint="j" delay="0.02" nsample="40" interp="linear"/>'
+LATER = (Parameter("delay", "actuator_delay", ("m",), "s", 0.0, 0.07), 0.06)
+WEAK = (Parameter("limit", "jnt_actfrcrange[1]", ("j",), "N m", 0.01, 3.0), 0.2)
+TENDON = """<tendon><spatial name="t" stiffness="10"><site site="on"/><site site="off"/></spatial></tendon>"""
+ON, OFF = '<site name="on" pos="0 0 2"/>', '<site name="off" pos=".3 0 0"/>'
+HUNG = arm(joint='springref="40"').replace("<worldbody>", f"<worldbody>{ON}")
+HUNG = HUNG.replace('<geom name="rod"', f'{OFF}<geom name="rod"').replace("<actuator>", f"{TENDON}<actuator>")
 CASES: dict[str, tuple[Any, ...]] = {
+    # what MuJoCo would compute anew from what is corrected, and what it does not copy back
+    "friction, geom's size": (DENSE, [], (level(0.2), THICK)),
+    "native delay": (arm(HELD), [], (LATER,)),
+    "joint's limit": (arm(joint='actuatorfrcrange="-2 2" actuatorfrclimited="true"'), [], (WEAK,)),
+    "spring, tendon": (HUNG, [SPRING]),
     # a servo's damping, given as a ratio, is that of the nominal model
     "dampratio, gain": (arm(SERVO, joint=WIDE), [gain(0.5)]),
     "dampratio, turned round": (arm(SERVO, joint=WIDE), [gain(-0.5)]),
