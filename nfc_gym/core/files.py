@@ -39,18 +39,23 @@ def numbered(folder: Path, name: Callable[[int], str], first: int) -> Iterator[t
       name: of the file with a number.
       first: number to begin the search with.
     """
-    for number in count(first):
-        path = folder / name(number)
-        part = path.with_name(f".{path.name}.part")
-        try:
-            part.touch(exist_ok=False)
-        except FileExistsError:  # being written by another process
-            continue
-        if not path.exists():
-            break
-        part.unlink()
+    paths = ((k, folder / name(k)) for k in count(first))
+    number, path, part = next((k, p, part) for k, p in paths if (part := _claimed(p)) is not None)
     with _becoming(path, part):
         yield number, part
+
+
+def _claimed(path: Path) -> Path | None:
+    """The part of a file of a series, which nobody else gets; None where it is being written, or there."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.touch(exist_ok=False)
+    except FileExistsError:
+        return None
+    if not path.exists():
+        return part
+    part.unlink()
+    return None
 
 
 def _part(path: Path) -> Path:
