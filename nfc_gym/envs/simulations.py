@@ -34,6 +34,7 @@ class Simulations:
       view: what the laws read, (n, ...).
       psi, seen: (n, d) in physical units, and as agents believe it, normalised.
       chosen: (n,) map of each simulation.
+      generators, seeds: n of each, what starts, goals and maps are drawn from.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Simulations:
         self.psi = np.tile(self.space.nominal, (n, 1))
         self.seen = np.zeros((n, len(self.space)), np.float32)
         self.chosen = np.zeros(n, np.intp)
-        self.generators = [seeding.np_random()[0] for _ in range(n)]
+        self.generators, self.seeds = map(list, zip(*(seeding.np_random() for _ in range(n)), strict=True))
         self.rest = rest_key(self.model)
         self._stack = np.stack([m.heights for m in maps]) if maps else np.zeros((0, 2, 2), np.float32)
         # Which map a simulation stands on is one entry of `geom_dataid`.

@@ -112,9 +112,10 @@ class RobotVectorEnv(VectorEnv):
     def _build(self, maps: Sequence[Heightfield], perceived: Sequence[Heightfield] | None = None) -> None:
         """Start a batch; every simulation then waits for its first reset."""
         n, before = self.num_envs, self.__dict__.get("_sims")
+        self.screen.close()  # pictures are of the model that they were made with
         self._sims = Simulations(self._given, n, self._nthread, maps, maps if perceived is None else perceived)
         if before is not None:
-            self._sims.generators = before.generators
+            self._sims.generators, self._sims.seeds = before.generators, before.seeds
         self._view = self._sims.view
         self._steps = np.zeros(n, np.int64)
         self._waiting = np.ones(n, bool)  # for a reset
@@ -146,6 +147,16 @@ class RobotVectorEnv(VectorEnv):
     def robot(self) -> Robot:
         """The laws."""
         return self._sims.robot
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """Every simulation's generator, as Gymnasium's own vector environments have them."""
+        return tuple(self._sims.generators)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seeds that they began from."""
+        return tuple(self._sims.seeds)
 
     @property
     def psi_space(self) -> ParameterSpace:
@@ -231,8 +242,9 @@ class RobotVectorEnv(VectorEnv):
           InputError: as for `RobotEnv.reset`.
         """
         ids, given, seeds = self.check_reset(seed, options)
+        self.closed = False  # else Gymnasium's `close` would leave what is made from now on
         for i, own in seeds.items():
-            self._sims.generators[i] = seeding.np_random(own)[0]
+            self._sims.generators[i], self._sims.seeds[i] = seeding.np_random(own)
         self._begin(ids, given)
         info = nothing_yet(self.robot, self._view)
         return self._observation(), masked(info, np.isin(np.arange(self.num_envs), ids))

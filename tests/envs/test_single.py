@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nfc_gym import InputError, terrain
-from nfc_gym.envs import render, terrains
+from nfc_gym.envs import render, screen, terrains
 
 ROUGH = "nfc_gym/JackalRough-v0"
 
@@ -222,6 +222,49 @@ def test_pictures_of_a_vector_environment(pictured: gymnasium.Env) -> None:
     assert (np.abs(first.astype(int) - second) > 8).mean() > 0.05
     single.close()
     envs.close()
+
+
+@pytest.fixture
+def contexts(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The graphics contexts that are open, none of which is real."""
+    there: list[Any] = []
+
+    class Context:
+        def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+            self.model = model
+            there.append(self)
+
+        def render(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Any) -> None:
+            assert model.nhfield == self.model.nhfield
+
+        def close(self) -> None:
+            there.remove(self)
+
+    monkeypatch.setattr(screen, "Pictures", Context)
+    return there
+
+
+def test_pictures_are_of_the_terrains_that_there_are(contexts: list[Any]) -> None:
+    envs = gymnasium.make_vec(ROUGH, num_envs=1, terrain_pool=2, render_mode="rgb_array", context=["psi"])
+    envs.reset(seed=0)
+    envs.render()
+    for count in (1, 3):
+        envs.unwrapped.set_terrains([np.zeros((256, 256), np.float32)] * count)
+        envs.reset(seed=0)
+        envs.render()
+        assert [each.model.nhfield for each in contexts] == [count]
+    envs.close()
+
+
+def test_what_is_opened_again_is_closed_again(contexts: list[Any]) -> None:
+    name, arguments = "nfc_gym/JackalFlat-v0", {"render_mode": "rgb_array", "context": []}
+    for env in (made(name, **arguments), gymnasium.make_vec(name, num_envs=1, **arguments)):
+        for _ in range(2):
+            env.reset(seed=0)
+            env.render()
+            assert len(contexts) == 1
+            env.close()
+            assert not contexts
 
 
 def test_pictures_show_the_state_as_it_is_and_as_a_vector_row_does() -> None:

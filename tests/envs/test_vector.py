@@ -355,3 +355,19 @@ def test_threads_change_no_bit() -> None:
     for _ in range(50):
         actions = rng.uniform(-1, 1, one.action_space.shape)
         same(one.step(actions), two.step(actions))
+
+
+def test_seeds_are_kept_as_gymnasiums_own_vectors_keep_them() -> None:
+    """A wrapper that is put on later draws from them."""
+    ours = vector("nfc_gym/JackalFlat-v0", context=["psi"])
+    theirs = gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=N, vectorization_mode="sync", context=["psi"])
+    assert len(set(ours.np_random_seed)) == N
+    for seed in (7, None, [None, 4, None]):
+        for envs in (ours, theirs):
+            envs.reset(seed=seed)
+        assert ours.np_random_seed == theirs.np_random_seed
+        same(*([g.bit_generator.state["state"]["state"] for g in e.np_random] for e in (ours, theirs)))
+    rough = vector("nfc_gym/JackalRough-v0", context=["psi"])
+    rough.reset(seed=3)
+    rough.unwrapped.set_terrains(rough.unwrapped.maps)
+    assert rough.np_random_seed == (3, 4, 5)

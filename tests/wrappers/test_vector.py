@@ -315,6 +315,18 @@ def test_what_are_no_seeds_is_told(wrap: Any, seed: Any, message: str) -> None:
         wrap(_vector()).reset(seed=seed)
 
 
+def test_a_wrapper_that_comes_after_the_seed_draws_from_it_too() -> None:
+    drawn = []
+    for first in (True, False):
+        envs = _vector()
+        if first:
+            envs.reset(seed=7)
+        envs = VectorRandomizePsi(envs, 0.5)
+        envs.reset(seed=None if first else 7)
+        drawn.append(envs.psi)
+    same(*drawn)
+
+
 def test_rows_without_a_seed_go_on() -> None:
     """A list of nothing is no seed: neither the rows' generators nor the wrapper's begin anew."""
     one, two = (VectorPerturbSignals(_vector(), NOISE) for _ in range(2))
