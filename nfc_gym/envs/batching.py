@@ -57,21 +57,21 @@ def seeds_of(seed: int | Iterable[int | None] | None, n: int) -> list[int | None
     """
     if seed is None:
         return [None] * n
-    if (one := _whole(seed)) is not None:
+    if (one := whole(seed)) is not None:
         return [one + i for i in range(n)]
     if not isinstance(seed, Iterable) or isinstance(seed, _NO_SEEDS) or getattr(seed, "ndim", 1) == 0:
         raise InputError(f"seed is {seed!r}, want a whole number, or one for each of {n} environments")
     given = list(seed)
     if len(given) != n:
         raise InputError(f"seed is {seed!r}, which holds {len(given)} seeds, want one for each of {n} environments")
-    seeds = [_whole(s) for s in given]
+    seeds = [whole(s) for s in given]
     for i, (own, s) in enumerate(zip(seeds, given, strict=True)):
         if own is None and s is not None:
             raise InputError(f"seed[{i}] is {s!r}, want a whole number, or None for a generator to stay as it is")
     return seeds
 
 
-def _whole(value: Any) -> int | None:
+def whole(value: Any) -> int | None:
     """A whole number of any library's as Python's own; None for what is none."""
     try:
         return operator.index(value)

@@ -1,5 +1,6 @@
 """`RobotEnv`: one robot in one simulation, a thin shell around the robot's laws."""
 
+import copy
 from collections.abc import Callable, Mapping
 from math import isfinite
 from typing import Any
@@ -7,9 +8,11 @@ from typing import Any
 import gymnasium
 import mujoco
 import numpy as np
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from nfc_gym.envs import scene
+from nfc_gym.envs.batching import whole
 from nfc_gym.envs.contract import (
     FLAT,
     UNSTABLE,
@@ -155,10 +158,12 @@ class RobotEnv(gymnasium.Env):
         Raises:
           InputError: an unknown option or name, another shape, values that are not finite or physically impossible.
         """
-        given = self._checked(options)
+        own = whole(seed)
+        seed = seed if own is None else own  # what is none is Gymnasium's to refuse
+        given = self._checked(options, seed)
         super().reset(seed=seed)
         u = self.np_random.random(1 + self.robot.draws)
-        if self.rough:  # first: a residual may lift the drawn map too high, and is then refused
+        if self.rough:
             self._set_terrain(given, u[0])
         self._set_psi(given)
         self._still()
@@ -227,7 +232,7 @@ class RobotEnv(gymnasium.Env):
             return np.zeros(xy.shape[:-1])
         return surface(self._terrain.heights, xy, self._terrain.resolution, self._terrain.origin)[0]
 
-    def _checked(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
+    def _checked(self, options: Mapping[str, Any] | None, seed: int | None) -> dict[str, Any]:
         """Reset options as they are used: refused, if at all, before anything has changed."""
         given, space = checked_options(options, self.rough), self.psi_space
         for name in ("psi", "psi_belief"):
@@ -240,7 +245,15 @@ class RobotEnv(gymnasium.Env):
                 given[name] = scene.checked(given[name], name)
         if "terrain_id" in given:
             given["heightfield"] = self._pool.map(given["terrain_id"])
+        if "terrain_residual" in given:  # which may lift a map too high, also one that is yet to be drawn
+            ground = given["heightfield"] if "heightfield" in given else self._coming(seed)
+            given["risen"] = scene.risen(ground, given["terrain_residual"])
         return given
+
+    def _coming(self, seed: int | None) -> Heightfield:
+        """The map that a reset with this seed is about to draw."""
+        generator = copy.deepcopy(self.np_random) if seed is None else seeding.np_random(seed)[0]
+        return self._pool.map(self._pool.draw(generator.random()))
 
     def _set_psi(self, given: Mapping[str, Any]) -> None:
         space = self.psi_space
@@ -255,8 +268,7 @@ class RobotEnv(gymnasium.Env):
 
     def _set_terrain(self, given: Mapping[str, Any], u: float) -> None:
         terrain = given["heightfield"] if "heightfield" in given else self._pool.map(self._pool.draw(u))
-        risen = scene.risen(terrain, given["terrain_residual"]) if "terrain_residual" in given else terrain
-        self._terrain, self._perceived = risen, given.get("perceived", terrain)
+        self._terrain, self._perceived = given.get("risen", terrain), given.get("perceived", terrain)
         scene.write(self.model, 0, self._terrain.heights)
 
     def _advance(self) -> None:

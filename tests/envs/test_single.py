@@ -234,8 +234,9 @@ def contexts(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
             self.model = model
             there.append(self)
 
-        def render(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Any) -> None:
+        def render(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Any) -> np.ndarray:
             assert model.nhfield == self.model.nhfield
+            return np.zeros((480, 640, 3), np.uint8)
 
         def close(self) -> None:
             there.remove(self)
@@ -343,13 +344,25 @@ def test_cameras_of_any_scene() -> None:
         render.camera_of(model, "track")
 
 
-@pytest.mark.parametrize("options", [{"psi": {"base_mass": -1.0}}, {"terrain_id": 7}, {"perceived": np.zeros(3)}])
-def test_a_reset_that_is_refused_changes_nothing(options: dict[str, Any]) -> None:
+@pytest.mark.parametrize("seed", [3, None])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"psi": {"base_mass": -1.0}},
+        {"terrain_id": 7},
+        {"perceived": np.zeros(3)},
+        {"terrain_residual": np.full((256, 256), 50.0)},
+        {"terrain_residual": np.zeros(3)},
+    ],
+    ids=["psi", "terrain_id", "perceived", "too_high", "shape"],
+)
+def test_a_reset_that_is_refused_changes_nothing(options: dict[str, Any], seed: int | None) -> None:
     env, twin = (made(ROUGH, context=["psi"]) for _ in range(2))
     for each in (env, twin):
         each.reset(seed=0)
     with pytest.raises(InputError):
-        env.reset(seed=3, options=options)
+        env.reset(seed=seed, options=options)
+    assert env.unwrapped.np_random_seed == 0
     for a, b in ((env.step(np.ones(2))[0], twin.step(np.ones(2))[0]), (env.reset()[0], twin.reset()[0])):
         np.testing.assert_array_equal(a["proprio"], b["proprio"])
 
@@ -368,3 +381,14 @@ def test_what_was_closed_is_not_stepped() -> None:
 def test_an_autoreset_mode_that_is_none_is_refused_by_name() -> None:
     with pytest.raises(InputError, match="autoreset_mode is 'foo', want one of: NextStep, SameStep, Disabled"):
         gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=2, autoreset_mode="foo")
+
+
+def test_seeds_are_whole_numbers_of_any_kind() -> None:
+    env = made("nfc_gym/JackalFlat-v0", context=["psi"]).unwrapped
+    first, _ = env.reset(seed=3)
+    for seed in (np.int64(3), np.uint8(3), np.array(3)):
+        np.testing.assert_array_equal(env.reset(seed=seed)[0]["proprio"], first["proprio"])  # type: ignore[arg-type]
+        assert env.np_random_seed == 3
+    for wrong in (-1, 1.5, "3"):
+        with pytest.raises(gymnasium.error.Error):
+            env.reset(seed=wrong)  # type: ignore[arg-type]
