@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from nfc_gym.adaptation.imagined import imagined, require_parts
 from nfc_gym.adaptation.network import Gaussian
 from nfc_gym.adaptation.optimise import optimise, pi_h_for
 from nfc_gym.adaptation.record import Record, in_words
+from nfc_gym.adaptation.settings import require_number
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute
 from nfc_gym.adaptation.weights import of_weights
@@ -79,12 +81,14 @@ class AdaptConfig:
     def __post_init__(self) -> None:
         least = {"missions": 1, "worlds": 1, "steps": 1, "seed": 0} | ({} if self.episode is None else {"episode": 1})
         for name, low in least.items():
-            require_whole(f"adapt: {name}", getattr(self, name), low)
-        if self.judged == 1 or self.judged < 0:
-            raise InputError(f"adapt: judged is {self.judged}; want 0, or 2 episodes or more")
-        if not 0 <= self.beta < float("inf"):
-            raise InputError(f"adapt: beta is {self.beta!r}; want a number of standard deviations, 0 or more")
-        if isinstance(self.parts, str) or not self.parts:
+            object.__setattr__(self, name, require_whole(f"adapt: {name}", getattr(self, name), low))
+        whole = isinstance(self.judged, Integral) and not isinstance(self.judged, bool)
+        if not whole or self.judged == 1 or self.judged < 0:
+            raise InputError(f"adapt: judged is {self.judged!r}; want 0, or 2 episodes or more")
+        object.__setattr__(self, "judged", int(self.judged))
+        beta = require_number("adapt: beta", self.beta, 0, what="a number of standard deviations")
+        object.__setattr__(self, "beta", beta)
+        if isinstance(self.parts, str) or not isinstance(self.parts, Sequence) or not self.parts:
             raise InputError(f"adapt: parts is {self.parts!r}; want parts of the belief, such as ('psi',)")
         require_parts(self.parts)
 
@@ -327,7 +331,10 @@ class _Run:
         plain = resume.load(path, self._modules(), None, self._described())
         self.t, self.steps, self.history = plain["t"], plain["steps"], plain["history"]
         self.dataset = Dataset(self.folder, self.t)
-        self.record.say(f"going on from mission {self.t} of {self.config.missions}")
+        over = not self.mission_goes_on()
+        self.record.say(
+            f"{'finished before, at' if over else 'going on from'} mission {self.t} of {self.config.missions}"
+        )
         self._infer_again([tau for tau in self.dataset if tau.anomalous])
 
     def _infer_again(self, anomalous: Sequence[Trajectory]) -> None:

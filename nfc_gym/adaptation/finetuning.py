@@ -24,9 +24,10 @@ from nfc_gym.adaptation.ppo import Diverged, OnPolicy, clipped
 from nfc_gym.adaptation.pretraining import recipe_of
 from nfc_gym.adaptation.record import Record, in_words
 from nfc_gym.adaptation.returns import figure
+from nfc_gym.adaptation.settings import require_number
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.worlds import VectorStaggered, batches, torchrl_env
-from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.random import mixed
 
 STATE = "training.safetensors"
@@ -61,10 +62,9 @@ class FineTuneConfig:
     def __post_init__(self) -> None:
         for name, least in (("steps", 1), ("envs", 1), ("episode", 1), ("every", 1), ("curve", 2), ("seed", 0)):
             value = getattr(self, name)
-            if value is not None and value < least:
-                raise InputError(f"{name} is {value}; want {least} or more")
-        if not 0 <= self.vary <= 10:
-            raise InputError(f"vary is {self.vary:g}; want a multiple of the intervals from 0 (fitted sizes) to 10")
+            if (name, value) != ("episode", None):
+                object.__setattr__(self, name, require_whole(name, value, least))
+        object.__setattr__(self, "vary", require_number("vary", self.vary, 0, 10, "a multiple of the intervals"))
 
 
 class FineTuning:
@@ -106,7 +106,9 @@ class FineTuning:
         """Learn, from the state in the folder if there is one; returns the policy of the curve's best point."""
         if self.path.is_file():
             self._load()
-            self.record.say(f"going on from step {self.steps:,} of {self.config.steps:,}")
+            over = self.steps >= self.config.steps or self.diverged is not None
+            said = "finished before, at" if over else "going on from"
+            self.record.say(f"{said} step {self.steps:,} of {self.config.steps:,}")
         else:
             self._point({})
         while self.steps < self.config.steps and self.diverged is None:

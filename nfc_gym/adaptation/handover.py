@@ -35,6 +35,7 @@ from nfc_gym.adaptation.weights import of_weights
 from nfc_gym.adaptation.worlds import vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together, write_whole
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.jobs import device_of
 from nfc_gym.inference.random import mixed
 from nfc_gym.simulate.machine import full_id
@@ -78,8 +79,7 @@ def hand_over(
       InputError: a policy of another robot; effects of another robot, or none at all; values that are not finite; a
         `world` of another task; a folder that holds something else, or another run.
     """
-    if episodes < 2:
-        raise InputError(f"episodes is {episodes}; want 2 or more, as each return is given an interval")
+    require_whole("episodes", episodes, 2)  # each return is given an interval
     began, name = time.monotonic(), full_id(environment)
     extension = Extension(read_found(effects), name, condition=condition, signals=signals)
     extension.require_something()
@@ -146,10 +146,10 @@ def _require_own(folder: Path) -> None:
     file = folder / REPORT
     if file.is_file():
         try:
-            mine = "returns" in json.loads(file.read_text(encoding="utf-8"))
+            told = json.loads(file.read_text(encoding="utf-8"))
         except ValueError:
-            mine = False
-        if not mine:
+            told = None
+        if not isinstance(told, dict) or "returns" not in told:
             raise InputError(f"{folder} holds the report of another command: choose another --out")
     folder.mkdir(parents=True, exist_ok=True)
 

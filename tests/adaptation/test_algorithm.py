@@ -1,7 +1,8 @@
 """Algorithm 1: nothing is touched without an anomaly, all is kept, a run that stopped ends as one that did not."""
 
 import copy
-from dataclasses import dataclass, field, replace
+import json
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +19,7 @@ from torchrl.modules import NormalParamExtractor, OneHotCategorical, Probabilist
 from torchrl.objectives import ClipPPOLoss
 
 from nfc_gym import InputError
-from nfc_gym.adaptation import AdaptConfig, Agent, adapt, load_policy, ppo_agent, sac_agent
+from nfc_gym.adaptation import AdaptConfig, Agent, FineTuneConfig, adapt, load_policy, ppo_agent, sac_agent
 from nfc_gym.adaptation.agent import OffPolicyConfig
 from nfc_gym.adaptation.beliefs import Fixed
 from nfc_gym.adaptation.choice import Choice
@@ -143,11 +144,28 @@ def test_a_run_that_stopped_ends_as_one_that_did_not(jackal: Path, tmp_path: Pat
         with pytest.raises(InputError, match=f"is of another run, with {odd}: give what that one began with"):
             adapt(given, world(), sampled, Alarm(9), config=config, folder=tmp_path / "b", threads=1)
     # What has learned in this folder, in this process, is the agent that began there; no belief is inferred in vain.
-    shown = Counted(belief())
-    again = adapt(ppo_agent(fresh), world(), shown, Alarm(9), config=config, folder=tmp_path / "b", threads=1)
+    shown, said = Counted(belief()), Console(record=True, width=200, file=open("/dev/null", "w"))  # noqa: SIM115
+    again = adapt(
+        ppo_agent(fresh), world(), shown, Alarm(9), config=config, folder=tmp_path / "b", threads=1, console=said
+    )
+    assert "finished before, at mission 3 of 3" in said.export_text()
     assert again.history == one.history
     assert shown.count == 1
     assert same(state(whole.network), state(fresh.network))
+
+
+def test_settings_of_the_simulator_that_are_left_out_are_another_run(jackal: Path, tmp_path: Path) -> None:
+    def run(settings: dict[str, Any] | None, missions: int) -> Any:
+        config = replace(CONFIG, missions=missions)
+        agent = ppo_agent(load_policy(jackal))
+        return adapt(agent, world(), belief(), Alarm(None), config=config, folder=tmp_path, settings=settings)
+
+    given = {"difficulty": 0.9, "terrain_pool": 2}
+    run(given, 1)
+    for now, told in (({"terrain_pool": 2}, ""), (None, "; terrain_pool 2, now not given")):
+        with pytest.raises(InputError, match=rf"of another run \(difficulty 0\.9, now not given{told}\)"):
+            run(now, 2)
+    assert len(run(given, 2).history) == 2
 
 
 @pytest.mark.parametrize(
@@ -269,12 +287,18 @@ def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path, judge
     ("wrong", "told"),
     [
         ({"judged": 1}, "judged is 1; want 0, or 2 episodes"),
+        ({"judged": -2}, "judged is -2; want 0, or 2 episodes"),
+        ({"judged": 2.5}, "judged is 2.5; want 0, or 2 episodes"),
+        ({"judged": "4"}, "judged is '4'; want 0, or 2 episodes"),
         ({"missions": 0}, "missions is 0, want a whole number, 1 or more"),
         ({"worlds": -1}, "worlds is -1, want a whole number, 1 or more"),
         ({"steps": 1.5}, "steps is 1.5, want a whole number"),
         ({"episode": 0}, "episode is 0, want a whole number"),
         ({"seed": -1}, "seed is -1, want a whole number, 0 or more"),
         ({"beta": -1.0}, "beta is -1.0; want a number of standard deviations"),
+        ({"beta": "a"}, "beta is 'a'; want a number of standard deviations"),
+        ({"beta": float("inf")}, "beta is inf; want a number of standard deviations"),
+        ({"parts": 5}, "parts is 5; want parts of the belief"),
         ({"parts": ()}, "parts is \\(\\); want parts of the belief"),
         ({"parts": "psi"}, "parts is 'psi'; want parts of the belief"),
         ({"parts": ("mass",)}, "no part 'mass' of a belief; there are: psi, delta_s, delta_e, effects, noise"),
@@ -283,6 +307,12 @@ def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path, judge
 def test_settings_that_cannot_be_are_named(wrong: dict[str, Any], told: str) -> None:
     with pytest.raises(InputError, match=told):
         AdaptConfig(**wrong)
+
+
+def test_numbers_of_numpy_are_kept_as_plain_ones() -> None:
+    one, half = np.int64(2), np.float32(0.5)
+    for config in (AdaptConfig(worlds=one, judged=one, beta=half), FineTuneConfig(envs=one, vary=half)):
+        assert json.loads(json.dumps(asdict(config)))["seed"] == 0
 
 
 def test_what_does_not_fit_is_named(jackal: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 from gymnasium.vector import VectorEnv
+from rich.console import Console
 from safetensors.torch import load_file
 from scipy import stats
 from typer.testing import CliRunner
@@ -181,10 +182,13 @@ def test_learning_that_comes_apart_keeps_the_best_weights(
 
 
 def test_folders_of_others_are_left_alone(tmp_path: Path, result: Path, jackal: Path) -> None:
-    (result / "report.json").write_text(json.dumps({"effects": [], "parameters": []}))
-    with pytest.raises(InputError, match="holds the report of another command"):
-        handed(result, result, jackal)
-    (result / "report.json").unlink()
+    theirs = json.dumps({"effects": [], "parameters": []})
+    for folder, report in ((result, theirs), *((tmp_path / "out", other) for other in ("5", "null", "["))):
+        folder.mkdir(exist_ok=True)
+        (folder / "report.json").write_text(report)
+        with pytest.raises(InputError, match="holds the report of another command"):
+            handed(result, folder, jackal)
+        (folder / "report.json").unlink()
     handed(result, tmp_path / "out", jackal, steps=512)
     with pytest.raises(InputError, match=r"is of another run \(seed 0, now 1\)"):
         hand_over(
@@ -201,8 +205,9 @@ def test_another_condition_or_signal_is_another_run(tmp_path: Path, jackal: Path
     file, out = tmp_path / "effects.yaml", tmp_path / "out"
     file.write_text(yaml.safe_dump({"version": 1, "effects": [wind, sag]}))
     given: dict[str, Any] = {"steps": 1, "condition": "calm", "signals": {"exo:supply": 20.0}}
-    first = handed(file, out, jackal, **given)
-    assert handed(file, out, jackal, **given)["returns"] == first["returns"]
+    first, said = handed(file, out, jackal, **given), Console(record=True, width=200, file=open("/dev/null", "w"))  # noqa: SIM115
+    assert handed(file, out, jackal, **given, console=said)["returns"] == first["returns"]
+    assert "finished before, at step 512 of 1" in said.export_text()
     with pytest.raises(InputError, match=r"is of another run \(condition"):
         handed(file, out, jackal, **{**given, "condition": "gale"})
     with pytest.raises(InputError, match=r"is of another run \(exo:supply 20.0, now 12.0"):
@@ -215,7 +220,7 @@ def test_another_condition_or_signal_is_another_run(tmp_path: Path, jackal: Path
         ({"environment": "AntFlat"}, "the policy is of JackalFlat-v0 and cannot act in AntFlat-v0"),
         ({"environment": "Jackal"}, "no environment 'Jackal'"),
         ({"policy": "none.safetensors"}, "no such file"),
-        ({"episodes": 1}, "episodes is 1; want 2 or more"),
+        ({"episodes": 1}, "episodes is 1, want a whole number, 2 or more"),
     ],
 )
 def test_bad_input_is_named(tmp_path: Path, jackal: Path, arguments: dict[str, Any], says: str) -> None:
@@ -230,9 +235,15 @@ def test_bad_input_is_named(tmp_path: Path, jackal: Path, arguments: dict[str, A
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("name", "value"), [("steps", 0), ("envs", 0), ("curve", 1), ("vary", -1.0), ("vary", 11.0)])
-def test_settings_are_checked(name: str, value: float) -> None:
-    with pytest.raises(InputError, match=f"{name} is {value:g}; want"):
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("steps", 0), ("steps", None), ("envs", 0), ("envs", 1.5), ("envs", "a"), ("episode", 0), ("curve", 1),
+        ("vary", -1.0), ("vary", 11.0), ("vary", "a"), ("vary", float("nan")),
+    ],
+)  # fmt: skip
+def test_settings_are_checked(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=f"{name} is {value!r}[,;] want a (whole number|multiple of the intervals)"):
         FineTuneConfig(**{name: value})
 
 

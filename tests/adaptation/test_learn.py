@@ -100,7 +100,8 @@ def test_options_reach_what_learns(mission: Path, tmp_path: Path, monkeypatch: p
     assert config.training.epochs == 3
     assert options == {
         "mission": mission, "posterior": Path("p.safetensors"), "detector": Path("d.safetensors"),
-        "environment": "AntFlat", "normal": quiet_windows, "beside": None, "folder": tmp_path, "jobs": 2, "device": "cpu",
+        "environment": "AntFlat", "normal": quiet_windows, "beside": None, "folder": tmp_path, "jobs": 2,
+        "device": "cpu",
     }  # fmt: skip
 
 
