@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from difflib import get_close_matches
 
 import mujoco
+import numpy as np
 
 from nfc_gym.core import InputError
 from nfc_gym.core.units import si_unit
@@ -24,6 +25,8 @@ from nfc_gym.physics.parameters import COMPOUND, Parameter, ParameterSpace, reso
 
 _OBJ = mujoco.mjtObj
 _GOALS = ("rad", "m", "rad/s", "m/s")  # units that servos are commanded in, and nothing else
+# Dynamics of actuators whose state the commands before a start tell.
+_LED = [int(getattr(mujoco.mjtDyn, f"mjDYN_{kind}")) for kind in ("NONE", "FILTER", "FILTEREXACT", "INTEGRATOR")]
 MOST_STEPS = 100_000  # of a segment with its history; usual are a hundred
 
 
@@ -179,6 +182,11 @@ def _integrating(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
     names, rolled = names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nu), mapping.segments.mode == "rollout"
     if mapping.segments.mode == "inverse":
         return
+    for a in np.flatnonzero(~np.isin(model.actuator_dyntype, _LED)):
+        kind = str(mujoco.mjtDyn(int(model.actuator_dyntype[a]))).rpartition("mjDYN_")[2].rstrip(">").lower()
+        message = f"an actuator with the dynamics {kind!r}: each roll-out begins with its state at 0"
+        advice = "filters and integrators are led through the commands before it: use one of these"
+        yield Finding("warning", f"controls.ctrl:{names[a]}", message, advice)
     shown = on_servos(model) if rolled else []
     for a in integrators(model):
         where = f"controls.ctrl:{names[a]}"

@@ -34,6 +34,8 @@ def unmeasured(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
         elif kind == _FREE:
             if not any(c.startswith(f"body:{body}:") for c in mapping.channels):
                 loose.append(f"the free joint of {body!r}")
+            else:
+                yield from _without_attitude(mapping, body)
         elif not {f"joint:{name}:pos", f"joint:{name}:vel"} & set(mapping.channels):
             (held if model.jnt_stiffness[j] > 0 else loose).append(repr(name))
     if loose:
@@ -44,6 +46,13 @@ def unmeasured(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
     if held:
         message = f"no channel measures {', '.join(held)}, which a spring holds: every roll-out starts with it there"
         yield Finding("note", "channels", message)
+
+
+def _without_attitude(mapping: Mapping, body: str) -> Iterator[Finding]:
+    """A free body whose attitude no channel measures: its rates say how it turns, and not from where."""
+    if f"body:{body}:quat" not in mapping.channels:
+        message = f"no channel measures the attitude of {body!r}: it is taken to stay at its reference all along"
+        yield Finding("warning", "channels", message, f"log body:{body}:quat, or gravity will pull the wrong way")
 
 
 def open_loops(model: mujoco.MjModel, log: Log) -> Iterator[Suspicion]:

@@ -218,6 +218,21 @@ def test_what_an_integrator_is_taken_to_have_gathered_is_told(
     assert all(words in str(f) and f.where == "controls.ctrl:servo" for f in found)
 
 
+def test_a_free_body_without_an_attitude_is_told_of(build: Build) -> None:
+    quat = '  "body:base:quat": {columns: [qw, qx, qy, qz], order: wxyz, noise: 0.01}\n'
+    rates = '  "body:base:angvel@body": {columns: [gx, gy, gz], unit: rad/s, noise: 0.01}\n'
+    said = "\n".join(map(str, check(build(None, (quat, rates)))))
+    assert "no channel measures the attitude of 'base'" in said
+
+
+def test_a_drive_whose_state_no_command_tells_is_told_of(build: Build, machine: str) -> None:
+    model = re.sub(r'<position name="servo"[^>]*/>', '<muscle name="servo" joint="hinge"/>', machine)
+    said = "\n".join(
+        map(str, check(build(None, ("{column: goal, unit: rad}", "{column: goal, unit: 1}"), model=model)))
+    )
+    assert "dynamics 'muscle'" in said
+
+
 def test_a_models_step_longer_than_the_shortest_horizon(build: Build, machine: str) -> None:
     """As of one that is given in the mapping."""
     slow = re.sub(r"(<mujoco[^>]*>)", r'\1<option timestep="0.2"/>', machine, count=1)
