@@ -6,7 +6,7 @@ adds the residual to the state outright after the step, positions included. Entr
 what is observed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -62,6 +62,15 @@ class Injection:
         self._bias = value
         if self.steady:  # the acceleration is the same in every step
             self._acceleration = value[..., -self.components.nv :] / self.duration
+
+    def kept(self) -> Callable[[], None]:
+        """What puts back the bias and the noise of the running episode, after a reset that fails."""
+        bias, delta, rng = self.bias, self.delta, self.rng
+
+        def undo() -> None:
+            self.bias, self.delta, self.rng = bias, delta, rng
+
+        return undo
 
     def begin(self) -> None:
         """Draw the step's noise, and push."""
@@ -198,11 +207,12 @@ class ResidualDynamics(_Observing, EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw the episode's bias, then reset."""
-        self.injection.rng = self.stream(seed)
-        self.injection.bias = self.draws.draw(1, self.injection.rng)[0]
-        self.injection.delta = self.injection.bias
-        self.sim.begin_episode()
-        observation, info = self.env.reset(seed=seed, options=options)
+        with self.refusable(self.injection.kept(), self.sim.kept()):
+            self.injection.rng = self.stream(seed)
+            self.injection.bias = self.draws.draw(1, self.injection.rng)[0]
+            self.injection.delta = self.injection.bias
+            self.sim.begin_episode()
+            observation, info = self.env.reset(seed=seed, options=options)
         return self._observed(observation), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

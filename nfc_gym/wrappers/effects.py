@@ -307,9 +307,10 @@ class ApplyEffects(EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Edit the model from nominal, forget hidden states, reset."""
-        self.sim.edit()
-        self.sim.begin_episode()
-        return self.env.reset(seed=seed, options=options)
+        with self.refusable(self.sim.kept(edits=True)):
+            self.sim.edit()
+            self.sim.begin_episode()
+            return self.env.reset(seed=seed, options=options)
 
 
 class VectorApplyEffects(VectorEnvWrapper):

@@ -7,7 +7,7 @@ told of psi (`psi_belief`) throughout: it is trained to believe the mean, as it 
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any
 
@@ -151,10 +151,19 @@ class Hallucinate(_Hallucinating, EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in the posterior's mean."""
-        self._chosen = False
-        self._again = (seed, options, self._draws() if seed is None else None)
-        self._h = np.zeros(self.belief.size)
-        return self._begin(seed, options)
+        with self.refusable(*self._kept()):
+            self._chosen = False
+            self._again = (seed, options, self._draws() if seed is None else None)
+            self._h = np.zeros(self.belief.size)
+            return self._begin(seed, options)
+
+    def _kept(self) -> list[Callable[[], None]]:
+        """What puts back the world of the running episode after a reset that fails."""
+        before = {name: self.__dict__[name] for name in ("_chosen", "_again", "_h", "_made")}
+        undo = [lambda: self.__dict__.update(before), self.sim.kept()]
+        if self.ground is not None:
+            undo.append(self.ground.kept(np.asarray(self.fidelity.delta_e)))
+        return undo + [part.kept() for part in (self.psi, self.injection) if part is not None]
 
     def _draws(self) -> tuple[Any, list[tuple[EnvWrapper, np.random.Generator | None]]]:
         """Where the environment's generator stands, and the streams of the wrappers beneath."""

@@ -100,8 +100,8 @@ class PerceiveTerrain(EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Forget what was seen, and reset."""
-        self.map.reset(self.stream(seed))
         observation, info = self.env.reset(seed=seed, options=options)
+        self.map.reset(self.stream(seed))
         return self._look(observation), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

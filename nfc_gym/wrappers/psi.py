@@ -1,6 +1,6 @@
 """`RandomizePsi`: physical coefficients that are drawn anew for each episode."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from numbers import Real
 from typing import Any
@@ -175,6 +175,16 @@ class Psi:
         self.sim.edit()
         return options or None
 
+    def kept(self) -> Callable[[], None]:
+        """What puts back the psi of the running episode, into its model too, after a reset that fails."""
+        value, undo = self.value, self.sim.kept(edits=True)
+
+        def both() -> None:
+            self.value = value
+            undo()
+
+        return both
+
     def write(self, value: Array) -> None:
         """Psi of an episode that has begun but not moved yet; derived quantities follow."""
         self.value = value
@@ -221,8 +231,9 @@ class RandomizePsi(EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw psi, then reset."""
-        value = self.prior.draw(1, self.stream(seed))[0]
-        return self.env.reset(seed=seed, options=self._psi.options(value, options, self._told))
+        with self.refusable(self._psi.kept()):
+            value = self.prior.draw(1, self.stream(seed))[0]
+            return self.env.reset(seed=seed, options=self._psi.options(value, options, self._told))
 
 
 class VectorRandomizePsi(VectorEnvWrapper):

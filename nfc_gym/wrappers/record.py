@@ -115,9 +115,13 @@ class RecordLog(_Recording, EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Write the running episode, if any, and begin another."""
+        running = self.tapes
+        with self.refusable(lambda: setattr(self, "tapes", running), self.sim.kept()):
+            self.tapes = {}  # steps that a reset makes are no episode's
+            self.sim.begin_episode()
+            result = self.env.reset(seed=seed, options=options)
+        self.tapes = running
         self.flush()
-        self.sim.begin_episode()
-        result = self.env.reset(seed=seed, options=options)
         self._undescribed = self.sim.late_ground
         if not self._undescribed:
             self.log.describe()

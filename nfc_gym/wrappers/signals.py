@@ -196,9 +196,9 @@ class PerturbSignals(_Perturbing, EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw the episode's biases, and reset."""
+        observation, info = self.env.reset(seed=seed, options=options)
         self.stream(seed)
         self._begin(None)
-        observation, info = self.env.reset(seed=seed, options=options)
         return self._see(observation), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

@@ -259,6 +259,21 @@ class SingleSimulation(Simulation):
             self.between = True
         self.attached = True
 
+    def kept(self, edits: bool = False) -> Callable[[], None]:
+        """What puts the running episode back after a reset that fails.
+
+        Args:
+          edits: made for that reset, to be made again as they were.
+        """
+        before = {name: self.__dict__[name] for name in ("started", "_inside", "_calls", "_time")}
+
+        def undo() -> None:
+            self.__dict__.update(before)
+            if edits:
+                self.edit()
+
+        return undo
+
     def begin_episode(self) -> None:
         """The next control step is the first of an episode."""
         self.started = True

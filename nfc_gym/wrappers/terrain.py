@@ -1,5 +1,6 @@
 """`ResidualTerrain`: delta_e = truth - perceived. The simulator gets e + delta_e; the policy still sees e."""
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -78,6 +79,10 @@ class Ground:
                     raise InputError(f"terrain_residual has shape {own.shape}, want {self.shape}")
                 residual = residual + own
             return {**(options or {}), "terrain_residual": residual}
+        self._write(residual)
+        return options
+
+    def _write(self, residual: Array) -> None:
         for name, value in self._given.items():
             getattr(self.sim.model, name)[...] = value
         heights = (self.perceived.heights + residual).astype(np.float32)
@@ -85,7 +90,10 @@ class Ground:
         if residual.any():  # through metres and back the heights would change in their last bit
             terrain.write(self.sim.model, self.name, truth)
         self._lift(truth)
-        return options
+
+    def kept(self, residual: Array) -> Callable[[], None]:
+        """What puts back the ground of the running episode, with its residual, after a reset that fails."""
+        return (lambda: None) if self.own else lambda: self._write(residual)
 
     def _lift(self, truth: terrain.Heightfield) -> None:
         """Raise the start of a free body by what the ground within a robot's length of it has risen."""
@@ -176,8 +184,11 @@ class ResidualTerrain(EnvWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw the residual, then reset onto the ground with it."""
-        self._delta = self.draws.draw(1, self.stream(seed))[0]
-        return self.env.reset(seed=seed, options=self.ground.options(self._delta, options))
+        with self.refusable(self.ground.kept(self._delta)):
+            delta = self.draws.draw(1, self.stream(seed))[0]
+            result = self.env.reset(seed=seed, options=self.ground.options(delta, options))
+            self._delta = delta
+            return result
 
 
 class VectorResidualTerrain(VectorEnvWrapper):
