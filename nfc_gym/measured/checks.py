@@ -1,10 +1,12 @@
 """`nfc-gym check`: all that is wrong with a mapping, its model and its logs, in one place. Nothing is repaired."""
 
+import hashlib
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from nfc_gym.core import InputError, Log
 from nfc_gym.measured.clock_checks import clock_offsets, shift_notes
@@ -114,11 +116,25 @@ def _whole(dataset: Dataset) -> list[Finding]:
     if not dataset.independent_splits:
         message = "some logs are cut by time, so fitting and verification are not independent"
         findings.append(Finding("note", "split", message, "the report will say so; separate logs prove more"))
+    findings += _copies(dataset)
     quiet = [name for name, c in dataset.mapping.channels.items() if c.noise is None]
     if quiet:
         advice = "give `noise` (standard deviation of one sample) where you know it"
         findings.append(Finding("note", "channels", f"noise will be estimated for {', '.join(quiet)}", advice))
     return findings
+
+
+def _copies(dataset: Dataset) -> list[Finding]:
+    """Logs that are the same one twice: what was fitted to would then verify itself."""
+    first: dict[bytes, str] = {}
+    for log in dataset.logs:
+        values = [log.time, *log.controls.values(), *(c.values for c in log.channels.values())]
+        content = hashlib.sha256(b"".join(np.ascontiguousarray(v).tobytes() for v in values)).digest()
+        other = first.setdefault(content, log.name)
+        if other != log.name:
+            message = f"log {log.name!r} holds the same as {other!r}: one that fits may verify itself"
+            return [Finding("warning", "logs", message, "leave one of them out")]
+    return []
 
 
 _DOES = {"fit": "is fitted to", "select": "selects", "verify": "verifies"}

@@ -143,6 +143,7 @@ def _fields(mapping: Mapping, spec: mujoco.MjSpec, model: mujoco.MjModel) -> Ite
                 ParameterSpace(model, [parameter])
                 right[parameter.name] = where
                 every.append(parameter)
+                yield from _doubtful(where, model, parameter)
         except (InputError, IndexError) as e:
             yield Finding("error", where, str(e), _field_advice(entry.field, model))
     try:
@@ -160,6 +161,22 @@ def _fields(mapping: Mapping, spec: mujoco.MjSpec, model: mujoco.MjModel) -> Ite
             resolve(model, entry.field, entry.of)
         except (InputError, IndexError) as e:
             yield Finding("error", f"known.{entry.field}", str(e), _field_advice(entry.field, model))
+
+
+def _doubtful(where: str, model: mujoco.MjModel, parameter: Parameter) -> Iterator[Finding]:
+    """A parameter that may take what nature does not allow, or that makes alike what differs in the model."""
+    space = ParameterSpace(model, [parameter])
+    if parameter.low < space.least[0] or parameter.high > space.most[0]:
+        allowed = (
+            f"{space.least[0]:g} to {space.most[0]:g}" if space.most[0] < np.inf else f"{space.least[0]:g} or more"
+        )
+        bounds = f"[{parameter.low:g}, {parameter.high:g}]"
+        yield Finding("warning", where, f"the bounds {bounds} reach beyond what nature allows, {allowed}")
+    own = {float(f"{value:.6g}") for value in space.tied(model, 0)} if parameter.nominal is None else set()
+    if len(own) > 1:
+        message = f"one value for what differs in the model ({', '.join(f'{v:g}' for v in sorted(own))})"
+        advice = f"before any fit all have {space.nominal[0]:g}; give `nominal`, or a parameter for each"
+        yield Finding("warning", where, message, advice)
 
 
 def _steps(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
@@ -182,7 +199,7 @@ def _integrating(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
     names, rolled = names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nu), mapping.segments.mode == "rollout"
     if mapping.segments.mode == "inverse":
         return
-    for a in np.flatnonzero(~np.isin(model.actuator_dyntype, _LED)):
+    for a in np.flatnonzero((model.actuator_actnum > 0) & ~np.isin(model.actuator_dyntype, _LED)):
         kind = str(mujoco.mjtDyn(int(model.actuator_dyntype[a]))).rpartition("mjDYN_")[2].rstrip(">").lower()
         message = f"an actuator with the dynamics {kind!r}: each roll-out begins with its state at 0"
         advice = "filters and integrators are led through the commands before it: use one of these"

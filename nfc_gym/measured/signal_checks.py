@@ -42,6 +42,15 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
         if model is not None and parsed.kind == "sensor":
             yield from _components(name, parsed.object, channel, model)
             yield from gravity(name, parsed.object, channel, model)
+    if mapping.segments.mode == "inverse":
+        for name, values in log.known.items():
+            if np.ptp(values) > 0:
+                message = (
+                    f"changes from {values.min():.4g} to {values.max():.4g}, and mode inverse takes its first value"
+                )
+                yield Suspicion(
+                    "warning", f"known.{name.split(':')[0]}", "known", message, "cut the log where it changes"
+                )
     yield from strangers(log)
     yield from too_fast(log)
     yield from _twins(log)

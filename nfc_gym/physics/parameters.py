@@ -112,8 +112,7 @@ _POSSIBLE = {
     **dict.fromkeys(
         (
             "geom_friction", "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
-            "tendon_stiffness", "tendon_damping", "tendon_frictionloss", "servo_kp", "servo_kv", "opt.density",
-            "opt.viscosity",
+            "tendon_stiffness", "tendon_damping", "tendon_frictionloss", "servo_kp", "servo_kv",
         ),
         _AT_LEAST_0,
     ),
@@ -278,14 +277,21 @@ class ParameterSpace:
         """(d,) which parameters are not anchored."""
         return np.array([not p.anchored for p in self.parameters], bool)
 
-    @staticmethod
-    def _read(model: mujoco.MjModel, bound: _Bound) -> float:
+    def tied(self, model: mujoco.MjModel, i: int) -> Array:
+        """(n,) what a model has of the i-th parameter at each of the objects that share it."""
+        return self._values(model, self._bound[i])
+
+    def _read(self, model: mujoco.MjModel, bound: _Bound) -> float:
         if bound.name == "geom_restitution":
             raise InputError("geom_restitution has no single nominal value in the model: give `nominal`")
+        return float(self._values(model, bound)[0])
+
+    @staticmethod
+    def _values(model: mujoco.MjModel, bound: _Bound) -> Array:
         name, component = _READ.get(bound.name, (bound.name, bound.component))
-        array = getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
-        row = array if bound.rows is None else array[bound.rows[0]]
-        return float(row if component is None else row[component])
+        array = getattr(model.opt, name[4:])[None] if name.startswith("opt.") else getattr(model, name)
+        rows = array if bound.rows is None else array[bound.rows]
+        return rows if component is None else rows[:, component]
 
     def write(self, fields: ModelFields, psi: ArrayLike) -> None:
         """Write psi (d,) to one model, or (nsim, d) to a batch. Call `fields.commit()` once everything is written.

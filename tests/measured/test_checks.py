@@ -1,6 +1,7 @@
 """Each way to spoil a data set is found, named, and comes with advice; an unspoilt one passes without a word."""
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -216,6 +217,34 @@ def test_what_an_integrator_is_taken_to_have_gathered_is_told(
     found = [f for f in check(build(None, *edits, model=model)) if "integrates" in f.message]
     assert [f.severity for f in found] == [severity] * bool(severity)
     assert all(words in str(f) and f.where == "controls.ctrl:servo" for f in found)
+
+
+def test_bounds_beyond_nature_and_values_made_alike_are_told_of(build: Build, machine: str) -> None:
+    rows = "\n  - {name: damping, field: dof_damping, of: [hinge], unit: N m s/rad, low: -1, high: 1}"
+    rows += (
+        "\n  - {name: size, field: 'geom_size[0]', of: [weight, hull], tied: true, unit: m, low: 0.01, high: 1}\nlogs:"
+    )
+    said = "\n".join(map(str, check(build(None, ("\nlogs:", rows)))))
+    assert "reach beyond what nature allows, 0 or more" in said
+    assert "one value for what differs in the model (0.02, 0.1)" in said
+
+
+def test_the_same_log_twice_is_told_of(build: Build, tmp_path: Path) -> None:
+    path = build()
+    shutil.copy(tmp_path / "run_0.npz", tmp_path / "run_9.npz")
+    assert "log 'run_9' holds the same as 'run_0'" in "\n".join(map(str, check(path)))
+
+
+def test_what_is_known_to_change_is_told_of_in_inverse_mode(build: Build) -> None:
+    known = "known:\n  - {field: body_mass, of: [bob], column: m, unit: kg}\nsegments: {mode: inverse, length: 0.4}"
+    force = '  "force:servo": {column: f, unit: N m, noise: 0.01}\n'
+
+    def spoil(table: dict[str, np.ndarray]) -> None:
+        table["m"], table["f"] = np.where(table["t"] > 2, 0.2, 0.1), np.sin(table["t"])
+
+    edits = ("segments: {length: 0.4}", known), ('  "sensor:gyro"', force + '  "sensor:gyro"')
+    said = "\n".join(map(str, check(build(spoil, *edits))))
+    assert "changes from 0.1 to 0.2, and mode inverse takes its first value" in said
 
 
 def test_a_free_body_without_an_attitude_is_told_of(build: Build) -> None:

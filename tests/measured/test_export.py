@@ -136,6 +136,7 @@ TENDON = """<tendon><spatial name="t" stiffness="10"><site site="on"/><site site
 ON, OFF = '<site name="on" pos="0 0 2"/>', '<site name="off" pos=".3 0 0"/>'
 HUNG = arm(joint='springref="40"').replace("<worldbody>", f"<worldbody>{ON}")
 HUNG = HUNG.replace('<geom name="rod"', f'{OFF}<geom name="rod"').replace("<actuator>", f"{TENDON}<actuator>")
+MIXING = '<motor name="m" joint="j" ctrlrange="-0.8 0.8" delay="0.025" nsample="40" interp="linear"/>'
 CASES: dict[str, tuple[Any, ...]] = {
     # what MuJoCo would compute anew from what is corrected, and what it does not copy back
     "friction, geom's size": (DENSE, [], (level(0.2), THICK)),
@@ -172,6 +173,7 @@ CASES: dict[str, tuple[Any, ...]] = {
     "saturation then a delay between steps": (arm(LIMITED), [CUT, BETWEEN]),
     "a delay between steps then saturation": (arm(LIMITED), [BETWEEN, CUT]),
     "a delay between steps": (arm(LIMITED), [BETWEEN]),
+    "lag, native delay between steps": (arm(MIXING), [LAG]),
     "saturation then offset": (arm(LIMITED), [CUT, OFFSET]),
     "offset then saturation": (arm(LIMITED), [OFFSET, CUT]),
     "a law that reads the command": (arm(), [LAG, ("law_command", ["j", "m"], {"size": 0.3})]),

@@ -132,8 +132,11 @@ def _why_no_log(path: Path) -> str:
 
 
 def _as_seconds(values: NDArray[Any]) -> NDArray[Any]:
-    """Dates become seconds since 1970; all else stays as it is."""
-    return values.astype("datetime64[ns]").astype(np.int64) * 1e-9 if values.dtype.kind == "M" else values
+    """Dates become seconds since 1970, durations seconds; all else stays as it is."""
+    if values.dtype.kind not in "Mm":
+        return values
+    fine = "datetime64[ns]" if values.dtype.kind == "M" else "timedelta64[ns]"
+    return values.astype(fine).astype(np.int64) * 1e-9
 
 
 def broken(path: Path, why: object, advice: str = "copy it again, or leave it out of `logs`") -> InputError:

@@ -15,7 +15,7 @@ from nfc_gym.physics.effects.drive import actuator_places
 from nfc_gym.physics.effects.lookup import Rows, actuator_ids, actuator_names, index, limited
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
-from nfc_gym.physics.effects.ranges import narrow_ranges, range_of
+from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, range_of
 from nfc_gym.physics.recurrence import FORGOTTEN, chased
 
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
@@ -101,6 +101,9 @@ class Lag(_Late):
         clips = [range_of(a, "ctrl") for a in actuators]
         wider = all(r[0] <= low and high <= r[1] for r, (low, high) in zip(clips, nominal, strict=True))
         if any(int(a.dyntype) != _STATELESS for a in actuators) or not wider or self._splits(spec):
+            return False
+        # A delay after it mixes before MuJoCo clips: what is clipped here would then be mixed otherwise.
+        if np.isfinite(self.limits).any() and any(mixes(spec, a) for a in actuators):
             return False
         narrow_ranges(spec, self.where, "ctrl", *self.limits)
         for actuator in actuators:
