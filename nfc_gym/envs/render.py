@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.physics.parameters import numbers
 
 Camera = str | Mapping[str, Any]
 TRACK = "track"  # the camera of each robot's file
@@ -24,7 +25,7 @@ def camera_of(model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
         {"trackbody": name, ...} to follow a body; what is left out is MuJoCo's default.
 
     Raises:
-      InputError: there is no such camera, or no such setting of a free one.
+      InputError: there is no such camera, no such setting of a free one, or one that is none of these.
     """
     view = mujoco.MjvCamera()
     if isinstance(camera, str):
@@ -41,12 +42,30 @@ def camera_of(model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
         if key not in known:
             raise InputError(f"a free camera has no {key!r}; it has {', '.join(known)}")
         if key == "trackbody":
-            view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, model.body(value).id
+            view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, _body(model, value)
         elif key == "lookat":
-            view.lookat[:] = value
+            view.lookat[:] = _finite(value, (3,), "camera's lookat is {!r}, want three finite numbers, (x, y, z) in m")
         else:
-            setattr(view, key, float(value))
+            setattr(view, key, float(_finite(value, (), f"camera's {key} is {{!r}}, want a finite number")))
     return view
+
+
+def _body(model: mujoco.MjModel, name: Any) -> int:
+    try:
+        return model.body(name).id
+    except (KeyError, IndexError, TypeError):
+        names = ", ".join(filter(None, (model.body(k).name for k in range(model.nbody))))
+        raise InputError(f"camera's trackbody is {name!r}, want the name of a body: {names}") from None
+
+
+def _finite(value: Any, shape: tuple[int, ...], message: str) -> NDArray[np.float64]:
+    try:
+        given = numbers(value, "camera")
+    except InputError:
+        given = np.array(np.nan)
+    if given.shape != shape or not np.isfinite(given).all():
+        raise InputError(message.format(value))
+    return given
 
 
 class _Shown:

@@ -1,6 +1,6 @@
 """`Settings`: the arguments that both engines take, checked once."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from typing import Any, Self
@@ -70,8 +70,9 @@ class Settings:
             raise InputError(f"goal_conditioned is {self.goal_conditioned!r}, want True or False")
         if self.goal_conditioned and not kind.place_size:
             raise InputError(f"goal_conditioned: the {kind.name} has no goals to reach")
-        parts = () if isinstance(self.context, str) or not isinstance(self.context, Iterable) else self.context
-        if any(c not in CONTEXT for c in parts) or parts is not self.context:
+        # An iterator would be used up here: whoever made the environment again from its spec would get another one.
+        several = isinstance(self.context, Iterable) and not isinstance(self.context, str | Iterator)
+        if not several or any(c not in CONTEXT for c in self.context):
             raise InputError(f"context is {self.context!r}, want a sequence of: {', '.join(CONTEXT)}")
         require_whole("width", self.width, 1)
         require_whole("height", self.height, 1)
@@ -94,7 +95,8 @@ class Settings:
         """Control steps between two elevation maps, given those a second."""
         if self.elevation_hz is None:
             return 1
-        rate = self.elevation_hz if isinstance(self.elevation_hz, Real) else 0.0
+        hz = self.elevation_hz
+        rate = float(hz) if isinstance(hz, Real) and not isinstance(hz, bool) else 0.0
         period = fps / rate if rate > 0 else 0.0
         if period < 1 or not float(period).is_integer():
             rates = ", ".join(f"{fps / k:g}" for k in (1, 2, 5, 10, 25, 50))

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -27,14 +28,16 @@ class Pool:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.size, int) or self.size < 1:
+        if not _number(self.size, Integral) or self.size < 1:
             raise InputError(f"terrain_pool is {self.size!r}, want a number of maps, 1 or more")
-        if not isinstance(self.seed, int) or self.seed < 0:
+        if not _number(self.seed, Integral) or self.seed < 0:
             raise InputError(f"terrain_seed is {self.seed!r}, want a whole number, 0 or more")
         if self.kind not in terrain.KINDS:
             raise InputError(f"terrain_kind is {self.kind!r}, want one of: {', '.join(terrain.KINDS)}")
-        if not isinstance(self.difficulty, int | float) or not 0 <= self.difficulty <= 1:
+        if not _number(self.difficulty, Real) or not 0 <= self.difficulty <= 1:
             raise InputError(f"difficulty is {self.difficulty!r}, want a number from 0 to 1")
+        for name, kind in (("size", int), ("seed", int), ("difficulty", float)):  # of whatever library
+            object.__setattr__(self, name, kind(getattr(self, name)))
 
     def draw(self, u: float) -> int:
         """Index of the map that a uniform number in [0, 1) picks."""
@@ -46,7 +49,12 @@ class Pool:
         whole = isinstance(value, int | float) and not isinstance(value, bool)
         if not whole or value not in range(self.size):
             raise InputError(f"terrain_id is {index!r}, want a whole number from 0 to {self.size - 1}")
-        return _map(self.kind, float(self.difficulty), self.seed, int(value), self.scale)
+        return _map(self.kind, self.difficulty, self.seed, int(value), self.scale)
+
+
+def _number(value: Any, kind: type) -> bool:
+    """Whether it is one of a kind; a flag is none."""
+    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 @lru_cache(maxsize=_KEPT)

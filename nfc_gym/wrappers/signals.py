@@ -109,7 +109,8 @@ class Channel:
             out = out + self.sd * rng.standard_normal(bias.shape)
         if self.bounded:
             out = np.minimum(np.maximum(out, self.low), self.high)
-        return out.astype(values.dtype if values.dtype.kind == "f" else self.dtype)
+        dtype = values.dtype if values.dtype.kind == "f" else self.dtype
+        return _nearest(out, dtype) if dtype.kind in "iu" else out.astype(dtype)
 
     def _late(self, values: NDArray, again: NDArray[np.bool_] | None) -> NDArray:
         if self.fresh is not None and self.fresh.any() and self.past:
@@ -121,6 +122,15 @@ class Channel:
         if again is None:
             self.past.append(values.copy())
         return self.past[0]
+
+
+def _nearest(values: NDArray, dtype: np.dtype) -> NDArray:
+    """The nearest whole numbers that a type holds: cut off, noise would pull all values down."""
+    info = np.iinfo(dtype)
+    most = float(info.max)
+    if most > info.max:  # 64 bits: the next number that both types hold
+        most = np.nextafter(most, 0.0)
+    return np.clip(np.rint(values), float(info.min), most).astype(dtype)
 
 
 def _rows(mask: NDArray[np.bool_], like: NDArray) -> NDArray[np.bool_]:

@@ -108,6 +108,18 @@ def test_psi_may_leave_the_prior_but_not_physics() -> None:
         ({"reward_type": "dense"}, "reward_type is 'dense', which wants goal_conditioned=True"),
         ({"camera": "front"}, "no camera is called 'front'; the scene has track"),
         ({"camera": -1}, "camera is -1, want the name of one, or a free one's lookat"),
+        ({"camera": {"trackbody": "nope"}}, "trackbody is 'nope', want the name of a body: world, base"),
+        ({"camera": {"trackbody": None}}, "trackbody is None, want the name of a body: world, base"),
+        ({"camera": {"distance": "far"}}, "camera's distance is 'far', want a finite number"),
+        ({"camera": {"azimuth": np.nan}}, "camera's azimuth is nan, want a finite number"),
+        ({"camera": {"lookat": (1, 2)}}, r"camera's lookat is \(1, 2\), want three finite numbers"),
+        ({"elevation_hz": True}, "elevation_hz is True, want 50 divided by a whole number"),
+        ({"terrain_pool": True}, "terrain_pool is True, want a number of maps"),
+        ({"terrain_pool": 2.0}, r"terrain_pool is 2\.0, want a number of maps"),
+        ({"terrain_seed": False}, "terrain_seed is False, want a whole number"),
+        ({"difficulty": True}, "difficulty is True, want a number"),
+        ({"difficulty": np.nan}, "difficulty is nan, want a number from 0 to 1"),
+        ({"context": iter(["psi"])}, "context is <list_iterator .*>, want a sequence of: psi, elevation"),
     ],
 )
 def test_bad_arguments_say_what_is_valid(kwargs: dict[str, Any], message: str) -> None:
@@ -115,6 +127,17 @@ def test_bad_arguments_say_what_is_valid(kwargs: dict[str, Any], message: str) -
         made("nfc_gym/JackalRough-v0", **kwargs)
     with pytest.raises(InputError, match=message.replace("human, ", "")):
         gymnasium.make_vec("nfc_gym/JackalRough-v0", num_envs=2, **(SMALL | kwargs))
+
+
+def test_numbers_of_any_library_are_numbers() -> None:
+    name, plain = "nfc_gym/JackalRough-v0", {"terrain_pool": 4, "terrain_seed": 3, "difficulty": 0.5}
+    given = {"terrain_pool": np.int64(4), "terrain_seed": np.uint8(3), "difficulty": np.float32(0.5)}
+    camera = {"lookat": np.zeros(3), "distance": np.float32(4), "trackbody": "base"}
+    ours = made(name, context=["psi"], elevation_hz=np.float32(25), camera=camera, **given)
+    ours.reset(seed=0)
+    twin = made(name, context=["psi"], **plain)
+    twin.reset(seed=0)
+    assert ours.unwrapped.heightfield is twin.unwrapped.heightfield
 
 
 def test_only_robots_with_goals_are_goal_conditioned() -> None:

@@ -146,6 +146,38 @@ def test_keys_that_are_no_numbers_are_refused() -> None:
         PerturbSignals(Discrete(), {"action": {"sd": 1.0}})
 
 
+class Whole(gym.Env):
+    """Observes one whole number."""
+
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, dtype: type[np.integer], value: int, low: int, high: int) -> None:
+        self.observation_space, self.value = spaces.Box(low, high, (1000,), dtype), value
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        super().reset(seed=seed)
+        return np.full(1000, self.value, self.observation_space.dtype), {}
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.int64])
+def test_whole_numbers_are_rounded(dtype: type[np.integer]) -> None:
+    seen, _ = PerturbSignals(Whole(dtype, 100, 0, 255), {"observation": {"sd": 3.0}}).reset(seed=0)
+    assert seen.dtype == dtype
+    assert abs(seen.mean() - 100) < 0.3
+    for bias, expected in ((0.6, 101), (-0.4, 100), (1e3, 255), (-1e3, 0)):
+        seen, _ = PerturbSignals(Whole(dtype, 100, 0, 255), {"observation": {"bias": bias}}).reset(seed=0)
+        np.testing.assert_array_equal(seen, expected)
+
+
+@pytest.mark.parametrize("dtype", [np.uint64, np.int64, np.int16])
+def test_whole_numbers_stay_in_what_their_type_holds(dtype: type[np.integer]) -> None:
+    info = np.iinfo(dtype)
+    for bias, end in ((1e30, int(info.max)), (-1e30, int(info.min))):
+        env = PerturbSignals(Whole(dtype, 5, int(info.min), int(info.max)), {"observation": {"bias": bias}})
+        seen, _ = env.reset(seed=0)
+        np.testing.assert_allclose(seen.astype(float), float(end), rtol=1e-12)
+
+
 def test_one_bound_is_kept_too() -> None:
     class Below(Plain):
         observation_space = spaces.Box(-np.inf, 1.0, (2,), np.float64)
