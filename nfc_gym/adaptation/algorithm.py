@@ -34,7 +34,7 @@ from nfc_gym.adaptation.optimise import optimise, pi_h_for
 from nfc_gym.adaptation.record import Record, in_words
 from nfc_gym.adaptation.settings import require_number
 from nfc_gym.adaptation.sight import VectorSight
-from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute
+from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute, limited
 from nfc_gym.adaptation.weights import of_weights
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
@@ -57,7 +57,8 @@ class AdaptConfig:
       worlds: N, simulations that are drawn from the belief; so many only that each has steps for several episodes.
         Until its first one has ended a simulation shows but the beginning of what there is to learn.
       steps: control steps of all of them together, after each anomaly.
-      episode: control steps of an episode in them; None is the world's own, or else the simulator's.
+      episode: control steps of an episode in them, and in a world of which no time limit is known; None is the world's
+        own, or else the simulator's.
       hallucinate: train pi_h too, which leans the draws in the policy's favour.
       parts: of the belief, those that are used where it speaks of them; ("psi",) is the paper's "w/o delta fidelity".
         A neural posterior's delta_e is of the ground around the robot, not of a map, and is not used.
@@ -169,6 +170,7 @@ class _Run:
         self.agent, self.world, self.config, self.threads, self.cluster = agent, world, config, threads, cluster
         self.environment = simulator_of(world, environment)
         self.episode = config.episode or episode_of(world, self.environment)
+        self.longest = None if limited(world) else self.episode
         self.settings, self.home = with_task(settings, world), home
         self.detector, self.threshold = opened(detector, threshold)
         self.inference = inference_of(posterior)
@@ -198,7 +200,7 @@ class _Run:
     def execute(self) -> Trajectory:
         """One episode in the world, watched by the detector."""
         seed = mixed(self.config.seed, self.t) % 2**31
-        tau = execute(self.agent, self.world, self.detector, self.threshold, seed)
+        tau = execute(self.agent, self.world, self.detector, self.threshold, seed, self.longest)
         top = float(tau.scores.max())  # over the threshold, where that is a measure of it
         self.now = {"return": tau.total, "length": len(tau), "reached": tau.reached,
                     "score": top / self.threshold if self.threshold > 0 else top}  # fmt: skip

@@ -33,12 +33,14 @@ class Score:
         return found if self.reached is None else found | {"success": float(self.reached.mean())}
 
 
-def evaluate(policy: Callable[[Any], Any], envs: VectorEnv, seed: int = 0) -> Score:
+def evaluate(policy: Callable[[Any], Any], envs: VectorEnv, seed: int = 0, longest: int | None = None) -> Score:
     """One episode in each simulation.
 
     Args:
       policy: observations (n, ...) -> actions (n, k).
       envs: a vector environment without autoreset; environment i begins from seed + i.
+      seed: see above.
+      longest: control steps after which an episode is cut; None leaves that to the environment.
     """
     observation, _ = envs.reset(seed=seed)
     n = envs.num_envs
@@ -52,7 +54,7 @@ def evaluate(policy: Callable[[Any], Any], envs: VectorEnv, seed: int = 0) -> Sc
         if "success" in info:
             goals = True
             reached |= np.asarray(info["success"], bool) & going
-        over = ended | truncated
+        over = ended | truncated | (lengths == longest)
         going &= ~over
         if over.any() and going.any():  # the rest is not counted, but every simulation must be one that may step
             observation, _ = envs.reset(options={"reset_mask": over})

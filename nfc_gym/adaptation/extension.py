@@ -99,6 +99,16 @@ class Extension:
                 f"nominal{said}"
             )
 
+    @property
+    def reads(self) -> set[str]:
+        """The exogenous signals that effects read."""
+        return {name for each in self.found.effects for name in each.effect.signals}
+
+    @property
+    def differs(self) -> bool:
+        """Whether an effect's values differ between conditions."""
+        return any(isinstance(each.effect, Conditioned) for each in self.found.effects)
+
     def _bound(self, each: Named, condition: str | None) -> Bound:
         effect, theta, low, high = each.effect, each.theta, each.low, each.high
         if isinstance(effect, Conditioned):
@@ -214,6 +224,17 @@ class Extension:
             return envs
         values = [_drawn(theta, low, high, (e.low, e.high), vary, n, rng) for e, theta, low, high in acting]
         return VectorApplyEffects(envs, [(e, t) for e, t, *_ in acting], self.signals, values=values)
+
+
+def require_read(extensions: Sequence[Extension], condition: str | None, signals: Mapping[str, float] | None) -> None:
+    """Raises `InputError` where a condition or a signal is given and none of the effects asks for it."""
+    read = set().union(*(x.reads for x in extensions))
+    unread = [name for name in signals or {} if name not in read]
+    if unread:
+        known = ", ".join(sorted(read)) or "none"
+        raise InputError(f"--signal {unread[0]}: no effect reads it, leave it out; signals that are read: {known}")
+    if condition is not None and not any(x.differs for x in extensions):
+        raise InputError(f"--condition {condition}: no effect differs between conditions, leave it out")
 
 
 def _drawn(

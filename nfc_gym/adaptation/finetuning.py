@@ -67,6 +67,11 @@ class FineTuneConfig:
         object.__setattr__(self, "vary", require_number("vary", self.vary, 0, 10, "a multiple of the intervals"))
 
 
+def whole_episode(config: FineTuneConfig, environment: str) -> int:
+    """Control steps of the episodes that judge."""
+    return config.episode or gymnasium.spec(environment).max_episode_steps or 1000
+
+
 class FineTuning:
     """A run of fine-tuning, on the task that the policy was trained to do.
 
@@ -93,7 +98,7 @@ class FineTuning:
         self.settings = policy.settings(extension.environment)
         recipe = recipe_of(extension.environment, **self.settings)
         self.ppo = replace(recipe.ppo, rate=_RATE, together=_TOGETHER)
-        self.whole = config.episode or gymnasium.spec(extension.environment).max_episode_steps or 1000
+        self.whole = whole_episode(config, extension.environment)
         self.episode = min(recipe.episode, self.whole)
         self.network = policy.network
         self.device = self.network.scale.mean.device

@@ -54,8 +54,8 @@ def simulator_of(world: Any, environment: str | None) -> str:
 
 def episode_of(world: Any, environment: str) -> int:
     """Control steps of a world's episode, or else of its simulator's."""
-    spec = getattr(world, "spec", None) or gymnasium.spec(environment)
-    return spec.max_episode_steps or 1000
+    specs = (getattr(world, "spec", None), gymnasium.spec(environment))
+    return next((s.max_episode_steps for s in specs if s is not None and s.max_episode_steps), 1000)
 
 
 def with_task(settings: Mapping[str, Any], world: Any) -> dict[str, Any]:

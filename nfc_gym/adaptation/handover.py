@@ -23,8 +23,8 @@ from rich.console import Console
 
 from nfc_gym.adaptation.evaluate import Score, evaluate
 from nfc_gym.adaptation.extended import read_found
-from nfc_gym.adaptation.extension import Bound, Extension
-from nfc_gym.adaptation.finetuning import FineTuneConfig, FineTuning
+from nfc_gym.adaptation.extension import Bound, Extension, require_read
+from nfc_gym.adaptation.finetuning import FineTuneConfig, FineTuning, whole_episode
 from nfc_gym.adaptation.handover_page import render
 from nfc_gym.adaptation.policy import Policy, load_policy
 from nfc_gym.adaptation.record import Record
@@ -77,7 +77,8 @@ def hand_over(
 
     Raises:
       InputError: a policy of another robot; effects of another robot, or none at all; values that are not finite; a
-        `world` of another task; a folder that holds something else, or another run.
+        condition or a signal that no effect asks for; a `world` of another task; a folder that holds something else, or
+        another run.
     """
     require_whole("episodes", episodes, 2)  # each return is given an interval
     began, name = time.monotonic(), full_id(environment)
@@ -87,6 +88,8 @@ def hand_over(
     start = load_policy(name if policy is None else policy, device_of(device))
     shape = {"threads": threads, "episode": config.episode, "settings": start.settings(name)}
     truth = _truth(world, name, condition, signals, shape)
+    models = [extension] if truth is None or truth.extension is None else [extension, truth.extension]
+    require_read(models, condition, signals)
     _require_fit(start, name)
     folder = Path(out)
     _require_own(folder)
@@ -110,11 +113,12 @@ def hand_over(
 
 @dataclass
 class _Truth:
-    """What plays the real machine, what it is called, and what tells it from another."""
+    """What plays the real machine, what it is called, what tells it from another, and what was found if it is that."""
 
     name: str
     envs: World
     key: str
+    extension: Extension | None = None
 
 
 def _truth(
@@ -130,7 +134,7 @@ def _truth(
         called = getattr(world, "__qualname__", type(world).__qualname__)
         return _Truth(called, world, _FUNCTION)
     extension = Extension(read_found(world), name, condition=condition, signals=signals)
-    return _Truth(str(world), partial(extension.envs, **shape), extension.found.digest)
+    return _Truth(str(world), partial(extension.envs, **shape), extension.found.digest, extension)
 
 
 def _require_fit(policy: Policy, environment: str) -> None:
@@ -260,7 +264,9 @@ class _Run:
             self.record.line(f"judging over {self.episodes} episodes: {label}, {world}")
             envs = VectorSight(make(self.episodes), self.start.sight)
             self._require_task(world, envs)
-            self.scores[key] = evaluate(policy, envs, seed=mixed(self.config.seed, _JUDGED) % 2**31)
+            # A function's world may have no time limit.
+            longest = whole_episode(self.config, self.extension.environment)
+            self.scores[key] = evaluate(policy, envs, mixed(self.config.seed, _JUDGED) % 2**31, longest)
             envs.close()
             kept = {"of": self._key, "scores": {k: to_plain(s) for k, s in self.scores.items()}}
             write_whole(self.folder / KEPT, json.dumps(kept))

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
+import gymnasium
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
@@ -150,7 +152,21 @@ def threshold_of(nominal: Iterable[Trajectory], rate: float) -> Threshold:
     return threshold_at([float(t.scores.max()) for t in nominal], rate, "trajectories")
 
 
-def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: float, seed: int) -> Trajectory:
+def limited(world: Any) -> bool:
+    """Whether it is known that a world's episodes end in time: its spec says so, or a `TimeLimit` around it."""
+    spec = getattr(world, "spec", None)
+    if spec is not None and (spec.max_episode_steps or 0) > 0:
+        return True
+    while isinstance(world, gymnasium.Wrapper):
+        if isinstance(world, TimeLimit):
+            return True
+        world = world.env
+    return False
+
+
+def execute(
+    policy: Callable[[Any], Any], world: Any, detector: Any, threshold: float, seed: int, longest: int | None = None
+) -> Trajectory:
     """One episode.
 
     Args:
@@ -159,13 +175,19 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
       detector: scores transitions (`nfc_gym.wrappers.Detector`).
       threshold: from which score on one is anomalous.
       seed: of the episode.
+      longest: control steps after which it is cut; None leaves that to the world.
 
     An episode that ends by itself, its goal not reached, before the detector has scored anything is anomalous: who
     falls at once was never found to be normal.
 
     Raises:
-      InputError: the observation lacks `proprio`; a score or a reward is no number.
+      InputError: the observation lacks `proprio`; a score or a reward is no number; nothing says when to end.
     """
+    if longest is None and getattr(world, "spec", None) is not None and not limited(world):
+        raise InputError(
+            "adapt: the world has no time limit, its episode may never end: make it with max_episode_steps, or give "
+            "`longest`, control steps after which it is cut"
+        )
     observation, _ = world.reset(seed=seed)
     detector.reset()
     states, estimate = [_proprio(observation)], [_estimate(world)]
@@ -187,7 +209,7 @@ def execute(policy: Callable[[Any], Any], world: Any, detector: Any, threshold: 
         states.append(_proprio(after))
         estimate.append(_estimate(world))
         reached |= bool(info.get("success", False))
-        observation, over = after, bool(ended or truncated)
+        observation, over = after, bool(ended or truncated) or len(actions) == longest
     if ended and not reached and not np.any(scores):
         scores[-1] = threshold
     elevation = np.asarray(observation.get("elevation", np.zeros((0, 0))), float)

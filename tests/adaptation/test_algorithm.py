@@ -23,10 +23,11 @@ from nfc_gym.adaptation import AdaptConfig, Agent, FineTuneConfig, adapt, load_p
 from nfc_gym.adaptation.agent import OffPolicyConfig
 from nfc_gym.adaptation.beliefs import Fixed
 from nfc_gym.adaptation.choice import Choice
+from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.network import ActorCritic
 from nfc_gym.adaptation.policy import Policy
 from nfc_gym.adaptation.sight import Sight
-from nfc_gym.adaptation.trajectory import Trajectory
+from nfc_gym.adaptation.trajectory import Trajectory, execute
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.envs.single import RobotEnv
 from nfc_gym.wrappers import RandomizePsi
@@ -166,6 +167,34 @@ def test_settings_of_the_simulator_that_are_left_out_are_another_run(jackal: Pat
         with pytest.raises(InputError, match=rf"of another run \(difficulty 0\.9, now not given{told}\)"):
             run(now, 2)
     assert len(run(given, 2).history) == 2
+
+
+def endless(named: bool = True) -> gym.Env:
+    """A world whose episodes nothing ends."""
+    if not named:
+        return RobotEnv("nfc_gym.envs.jackal:Jackal", context=["psi"])
+    return RandomizePsi(gym.make("nfc_gym/JackalFlat-v0", context=["psi"], max_episode_steps=-1), 0.5)
+
+
+@pytest.mark.parametrize(("named", "episode", "length"), [(True, 7, 7), (False, 7, 7), (True, None, 1000)])
+def test_a_world_without_a_time_limit_has_episodes_of_the_simulators_length(
+    jackal: Path, named: bool, episode: int | None, length: int
+) -> None:
+    config, agent = replace(CONFIG, missions=1, episode=episode), ppo_agent(load_policy(jackal))
+    done = adapt(agent, endless(named), belief(), Alarm(None), config=config, environment="JackalFlat")
+    assert len(done.dataset[0]) == length
+    assert not done.dataset[0].ended
+
+
+def test_an_episode_that_nothing_would_end_is_not_begun() -> None:
+    with pytest.raises(InputError, match="the world has no time limit, its episode may never end"):
+        execute(lambda o: np.zeros(2), endless(), Alarm(None), 1.0, 0)
+    assert len(execute(lambda o: np.zeros(2), endless(), Alarm(None), 1.0, 0, longest=3)) == 3
+    assert len(execute(lambda o: np.zeros(2), gym.wrappers.TimeLimit(endless(), 4), Alarm(None), 1.0, 0)) == 4
+    envs = gym.make_vec(
+        "nfc_gym/JackalFlat-v0", num_envs=2, context=["psi"], autoreset_mode="Disabled", max_episode_steps=-1
+    )
+    assert evaluate(lambda o: np.zeros((2, 2)), envs, longest=5).lengths.tolist() == [5, 5]
 
 
 @pytest.mark.parametrize(

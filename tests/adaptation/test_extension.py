@@ -12,7 +12,7 @@ from scipy import stats
 
 from nfc_gym import assets
 from nfc_gym.adaptation.extended import Calibrated, Found, read_found
-from nfc_gym.adaptation.extension import Extension
+from nfc_gym.adaptation.extension import Extension, require_read
 from nfc_gym.core.errors import InputError
 
 WHEELS = ["front_left", "front_right", "rear_left", "rear_right"]
@@ -179,6 +179,17 @@ def test_signals_and_conditions_must_be_said(tmp_path: Path) -> None:
         found_in(write(tmp_path / "b", [wind]))
     (effect,) = found_in(write(tmp_path / "b", [wind]), condition="gale").effects
     np.testing.assert_array_equal(effect.theta, [5.0, 5.0, 5.0, 1.0])
+    supply = {"exo:supply": 20.0}
+    read, windy = found_in(tmp_path / "a", signals=supply), found_in(tmp_path / "b", condition="gale")
+    require_read([read, windy], "gale", supply)  # of two models it will do if one asks for it
+    with pytest.raises(
+        InputError, match="exo:foo: no effect reads it, leave it out; signals that are read: exo:supply"
+    ):
+        require_read([read], None, {**supply, "exo:foo": 3.0})
+    with pytest.raises(InputError, match="signals that are read: none"):
+        require_read([windy], "gale", supply)
+    with pytest.raises(InputError, match="--condition gale: no effect differs between conditions, leave it out"):
+        require_read([read], "gale", supply)
 
 
 def lost(**fraction: float) -> dict[str, Any]:

@@ -122,7 +122,8 @@ def test_a_true_world_is_judged_in_and_not_learned_from(tmp_path: Path, result: 
     assert report["returns"]["extended"] == first["returns"]["extended"]
     assert report["returns"]["world"]["after"] != report["returns"]["extended"]["after"]
     assert "not of the machine" not in (out / "report.html").read_text()
-    plain = handed(result, out, jackal, steps=512, world=lambda n: vector_env("JackalFlat", n, threads=1, episode=40))
+    # A function's world without a time limit is judged in over episodes of the same length.
+    plain = handed(result, out, jackal, steps=512, world=lambda n: vector_env("JackalFlat", n, threads=1, episode=-1))
     assert plain["returns"]["world"] == plain["returns"]["nominal"]
 
 
@@ -220,6 +221,8 @@ def test_another_condition_or_signal_is_another_run(tmp_path: Path, jackal: Path
         ({"environment": "AntFlat"}, "the policy is of JackalFlat-v0 and cannot act in AntFlat-v0"),
         ({"environment": "Jackal"}, "no environment 'Jackal'"),
         ({"policy": "none.safetensors"}, "no such file"),
+        ({"signals": {"exo:foo": 3.0}}, "--signal exo:foo: no effect reads it"),
+        ({"condition": "calm"}, "--condition calm: no effect differs between conditions"),
         ({"episodes": 1}, "episodes is 1, want a whole number, 2 or more"),
     ],
 )
