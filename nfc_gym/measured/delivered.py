@@ -8,7 +8,8 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from nfc_gym.measured.instant import Track
-from nfc_gym.physics.activations import LED_BY, Activations, delayed_course, longest_delay
+from nfc_gym.physics.activations import LED_BY, Activations
+from nfc_gym.physics.delays import delayed_course, longest_delay
 from nfc_gym.physics.effects.base import Effect, overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import split_field

@@ -14,7 +14,7 @@ from nfc_gym.measured.delivered import Delivered, delivered
 from nfc_gym.measured.instant import InstantProblem, Track
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.physics.acting import Acting
-from nfc_gym.physics.activations import fill_delays, longest_delay
+from nfc_gym.physics.delays import fill_delays, longest_delay
 from nfc_gym.physics.effects.base import overrides
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.rollout import Plant

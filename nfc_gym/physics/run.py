@@ -13,7 +13,8 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from nfc_gym.physics.acting import Acting
-from nfc_gym.physics.activations import Activations, delayed, fill_delays, longest_delay
+from nfc_gym.physics.activations import Activations
+from nfc_gym.physics.delays import delayed, fill_delays, longest_delay
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.sensors import true_state
 from nfc_gym.physics.fields import ModelFields
