@@ -1,5 +1,6 @@
 """`MonitorAnomaly`: a detector that watches the transitions, and what it thinks of them in `info`."""
 
+import copy
 import os
 from collections.abc import Callable
 from numbers import Real
@@ -168,7 +169,8 @@ class VectorMonitorAnomaly(VectorEnvWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the detector of the same rows too."""
-        observation, info = self.env.reset(seed=seed, options=options)
+        # A copy: Gymnasium's own take the mask out of what they are given.
+        observation, info = self.env.reset(seed=seed, options=copy.copy(options))
         new = self.rows.reset(options)
         self.detector.reset(None if new.all() else new)
         self._last = observation

@@ -68,6 +68,17 @@ def test_rows_are_scored_together_and_forgotten_alone() -> None:
     assert info["_anomaly"].all()
 
 
+def test_rows_that_are_not_reset_are_remembered() -> None:
+    detector = Jump()
+    mode = gym.vector.AutoresetMode.DISABLED
+    env = VectorMonitorAnomaly(gym.vector.SyncVectorEnv([Leaping, Leaping], autoreset_mode=mode), detector)
+    env.reset()
+    options = {"reset_mask": np.array([True, False])}
+    env.reset(options=options)
+    assert detector.seen == [("reset", None), ("reset", [True, False])]
+    assert options["reset_mask"].tolist() == [True, False]
+
+
 def test_a_detector_in_a_file_is_opened_by_its_suffix(tmp_path) -> None:
     register_loader(".jump", lambda path: Jump())  # type: ignore[arg-type,return-value]
     path = tmp_path / "detector.jump"
