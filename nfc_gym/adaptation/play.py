@@ -1,6 +1,7 @@
 """Watch a policy: episodes in its environment, as a video or a sheet of pictures, and what they came to."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -59,43 +60,50 @@ def play(
     env = gymnasium.make(name, context=context, **look, **loaded.settings(name))
     loaded.require(env)
     console = console or Console()
-    found, frames = [], []
+    found: list[dict[str, Any]] = []
     steps = env.spec.max_episode_steps if env.spec else None
-    with Progress(*Progress.get_default_columns(), console=console, transient=True) as bar:
+    films = path is not None and path.suffix.lower() in VIDEOS
+    every = EVERY_VIDEO if films else EVERY_SHEET
+    with ExitStack() as stack:
+        stack.callback(env.close)
+        frames: list[Frame] = []
+        keep: Callable[[Frame], Any] | None = None if path is None else frames.append
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        if path is not None and films:  # opened first: where nothing can be written it is told before any work
+            keep = stack.enter_context(film(path))
+        bar = stack.enter_context(Progress(*Progress.get_default_columns(), console=console, transient=True))
         for k in range(episodes):
-            keep = path is not None and (k == 0 or path.suffix.lower() in VIDEOS)
-            every = EVERY_VIDEO if path is None or path.suffix.lower() in VIDEOS else EVERY_SHEET
             task = bar.add_task(f"episode {k}", total=steps)
-            score, seen = episode(env, loaded, seed + k, every if keep else 0, partial(bar.advance, task))
+            shown = keep if k == 0 or films else None
+            score = episode(env, loaded, seed + k, every, shown, partial(bar.advance, task))
             bar.remove_task(task)
             found.append(score)
-            frames += seen
             console.print(f"episode {k}: " + ", ".join(f"{key} {value:.4g}" for key, value in score.items()))
-    env.close()
+    if path is not None and not films:
+        sheet(path, frames)
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write = video if path.suffix.lower() in VIDEOS else sheet
-        write(path, frames)
-        console.print(f"{path}: {len(frames)} frames", markup=False, emoji=False)
+        count = sum(-(-score["length"] // every) for score in (found if films else found[:1]))
+        console.print(f"{path}: {count} frames", markup=False, emoji=False)
     return found
 
 
 def episode(
-    env: Any, policy: Policy | Callable[[Any], Any], seed: int, every: int, told: Callable[[], None] = lambda: None
-) -> tuple[dict[str, Any], list[Frame]]:
-    """One episode, and a frame each so many control steps; 0 renders nothing. `told` is called after each step."""
+    env: Any, policy: Policy | Callable[[Any], Any], seed: int, every: int, keep: Callable[[Frame], Any] | None = None,
+    told: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:  # fmt: skip
+    """One episode; `keep` is given a frame each so many control steps, `told` is called after each step."""
     observation, info = env.reset(seed=seed)
-    frames: list[Frame] = []
     total, length, over, reached = 0.0, 0, False, False
     while not over:
-        if every and length % every == 0:
-            frames.append(rendered(env))
+        if keep is not None and length % every == 0:
+            keep(rendered(env))
         observation, reward, ended, truncated, info = env.step(policy(observation))
         total, length, over = total + float(reward), length + 1, bool(ended or truncated)
         reached |= bool(info.get("success", False))
         told()
     score: dict[str, Any] = {"return": total, "length": length}
-    return (score | {"success": reached} if "success" in info else score), frames
+    return score | {"success": reached} if "success" in info else score
 
 
 def rendered(env: Any) -> Frame:
@@ -111,15 +119,21 @@ def rendered(env: Any) -> Frame:
         ) from None
 
 
-def video(path: Path, frames: list[Frame]) -> None:
-    """In real time."""
+@contextmanager
+def film(path: Path) -> Iterator[Callable[[Frame], Any]]:
+    """Takes frames as they come, for a video in real time; what was at `path` stays until the whole of it is there."""
+    part = path.with_name(f".{path.stem}.part{path.suffix}")  # by whose ending the kind of video is told
     code = cv2.VideoWriter.fourcc(*("mp4v" if path.suffix.lower() == ".mp4" else "MJPG"))
-    writer = cv2.VideoWriter(str(path), code, 50.0 / EVERY_VIDEO, (frames[0].shape[1], frames[0].shape[0]))
-    if not writer.isOpened():
-        raise InputError(f"{path}: no video can be written there; try .avi, or a picture (.png)")
-    for frame in frames:
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    writer.release()
+    writer = cv2.VideoWriter(str(part), code, 50.0 / EVERY_VIDEO, _SIZE)
+    try:
+        if not writer.isOpened():
+            raise InputError(f"{path}: no video can be written there; try .avi, or a picture (.png)")
+        yield lambda frame: writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+        writer.release()
+        part.replace(path)
+    finally:
+        writer.release()
+        part.unlink(missing_ok=True)
 
 
 def sheet(path: Path, frames: list[Frame]) -> None:
