@@ -141,7 +141,8 @@ class Bench:
     ) -> RolloutProblem:
         segments, model = self.dataset.mapping.segments, self.plant.model
         length, horizons = (segments.length, segments.horizons) if horizons is None else (horizons[-1], horizons)
-        layout = Layout(length, segments.history, horizons, length, model.opt.timestep, put_off)
+        felt = Activations(model, model.opt.timestep).span
+        layout = Layout(length, segments.history, horizons, length, model.opt.timestep, put_off, felt)
         laws, straight = self.dataset.mapping.servo_laws, self.dataset.mapping.straight
         return RolloutProblem(
             model, logs, states, layout, servos(model, laws), straight, settle=segments.start == "settled"

@@ -99,6 +99,9 @@ def report(
     }
 
 
+_CLEAR = 0.9  # of the calibrated model's chi-squared: what must be left at most where even that is less than noise
+
+
 @dataclass(frozen=True)
 class _Judged:
     """The verdict, and what becomes of the rows of effects that were found.
@@ -139,7 +142,10 @@ def _judge(
     """
     named, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
     generic = found.generic is not None or bool(proposed)
-    seen = gain[1] < 1 or v.chi2("calibrated") > say.null_bound(v)
+    calibrated, bound = v.chi2("calibrated"), say.null_bound(v)
+    # Where less is left than the declared noise would leave, smoothing and rounding have a say in what mends it.
+    most = _CLEAR if calibrated < 2 * float(v.null.mean()) - bound else 1.0
+    seen = gain[1] < most or calibrated > bound
     verdict, taken = say.verdict(v, len(named) if seen else 0, generic and seen), say.taken_away(v, errors)
     # What is weak predicts, and stays in the model; that it is the cause of what is missing is not shown.
     every = [r | {"nearest": True, "alike": found.doubted.get(r["id"], [])} for r in named]

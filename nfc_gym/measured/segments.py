@@ -36,6 +36,8 @@ class Layout:
       stride: s between starts; the length where segments follow each other.
       dt: physics step, s.
       put_off: whether a start waits until no command steps beside it; not where states are known and not estimated.
+      unknown: s from a log's beginning in which commands before it, of which it does not tell, are still felt; no
+        segment starts there, short of half the log.
     """
 
     length: float
@@ -44,6 +46,7 @@ class Layout:
     stride: float
     dt: float
     put_off: bool = True
+    unknown: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,8 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
     which, starts, samples, steps = [], [], [], []
     for i, log in enumerate(logs):
         last = log.time[-1] - max(layout.horizons) + 0.5 * log.interval
-        calm, late = _calm(log), 0.0
+        calm, told = _calm(log), log.inputs.time[0] < log.time[0]
+        late = 0.0 if told or not layout.put_off else min(layout.unknown, max(last, 0.0) / 2)
         for count in itertools.count():
             begin = count * layout.stride + late
             if begin > last + 1e-9:

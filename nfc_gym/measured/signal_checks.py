@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 MANY_TURNS = 4 * np.pi  # rad; a joint that goes further may be in degrees, unless it is a wheel
 
 _RUNS = 20  # changes of a value from which on it is told whether they come at a beat
+_TOUCHES = (int(mujoco.mjtSensor.mjSENS_TOUCH), int(mujoco.mjtSensor.mjSENS_CONTACT))
 _ALIKE = 0.8  # share of them that are as many rows apart: an encoder's steps are not
 
 
@@ -30,7 +31,7 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
     for name, values in log.controls.items():
         yield from _command(name, values, None if name in log.servo else model)  # a servo's goal is no ctrl
     for name, channel in log.channels.items():
-        yield from _any_channel(name, channel, mapping)
+        yield from _any_channel(name, channel, mapping, model)
         yield from _held(name, channel, log)
         parsed = parse_channel(name)
         if parsed.kind == "joint" and parsed.quantity == "pos" and channel.unit == "rad":
@@ -136,7 +137,15 @@ def _held(name: str, channel: Channel, log: Log) -> Iterator[Suspicion]:
         yield Suspicion("warning", f"channels.{name}", "held", message, f"say `rate: {hertz:.4g}`")
 
 
-def _any_channel(name: str, channel: Channel, mapping: Mapping) -> Iterator[Suspicion]:
+def _touches(name: str, model: mujoco.MjModel | None) -> bool:
+    """Whether a channel is that of a touch sensor, which is 0 wherever nothing presses on it."""
+    if model is None or not name.startswith("sensor:"):
+        return False
+    at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name.removeprefix("sensor:"))
+    return at >= 0 and int(model.sensor_type[at]) in _TOUCHES
+
+
+def _any_channel(name: str, channel: Channel, mapping: Mapping, model: mujoco.MjModel | None) -> Iterator[Suspicion]:
     where = f"channels.{name}"
     columns = mapping.channels[name].columns
     values = channel.values.reshape(len(channel.values), -1)
@@ -147,6 +156,10 @@ def _any_channel(name: str, channel: Channel, mapping: Mapping) -> Iterator[Susp
         )
         return
     still = np.flatnonzero(np.ptp(compared, axis=0) == 0)
+    if _touches(name, model) and not (compared.any() and len(still)):
+        if len(still):
+            yield Suspicion("note", where, "untouched", "0 throughout: nothing touches it", "")
+        return
     if len(still) == values.shape[1]:
         message = f"constant ({', '.join(f'{v:g}' for v in compared[0])})"
         yield Suspicion("warning", where, "constant", message, "name the right column, or leave the channel out")

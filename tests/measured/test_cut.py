@@ -1,6 +1,7 @@
 """Where segments begin and what they are compared at: within the log, at a sample beside the start."""
 
 import time
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -49,6 +50,16 @@ def test_every_segment_holds_a_sample_beside_its_start(interval: float, jitter: 
 def test_segments_follow_each_other_to_the_end() -> None:
     np.testing.assert_array_equal(cut([log(0.01, 121)], LAYOUT).start, [0, 40, 80])
     np.testing.assert_array_equal(cut([log(0.01, 120)], LAYOUT).start, [0, 40])
+
+
+def test_no_start_lies_where_commands_before_the_log_are_felt() -> None:
+    """Short of half of a log; of a part of one, what came before is known."""
+    late = replace(LAYOUT, unknown=0.25)
+    one = log(0.01, 201)
+    np.testing.assert_array_equal(cut([one], late).start, [25, 65, 105, 145])
+    np.testing.assert_array_equal(cut([one], replace(LAYOUT, unknown=9.0)).start, [81, 121, 161])
+    part = one.part(100, 201, "run@verify")
+    np.testing.assert_array_equal(cut([part], late).start, cut([part], LAYOUT).start)
 
 
 def stepping(interval: float = 0.01, rows: int = 240, every: float = 0.4, until: float = np.inf) -> Log:

@@ -51,6 +51,11 @@ def test_where_nothing_is_seen_to_be_missing_what_makes_no_sure_difference_is_no
     assert judged(1.05, 4.9, gain=(0.75, 1.0006)).claimed == judged(1.0, 4.9, gain=(0.6, 0.99)).claimed == ROWS[:1]
 
 
+def test_where_less_is_left_than_noise_would_leave_a_claim_must_mend_a_tenth_of_it() -> None:
+    assert judged(0.2, 4.9, gain=(0.85, 0.95)).claimed == []
+    assert judged(0.2, 4.9, gain=(0.6, 0.85)).claimed == ROWS[:1]
+
+
 def test_one_guess_among_several_is_no_cause() -> None:
     alike = ["gain:rotor", "payload:base"]
     beside = {"id": "delay:rotor", "share_of_excess": 0.6}

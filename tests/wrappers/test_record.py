@@ -22,13 +22,13 @@ from nfc_gym.physics.state import rotate
 from nfc_gym.wrappers import ApplyEffects, Hallucinate, RecordLog, VectorRecordLog
 
 
-def _drive(env: gym.Env, episodes: int, steps: int) -> None:
+def _drive(env: gym.Env, episodes: int, steps: int, most: float = 0.5) -> None:
     rng = np.random.default_rng(0)
     for seed in range(episodes):
         env.reset(seed=seed)
         for k in range(steps):
             if k % 10 == 0:
-                action = rng.uniform(-0.5, 0.5, env.action_space.shape)
+                action = rng.uniform(-most, most, env.action_space.shape)
             _, _, ended, truncated, _ = env.step(action)
             if ended or truncated:
                 break
@@ -86,11 +86,14 @@ def test_an_accelerometer_shows_the_command_of_its_own_step(tmp_path: Path) -> N
         np.testing.assert_allclose(table["sensor:a"][:, 0], [0, 0.5, 1.5, -1], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["Ant-v5", "nfc_gym/JackalFlat-v0", "nfc_gym/AntRough-v0"])
+@pytest.mark.parametrize(
+    "name",
+    ["Ant-v5", *(f"nfc_gym/{robot}-v0" for robot in ("JackalFlat", "AntRough", "QuadcopterFlat", "QuadrupedFlat"))],
+)
 def test_a_recorded_log_passes_the_check(name: str, tmp_path: Path) -> None:
     kwargs = {"terrain_pool": 1} if "Rough" in name else {}
     env = RecordLog(gym.make(name, max_episode_steps=80, **kwargs), tmp_path)
-    _drive(env, 4, 80)
+    _drive(env, 4, 80, 0.1 if "Quadcopter" in name else 0.5)  # what flies must not fall
     assert len(list(tmp_path.glob("episode_*.parquet"))) == 4
     findings = check(tmp_path / "mapping.yaml")
     assert [f for f in findings if f.severity == "error"] == []
