@@ -84,7 +84,7 @@ class Activations:
 
         Args:
           settle: the commands have been held for ever; integrators stay as they are.
-          dt: of this step, s; default as of all.
+          dt: of a coarse step before the history, s, in which integrators stay as they are; default as of all.
         """
         if not self:
             return
@@ -93,7 +93,8 @@ class Activations:
         if not settle:
             keep = self._keep if dt is None else np.exp(-dt / self._late)
             new[..., :cut] += keep * (old[..., :cut] - wish[..., :cut])
-        new[..., cut:] = old[..., cut:] if settle else old[..., cut:] + (dt or self._dt) * wish[..., cut:]
+        still = settle or dt is not None
+        new[..., cut:] = old[..., cut:] if still else old[..., cut:] + self._dt * wish[..., cut:]
         act[..., self._at] = np.clip(new, *self._bound)
 
     def course(self, ctrl: Array) -> Array:
