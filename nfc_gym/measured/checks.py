@@ -128,9 +128,10 @@ def _copies(dataset: Dataset) -> list[Finding]:
     """Logs that are the same one twice: what was fitted to would then verify itself."""
     first: dict[bytes, str] = {}
     for log in dataset.logs:
-        values = [log.time, *log.controls.values(), *(c.values for c in log.channels.values())]
-        content = hashlib.sha256(b"".join(np.ascontiguousarray(v).tobytes() for v in values)).digest()
-        other = first.setdefault(content, log.name)
+        content = hashlib.sha256()
+        for values in (log.time, *log.controls.values(), *(c.values for c in log.channels.values())):
+            content.update(np.ascontiguousarray(values))
+        other = first.setdefault(content.digest(), log.name)
         if other != log.name:
             message = f"log {log.name!r} holds the same as {other!r}: one that fits may verify itself"
             return [Finding("warning", "logs", message, "leave one of them out")]
