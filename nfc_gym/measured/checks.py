@@ -130,7 +130,7 @@ def _copies(dataset: Dataset) -> list[Finding]:
     for log in dataset.logs:
         content = hashlib.sha256()
         for values in (log.time, *log.controls.values(), *(c.values for c in log.channels.values())):
-            content.update(np.ascontiguousarray(values))
+            content.update(np.ascontiguousarray(values).data)
         other = first.setdefault(content.digest(), log.name)
         if other != log.name:
             message = f"log {log.name!r} holds the same as {other!r}: one that fits may verify itself"
