@@ -4,7 +4,8 @@ Measured signals are interpolated linearly, orientations by slerp, commands held
 says linear. A gap longer than `GAP` of a stream's own sampling intervals is not bridged: rows inside it are NaN. Of a
 sensor that is slower than the base only the row nearest to each of its samples is kept, so that one sample counts once.
 Rows that some stream does not reach are cut off at both ends. A channel's `shift` is taken from its stamps before all
-that. All of it is told by `Alignment`, nothing is guessed.
+that. All of it is told by `Alignment`, nothing is guessed. A stream whose clock was set back while it was recorded is
+refused: sorted by its stamps, two stretches of it would lie in each other.
 """
 
 from collections.abc import Sequence
@@ -14,11 +15,20 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.core import InputError
+from nfc_gym.core import InputError, units
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.readers import Stream, Streams, Table
-from nfc_gym.measured.resampling import Clock, flagged, held, interpolated, lateness, nearest_rows
+from nfc_gym.measured.resampling import (
+    Clock,
+    flagged,
+    held,
+    interpolated,
+    lateness,
+    nearest_rows,
+    set_back,
+    wandering,
+)
 
 Array = NDArray[np.float64]
 How = Literal["linear", "hold", "slerp", "both"]
@@ -38,6 +48,7 @@ class Use:
       shift: s by which their stamps are late.
       rate: Hz at which they are renewed where they are held between rows, if that was declared.
       beside: the channel's columns that a shifted mask is of; it moves with them if it has their clock.
+      turn: of angles, a full turn in the unit of the columns.
     """
 
     columns: tuple[str, ...]
@@ -46,6 +57,7 @@ class Use:
     shift: float = 0.0
     rate: float | None = None
     beside: tuple[str, ...] = ()
+    turn: float | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +74,7 @@ class Resampled:
       kept: share of the base's rows that carry a sample of a sensor slower than the base; else 1.
       late: s, by which a held command comes after its stamp, on average: it waits for the base's next row.
       longest: s, the longest pause in it.
+      silent: s, for which commands that come at a beat otherwise stayed away, and the last was held; 0 if they did not.
       repeated, disordered: samples with a stamp that another has, and those that came before an earlier one.
       shift: s that were taken from its stamps.
     """
@@ -76,6 +89,7 @@ class Resampled:
     kept: float
     late: float
     longest: float
+    silent: float
     repeated: int
     disordered: int
     shift: float
@@ -94,6 +108,7 @@ class Alignment:
       rates: measured columns that are NaN in some rows, in gaps or between a slow sensor's samples -> Hz of those.
       ahead: s by which the stamps of a stream, its shift taken out, lie after its receipt, if they do, which two right
         clocks cannot show.
+      wandering: s by which the stamps of a stream move against its receipt in the course of the log.
       cut: s that were cut off at the start and at the end, as some stream does not reach there.
       cutters: the streams that decided where.
     """
@@ -104,6 +119,7 @@ class Alignment:
     resampled: tuple[Resampled, ...]
     rates: dict[str, float]
     ahead: dict[str, float]
+    wandering: dict[str, float]
     cut: tuple[float, float]
     cutters: tuple[str, str]
 
@@ -118,7 +134,8 @@ def uses(mapping: Mapping) -> list[Use]:
     found = [Use(c.columns, "hold" if c.hold == "zero" else "linear") for c in mapping.controls.values()]
     for name, c in mapping.channels.items():
         how = "slerp" if parse_channel(name).quantity == "quat" else "linear"
-        found.append(Use(c.columns, how, True, c.shift, c.rate))
+        turn = float(units.from_si(2 * np.pi, c.unit)) if c.unit and units.si_unit(c.unit) == "rad" else None
+        found.append(Use(c.columns, how, True, c.shift, c.rate, turn=turn))
         if c.mask:
             mask = Use((c.mask,), "hold")
             found.append(replace(mask, how="both", shift=c.shift, beside=c.columns) if c.shift else mask)
@@ -132,7 +149,8 @@ def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
     """Bring the columns in `uses` to the times of column `time`.
 
     Raises:
-      InputError: `time` is no stream's time, streams have no time in common, or a quaternion's columns several clocks.
+      InputError: `time` is no stream's time, streams have no time in common, a stream's clock was set back, or a
+        quaternion's columns have several clocks.
     """
     _require_present(streams, [time, *(c for use in uses for c in use.columns)])
     found = streams.clock(time)
@@ -143,6 +161,8 @@ def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
     uses = [_own_clock(streams, use) for use in uses]
     owners = [(use, owner) for use in uses if (owner := _owner(streams, use)) is not None]
     others = {_label(s, use): (s, use.shift) for use, s in owners if s is not base or use.shift}
+    if kind == "stamps":
+        _require_forward(streams, base, [s for _, s in owners if s is not base])
     clocks = {n: Clock(streams.seconds(s, kind) - shift) for n, (s, shift) in others.items() if len(s.stamps) > 1}
     holds = {_label(s, use) for use, s in owners if use.how == "hold"}
     rows, cut, cutters = _overlap(base.name, grid, clocks, holds)
@@ -165,8 +185,11 @@ def align(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
             told = Resampled(owner.name, owner.clock if kind == "stamps" else "receive time", use.how, **report)
             done[label, use.how] = max(done.get((label, use.how), told), told, key=lambda r: r.missing)
     clock = base.clock if kind == "stamps" else "receive time"
-    ahead = _ahead([(base, 0.0), *others.values()]) if kind == "stamps" else {}
-    return Alignment(table, base.name, clock, tuple(done.values()), rates, ahead, cut, cutters)
+    ahead, moving = {}, {}
+    if kind == "stamps":
+        ahead = _ahead([(base, 0.0), *others.values()])
+        moving = {s.name: wandering(s.stamps, s.received) for s in (base, *(s for s, _ in others.values()))}
+    return Alignment(table, base.name, clock, tuple(done.values()), rates, ahead, moving, cut, cutters)
 
 
 def _require_present(streams: Streams, names: Sequence[str]) -> None:
@@ -184,6 +207,20 @@ def _owner(streams: Streams, use: Use) -> Stream | None:
             f"columns {', '.join(use.columns)} come from {' and '.join(owners)}; a quaternion needs one clock"
         )
     return next(iter(owners.values()), None)
+
+
+def _require_forward(streams: Streams, base: Stream, others: Sequence[Stream]) -> None:
+    """Refuse streams whose clock was set back; of the base that is told where its time is read."""
+    for stream in others:
+        raw = streams.seconds(stream, "stamps")
+        found = set_back(raw, GAP * Clock(raw).interval)
+        if found is not None:
+            at, seconds = found
+            raise InputError(
+                f"the times of {stream.name} go back by {seconds:.3g} s at its message {at} and stay behind: its clock "
+                f"({stream.clock}) was set meanwhile; cut the recording there, or name '{base.name}.received' as the "
+                "time column, and all are taken as they were received"
+            )
 
 
 def _ahead(used: Sequence[tuple[Stream, float]]) -> dict[str, float]:
@@ -219,7 +256,7 @@ def _single(streams: Streams, time: str, uses: Sequence[Use]) -> Alignment:
             f"{_clocks(streams)}"
         )
     name = "" if base is None else base.name
-    return Alignment(dict(streams), name, time, (), {}, {}, (0.0, 0.0), ("", ""))
+    return Alignment(dict(streams), name, time, (), {}, {}, {}, (0.0, 0.0), ("", ""))
 
 
 def _clocks(streams: Streams) -> str:
@@ -268,14 +305,15 @@ def _bring(
         time, columns = time[there], columns[there]
         interval = float(np.median(np.diff(time)))
     step = float(np.median(np.diff(grid)))
-    gap, late = GAP * interval, 0.0
+    gap, late, silent = GAP * interval, 0.0, 0.0
     fresh = np.ones(len(grid), bool)
     if use.how == "hold":
         values, gap, late = held(time, columns, grid), np.inf, lateness(time, grid)
+        silent = clock.silence(float(grid[-1]), GAP)
     elif use.how == "both":
         values, gap = flagged(time, columns, grid), np.inf
     else:
-        values = interpolated(time, columns, grid, gap, use.how == "slerp")
+        values = interpolated(time, columns, grid, gap, use.how == "slerp", use.turn)
         if use.measured and interval > SLOWER * step:
             fresh = nearest_rows(time, grid)
     missing = float(np.isnan(values[fresh]).any(1).mean()) if fresh.any() else 1.0
@@ -289,6 +327,7 @@ def _bring(
         "kept": float(fresh.mean()),
         "late": late,
         "longest": clock.longest,
+        "silent": silent,
         "repeated": clock.repeated,
         "disordered": clock.disordered,
         "shift": use.shift,

@@ -5,6 +5,13 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+BLOCKS = 10  # stretches of a stream, in each of which some message came without waiting
+EACH = 10  # messages that such a stretch has at least
+BEHIND = 5  # messages in each of two stretches of the same times, which a clock that was set back makes
+SELDOM = 5  # times that a clock is set back at most; two senders of one topic take turns throughout
+BEAT = 0.5, 1.5  # of the usual interval: between these lie nine in ten of a stream that comes at a beat
+WRAP = 0.8, 1.2  # of a full turn: a step between these is an angle that was wrapped
+
 
 class Clock:
     """Times (N,) s of a stream, in order and each once.
@@ -27,6 +34,47 @@ class Clock:
         self.interval = float(np.median(steps)) if steps.size else 0.0
         self.longest = float(steps.max()) if steps.size else 0.0
 
+    def silence(self, until: float, most: float) -> float:
+        """The longest time in s without a sample, up to `until`, of a stream that comes at a beat otherwise.
+
+        Args:
+          most: of its usual intervals; 0 is given for shorter ones, and for a stream that sends when there is need.
+        """
+        steps = np.diff(self.time)
+        if not steps.size or np.mean((steps > BEAT[0] * self.interval) & (steps < BEAT[1] * self.interval)) < 0.9:
+            return 0.0
+        longest = max(self.longest, until - float(self.time[-1]))
+        return longest if longest > most * self.interval else 0.0
+
+
+def set_back(raw: Array, most: float) -> tuple[int, float] | None:
+    """Where times (N,) s go back by more than `most` s and stay behind those before, as of a clock that is set.
+
+    Returns:
+      The first such sample and by how much, s; None where samples merely overtake each other or two senders take turns.
+    """
+    back = np.flatnonzero(np.diff(raw) < -most) + 1
+    if not 0 < len(back) <= SELDOM:
+        return None
+    latest = np.maximum.accumulate(raw)
+    for k in back:
+        after = raw[k : k + BEHIND]
+        if (after < latest[k - 1]).sum() == BEHIND <= (raw[:k] > raw[k]).sum():
+            return int(k), float(raw[k - 1] - raw[k])
+    return None
+
+
+def wandering(stamps: NDArray[np.int64], received: NDArray[np.int64]) -> float:
+    """By how many s the clock of `stamps` (N,) ns moves against that of `received`, in the course of a recording.
+
+    A message may wait, so that of each stretch the one that came soonest tells how the clocks lie.
+    """
+    count = min(BLOCKS, len(stamps) // EACH)
+    if count < 2:
+        return 0.0
+    soonest = [int(part.min()) for part in np.array_split(received - stamps, count)]
+    return (max(soonest) - min(soonest)) * 1e-9
+
 
 def held(time: Array, values: Array, at: Array) -> Array:
     """Samples (N, k) at times (N,) s, each held until the next: (T, k) at times `at`; NaN before the first."""
@@ -45,18 +93,25 @@ def flagged(time: Array, values: Array, at: Array) -> Array:
     return np.where(interpolated(time, values, at, np.inf) == 1, 1.0, 0.0)
 
 
-def interpolated(time: Array, values: Array, at: Array, gap: float, rotation: bool = False) -> Array:
+def interpolated(
+    time: Array, values: Array, at: Array, gap: float, rotation: bool = False, turn: float | None = None
+) -> Array:
     """Samples (N, k) at times (N,) s, interpolated to (T, k) at times `at`; NaN outside and in pauses over `gap` s.
 
     Args:
       rotation: the samples are unit quaternions (either scalar order), interpolated along the shorter arc at constant
         speed (Shoemake, Animating rotation with quaternion curves, SIGGRAPH 1985).
+      turn: of angles, a full turn in their unit. Where one was wrapped the sample before is held: half way between pi
+        and -pi lies 0, where nothing was, and the jump must stay whole to be recognised.
     """
     low = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
     width = time[low + 1] - time[low]
     part = ((at - time[low]) / width)[:, None]
     on_sample = (part == 0) | (part == 1)
     out = (_arc if rotation else _line)(values[low], values[low + 1], part)
+    if turn is not None:
+        step = np.abs(values[low + 1] - values[low]) / turn
+        out = np.where((step > WRAP[0]) & (step < WRAP[1]), values[low], out)
     out = np.where(on_sample, np.where(part == 0, values[low], values[low + 1]), out)
     bridged = on_sample[:, 0] | (width <= gap * (1 + 1e-9))
     return np.where((bridged & (at >= time[0]) & (at <= time[-1]))[:, None], out, np.nan)

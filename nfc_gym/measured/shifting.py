@@ -68,7 +68,7 @@ def _moved(columns: LogColumns, use: Use, stamps: Array, grid: Array) -> Table:
     samples = fresh_samples(stamps, values, use.rate)
     # Pauses are bridged: a longer one than what the log's time may have is refused before, and renewals that repeat a
     # value are not seen.
-    moved = interpolated(stamps[samples], values[samples], grid, np.inf, use.how == "slerp")
+    moved = interpolated(stamps[samples], values[samples], grid, np.inf, use.how == "slerp", use.turn)
     if len(samples) < len(stamps):
         moved[~nearest_rows(stamps[samples], grid)] = np.nan
     ends = np.cumsum([part.shape[1] for part in parts])

@@ -10,6 +10,7 @@ from nfc_gym.measured.findings import Severity, Suspicion
 MANY_MISSING = 0.05  # share of rows in gaps from which on a stream is doubtful
 LATE = 1e-3  # s; commands that come so much later than they were sent look like a delay of the machine
 AHEAD = 1e-3  # s; stamps that lie so much after their receipt are of another clock
+WANDER = 5e-3  # s; the soonest messages of ten stretches of a log differ by less, unless a clock moves
 CUT = 1.0  # s that are cut off at an end, from which on it is told as a warning
 
 
@@ -26,6 +27,20 @@ def stream_notes(alignment: Alignment) -> Iterator[Suspicion]:
                 f"its commands wait {1e3 * r.late:.2g} ms on average for the next row of {alignment.base}, which will "
                 "look like a delay of the machine",
                 f"name {r.stream}.time, or that of a faster stream, as the time column",
+            )  # fmt: skip
+        if r.silent:
+            yield Suspicion(
+                "warning", f"streams.{r.stream}", "silent",
+                f"nothing for {r.silent:.3g} s, where otherwise a sample comes each {1 / r.rate:.3g} s: the last is held",
+                "if samples were lost, and the machine got them, cut the recording there",
+            )  # fmt: skip
+    for name, seconds in alignment.wandering.items():
+        if seconds > WANDER:
+            yield Suspicion(
+                "warning", f"streams.{name}", "wandering",
+                f"its stamps move by {1e3 * seconds:.3g} ms against their receipt in the course of the log: its "
+                "sender's clock drifts or was set, or messages had to wait throughout a part of it",
+                f"synchronise the clocks, or name {alignment.base}.received as the time column; nothing was shifted",
             )  # fmt: skip
     for name, seconds in alignment.ahead.items():
         if seconds > AHEAD:

@@ -149,6 +149,65 @@ def test_stamps_out_of_order_and_repeated_are_sorted_and_counted() -> None:
     assert (clock.repeated, clock.disordered) == (1, 1)
 
 
+def test_a_clock_that_was_set_back_is_refused_and_messages_that_overtake_are_not() -> None:
+    time = np.arange(0, 2, 0.01)
+    late = np.where(time > 1, time - 0.3, time)
+    base, use = stream("/b", time), [Use(("/s.x",), "linear", True)]
+    with pytest.raises(InputError, match=r"times of /s go back by 0\.29 s at its message 101 .*'/b\.received'"):
+        align(Streams([base, stream("/s", late, x=time)]), "/b.time", use)
+    received = Stream("/s", stream("/s", late).stamps, base.stamps, "header.stamp", {"x": time})
+    assert align(Streams([base, received]), "/b.received", use).table["/s.x"] == pytest.approx(time, abs=1e-9)
+    swapped = np.arange(len(time))
+    swapped[50:57] = [56, 50, 51, 52, 53, 54, 55]  # one message came six too soon
+    overtaken = align(Streams([base, stream("/s", time[swapped], x=time[swapped])]), "/b.time", use)
+    np.testing.assert_allclose(overtaken.table["/s.x"], time, atol=1e-9)
+    two = time - np.where(np.arange(len(time)) % 20 == 0, 0, 0.1)  # a slow sender among a fast one's messages
+    assert align(Streams([base, stream("/s", two, x=two)]), "/b.time", use).resampled[0].disordered == 10
+
+
+def test_a_clock_that_moves_against_the_recorders_is_told_and_waiting_messages_are_not() -> None:
+    rng, time = np.random.default_rng(0), np.arange(0, 20, 0.01)
+    wait = 0.002 + rng.exponential(0.01, len(time))
+    received = np.round((time + wait) * NS).astype(np.int64)
+    use = [Use(("/s.x",), "linear", True)]
+
+    def moved(by: np.ndarray) -> float:
+        sensor = Stream("/s", np.round((time + by) * NS).astype(np.int64), received, "header.stamp", {"x": time})
+        return align(Streams([stream("/b", time), sensor]), "/b.time", use).wandering["/s"]
+
+    assert moved(np.zeros(len(time))) < 1e-3
+    assert moved(1e-3 * time) == pytest.approx(0.018, abs=1e-3)  # between the middles of ten stretches
+    assert moved(np.where(time > 13, 0.5, 0)) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_a_wrapped_angle_keeps_its_jump() -> None:
+    time, grid = np.arange(0, 2, 1 / 130), np.arange(0, 1.9, 0.01)
+    angle = np.angle(np.exp(1j * 4 * time))  # through half a turn at 0.785 s
+    table = Streams([stream("/b", grid), stream("/s", time, x=angle, deg=np.rad2deg(angle))])
+    turned = [Use(("/s.x",), "linear", True, turn=2 * np.pi), Use(("/s.deg",), "linear", True, turn=360.0)]
+    found = align(table, "/b.time", turned)
+    for values in (found.table["/s.x"], np.deg2rad(found.table["/s.deg"])):
+        assert np.abs(np.diff(values)).max() == pytest.approx(2 * np.pi, abs=0.1)
+        assert np.abs(values - np.angle(np.exp(1j * 4 * grid)))[np.abs(grid - np.pi / 4) > 0.02].max() < 1e-3
+    shifted_by = [Use(("/s.x",), "linear", True, 0.0123, turn=2 * np.pi)]
+    values = align(table, "/s.time", shifted_by).table[shifted("/s.x", 0.0123)]
+    assert np.abs(np.diff(values)).max() == pytest.approx(2 * np.pi, abs=0.1)
+
+
+def test_commands_that_stay_away_are_told_unless_they_come_when_there_is_need() -> None:
+    grid = np.arange(0, 4, 0.01)
+    use = [Use(("/u.u",), "hold")]
+
+    def silent(sent: np.ndarray) -> float:
+        return align(Streams([stream("/b", grid), stream("/u", sent, u=sent)]), "/b.time", use).resampled[0].silent
+
+    assert silent(grid) == 0
+    assert silent(grid[(grid < 1.005) | (grid > 2.195)]) == pytest.approx(1.2)
+    assert silent(grid[grid < 3.005]) == pytest.approx(0.99)  # till the recording ends
+    assert silent(grid[(grid < 1.005) | (grid > 1.035)]) == 0  # three in a row are no silence
+    assert silent(np.cumsum(np.random.default_rng(0).exponential(0.1, 40))) == 0
+
+
 def test_commands_that_wait_for_the_next_row_are_told() -> None:
     grid, sent = np.arange(0, 2, 0.01), np.arange(0.004, 1.9, 0.01)
     table = Streams([stream("/b", grid), stream("/u", sent, u=sent)])
