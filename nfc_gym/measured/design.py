@@ -134,11 +134,12 @@ class Design:
         walk = cma.CMAEvolutionStrategy(np.zeros(series.size), _STEP, options)
         while done < tries and time.monotonic() - began < budget and not walk.stop():
             z = walk.ask()
-            w = np.stack([series(row) for row in z])
+            w = np.stack([series(row) for row in z[: tries - done]])
             parts = [self.judge(w[i : i + _BATCH], _REPAIR) for i in range(0, len(w), _BATCH)]
             w, _, value, answers = (np.concatenate(p) for p in zip(*parts, strict=True))
-            walk.tell(z, (-value).tolist())
             done += len(w)
+            if len(w) == len(z):  # the last ones may be fewer
+                walk.tell(z, (-value).tolist())
             i = int(value.argmax())
             if value[i] > best.value:
                 best = replace(start, w=w[i], value=float(value[i]), answers=answers[i])

@@ -16,7 +16,7 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.envelope import Envelope, envelope
 from nfc_gym.measured.motions import patterns
-from nfc_gym.measured.room import room
+from nfc_gym.measured.room import Room, let_go, room
 from nfc_gym.measured.segments import commanded, servos
 from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.measured.states import States, channel_noise
@@ -38,7 +38,9 @@ class Stage:
       seconds: length of the proposal.
 
     Attributes:
-      open_loop: False where the resting command does not keep the machine within what was seen.
+      room: what may be commanded; at rest the first command of `start`, or where that drives the machine away, no
+        force and no speed.
+      open_loop: False where neither keeps the machine within what was seen.
       start: the log whose first state a proposal starts from.
       patterns: sets of controls to be moved together, (m, nu) each.
 
@@ -52,17 +54,22 @@ class Stage:
         self.start = logs[int(np.argmin(speeds))]
         self.interval = self.start.interval
         self.time: Array = np.arange(round(seconds / self.interval) + 1, dtype=np.float64) * self.interval
-        self.room = room(bench, logs, self.start)
+        self.room: Room = room(bench, logs, self.start)
         self.envelope: Envelope = envelope(plant.model, [bench.states[log.name] for log in logs])
         moved = [np.stack([log.controls[n] for n in self.room.names], 1) for log in logs]
         self.patterns = patterns(np.concatenate(moved) / np.maximum(self.room.high - self.room.low, 1e-12))
-        idle = np.zeros((1, len(self.time), len(self.room.names)))
-        _, over = self.motion(self.room.commands(idle), [(plant, x)])
-        self.open_loop = bool(over[0] <= 0)
+        resting = next((r for r in (self.room, let_go(bench, self.room)) if self._stays(r)), None)
+        self.open_loop = resting is not None
+        self.room = resting or self.room
         self.allowed = np.zeros(0)
         self.recorded = [] if self.open_loop else _stretch(bench, logs, seconds)
         if not self.open_loop:
             self._require_stands()
+
+    def _stays(self, room: Room) -> bool:
+        """Whether its resting command alone keeps the machine within what was seen."""
+        idle = np.zeros((1, len(self.time), len(room.names)))
+        return bool(self.motion(room.commands(idle), [(self.plant, self.x)])[1][0] <= 0)
 
     def _require_stands(self) -> None:
         """Note how far recorded motion itself oversteps when it is followed segment by segment.

@@ -1,7 +1,7 @@
 """What each actuator may be commanded, in a proposal: its range, and the command at which a recording begins."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
+from nfc_gym.physics.effects.drive import is_position
 from nfc_gym.physics.effects.lookup import actuator_names
 
 Array = NDArray[np.float64]
@@ -32,6 +33,19 @@ class Room:
     def additions(self, w: Array) -> Array:
         """The same as changes to a controller's commands, symmetric about none."""
         return _ADDED * w * (self.high - self.low) / 2
+
+
+def let_go(bench: Bench, room: Room) -> Room:
+    """The same with forces and speeds commanded to 0 at rest; goals of positions stay as they were.
+
+    A log that begins in mid-motion begins with a command that drives.
+    """
+    model, entries = bench.plant.model, bench.dataset.mapping.controls
+    actuators = [actuator_names(model).index(name.removeprefix("ctrl:")) for name in room.names]
+    goal = [
+        entries[name].servo is not None or is_position(model, a) for name, a in zip(room.names, actuators, strict=True)
+    ]
+    return replace(room, rest=np.where(goal, room.rest, np.clip(0.0, room.low, room.high)))
 
 
 def room(bench: Bench, logs: Sequence[Log], start: Log) -> Room:

@@ -181,6 +181,19 @@ POLE = """
 """
 
 
+def test_logs_that_begin_under_a_force_still_get_commands_of_their_own(tmp_path: Path) -> None:
+    def swung(time: np.ndarray, seed: int) -> np.ndarray:
+        return 0.5 * np.cos(6 * time + 0.3 * seed)  # held for ever, the first one would drive the rotor away
+
+    path = record(tmp_path, swung, speed=0.0)
+    result = excite(path, None, tmp_path / "next.csv", seconds=3.0, tries=30, jobs=1)
+    assert result["kind"] == "commands"
+    assert result["tried"] == 30
+    torque = np.loadtxt(tmp_path / "next.csv", delimiter=",", skiprows=1)[:, 1]
+    assert torque[[0, -1]] == pytest.approx(0)
+    assert np.abs(torque).max() > 0.2
+
+
 def test_what_only_a_controller_keeps_upright_gets_a_feed_forward(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(POLE)
     for seed, name in enumerate(("fit_0", "fit_1", "select", "verify")):
