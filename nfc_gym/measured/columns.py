@@ -122,7 +122,9 @@ class LogColumns:
         if values.size == 1:
             return np.full(self.rows, values.item())
         if values.ndim not in (1, 2) or len(values) != self.rows or values.size == 0:
-            raise InputError(f"column {name!r} has shape {values.shape} where time has {self.rows} rows")
+            across = values.ndim == 2 and values.shape[1] == self.rows
+            hint = "; turn it over (transpose it), so that each sample is a row" if across else ""
+            raise InputError(f"column {name!r} has shape {values.shape} where time has {self.rows} rows{hint}")
         return values
 
 

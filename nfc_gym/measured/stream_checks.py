@@ -31,7 +31,7 @@ def stream_notes(alignment: Alignment) -> Iterator[Suspicion]:
         if r.silent:
             yield Suspicion(
                 "warning", f"streams.{r.stream}", "silent",
-                f"nothing for {r.silent:.3g} s, where otherwise a sample comes each {1 / r.rate:.3g} s: the last is held",
+                f"nothing for {r.silent:.3g} s, where a sample came each {1 / r.rate:.3g} s before: the last is held",
                 "if samples were lost, and the machine got them, cut the recording there",
             )  # fmt: skip
     for name, seconds in alignment.wandering.items():

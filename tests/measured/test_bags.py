@@ -211,6 +211,23 @@ def test_a_flipped_bit_is_refused_or_harmless(tmp_path: Path, at: float, bit: in
     assert isinstance(table, Streams)
 
 
+def test_an_mcap_file_of_other_messages_says_so(tmp_path: Path) -> None:
+    path = write_bag(
+        tmp_path / "bag",
+        STORE,
+        {"/u": ("std_msgs/msg/Float64", [(START, make("std_msgs/msg/Float64", data=1.0))])},
+        only=True,
+    )
+    content = path.read_bytes()
+    header = b"\x89MCAP0\r\n\x01"
+    assert content.startswith(header)
+    size = int.from_bytes(content[9:17], "little")
+    foreign = (9).to_bytes(4, "little") + b"protobufs"
+    path.write_bytes(header + (size + 5).to_bytes(8, "little") + foreign + content[17 + 8 :])
+    with pytest.raises(InputError, match="its profile is 'protobufs', and messages of ros2 alone are read"):
+        read_table(path)
+
+
 def test_an_empty_bag_and_an_absent_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     empty = write_bag(tmp_path / "empty", STORE, {"/low": ("machine_msgs/msg/Low", [])})
     with pytest.raises(InputError, match=r"no topic that can be read \(/low: no message was recorded\)"):

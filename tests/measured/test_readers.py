@@ -96,6 +96,7 @@ def test_missing_files_folders_and_unknown_suffixes(tmp_path: Path) -> None:
         ("t,q\n", "no rows under the header"),
         ("t,q\n0,1,2\n1,2,3\n", "more fields than the header names"),
         ("t,q\n0,1\n1,2,3\n", "truncated or not a csv file"),
+        ("t,q,u\n0,1.25,2\n1,1.2", "last row is cut off, '1,1.2' where 3 fields are wanted; remove that row"),
         ("# made by a logger\n# on a Monday\nt,q\n0,1\n", "begins with a comment; the first line must be the columns'"),
     ],
 )
@@ -117,6 +118,42 @@ def test_csv_separators_quotes_and_marks(tmp_path: Path, separator: str) -> None
     assert table["on"][0]
 
 
+def test_csv_that_ends_without_a_line_end_and_names_that_hold_separators(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text('"t, s";"angle, rad, shaft"\n0;1.5\n0.1;2.5')
+    assert read_table(path)["angle, rad, shaft"].tolist() == [1.5, 2.5]
+    path.write_text("t,q,\n0,1.5\n0.1,2.5")  # every row lacks the last field
+    assert read_table(path)["q"].tolist() == [1.5, 2.5]
+
+
+@pytest.mark.parametrize(("encoding", "byte"), [("cp1252", "0xb0"), ("utf-16", "0xff")])
+def test_csv_of_another_encoding_says_so(tmp_path: Path, encoding: str, byte: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes("t;Winkel (°)\n0;1.5\n0.1;2.5\n".encode(encoding))
+    with pytest.raises(InputError, match=rf"is no UTF-8 text \(byte {byte}\); save it with that encoding"):
+        read_table(path)
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".npz"])
+def test_what_nobody_asks_for_is_not_read(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"log{suffix}"
+    columns = {"t": np.arange(4000.0), "q": np.ones((4000, 3)), "picture": np.zeros((4000, 500))}
+    if suffix == ".npz":
+        np.savez(path, **columns)
+    else:
+        lists = {
+            k: v if v.ndim == 1 else pa.FixedSizeListArray.from_arrays(v.ravel(), v.shape[1])
+            for k, v in columns.items()
+        }
+        pq.write_table(pa.table(lists), path)
+    table = read_table(path, names={"t", "q[1]", "qq"})
+    np.testing.assert_array_equal(table["t"], columns["t"])
+    assert table["q"].shape == (4000, 3)
+    assert list(table) == ["t", "q", "picture"]  # the name is there, to be suggested
+    assert table["picture"].size == 0
+    assert read_table(path)["picture"].shape == (4000, 500)
+
+
 def test_pickled_objects_are_not_opened(tmp_path: Path) -> None:
     path = tmp_path / "log.npz"
     np.savez(path, t=np.array([{"a": 1}], object))
@@ -130,9 +167,23 @@ def test_matlab_structs_and_version_7_3(tmp_path: Path) -> None:
     table = read_table(path)
     np.testing.assert_array_equal(table["run.t"], T)
     assert table["run.gain"].item() == 35.15
-    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n")
-    with pytest.raises(InputError, match=r"v7\.3.*'-v7'"):
-        read_table(path)
+    for text in (b"MATLAB 7.3 MAT-file", b"MATLAB 7.0 MAT-file, HDF5 schema 0.05"):
+        path.write_bytes(text.ljust(512, b"\0") + b"\x89HDF\r\n")
+        with pytest.raises(InputError, match=r"v7\.3.*'-v7'"):
+            read_table(path)
+
+
+def test_matlab_arrays_of_structs_as_simulink_writes_them(tmp_path: Path) -> None:
+    path = tmp_path / "log.mat"
+    signals = np.zeros((1, 2), [("values", "O"), ("label", "O")])
+    for i in range(2):
+        signals[0, i] = (i + 1) * Q[:, None], f"scope {i}"
+    scipy.io.savemat(path, {"out": {"time": T[:, None], "signals": signals}})
+    table = read_table(path)
+    np.testing.assert_array_equal(table["out.signals[1].values"], 2 * Q)
+    columns = LogColumns(table)
+    columns.time("out.time")
+    np.testing.assert_array_equal(columns.one("out.signals[0].values"), Q)
 
 
 def test_parquet_lists_are_columns_and_dates_are_seconds(tmp_path: Path) -> None:
@@ -142,6 +193,15 @@ def test_parquet_lists_are_columns_and_dates_are_seconds(tmp_path: Path) -> None
     table = read_table(path)
     assert table["q"].shape == (2, 2)
     assert np.diff(table["t"]).item() == pytest.approx(1.5, abs=1e-6)
+
+
+def test_parquet_rows_without_a_date_or_a_list_are_no_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "log.parquet"
+    stamps = pd.to_datetime(["2024-01-01T00:00:00.25", None, "2024-01-01T00:00:01.75"])
+    pq.write_table(pa.table({"t": stamps, "q": [[1.0, 2.0], [3.0, 4.0], None]}), path)
+    table = read_table(path)
+    assert np.isnan(table["t"]).tolist() == [False, True, False]
+    np.testing.assert_array_equal(table["q"], [[1, 2], [3, 4], [np.nan, np.nan]])
 
 
 def test_a_reader_can_be_added(tmp_path: Path) -> None:
@@ -161,6 +221,8 @@ def test_columns_of_arrays_are_addressed_by_index(values: np.ndarray, k: int) ->
     np.testing.assert_array_equal(columns.product((f"q[{k}]", "gain"), 2.0), values[:, k] * 2.5 * 2.0)
     with pytest.raises(InputError, match="columns 0 to 2"):
         columns.one("q[3]")
+    with pytest.raises(InputError, match=r"shape \(3, 7\) where time has 7 rows; turn it over"):
+        LogColumns({"q": values.T}, 7).one("q")
     with pytest.raises(InputError, match=r"no column 'qq'; valid: t, q, gain|did you mean"):
         columns.one("qq")
 

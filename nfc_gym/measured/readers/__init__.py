@@ -38,16 +38,17 @@ __all__ = [
     "suffixes",
 ]
 
-for _suffix, _reader in (
-    (".csv", read_csv),
-    (".parquet", read_parquet),
-    (".npz", read_npz),
-    (".mat", read_mat),
-    (".ulg", read_ulog),
+for _suffix, _reader, _selective in (
+    (".csv", read_csv, False),
+    (".parquet", read_parquet, True),
+    (".npz", read_npz, True),
+    (".mat", read_mat, False),
+    (".ulg", read_ulog, False),
+    (".db3", read_bag, True),
+    (".mcap", read_bag, True),
+    (".bag", read_bag, True),
 ):
-    register_reader(_suffix, _reader)
-for _suffix in (".db3", ".mcap", ".bag"):
-    register_reader(_suffix, read_bag, selective=True)
+    register_reader(_suffix, _reader, _selective)
 register_folder("metadata.yaml", read_bag, selective=True)
 register_parts(".hdf5", episodes, read_episode)
 for _marker in ("main_data.hdf5", "data/metadata.json"):

@@ -1,12 +1,17 @@
-"""CSV files: separator, quotes and byte-order mark are found out."""
+"""CSV files of UTF-8 text: separator, quotes and byte-order mark are found out."""
 
 import csv
 import itertools
+import os
+import re
 import warnings
 from pathlib import Path
 
 from nfc_gym.core import InputError
 from nfc_gym.measured.readers.registry import Table, broken
+
+_QUOTED = re.compile(r'"[^"]*"')
+_LONGEST = 1 << 16  # bytes of a row
 
 
 def read_csv(path: Path) -> Table:
@@ -18,7 +23,7 @@ def read_csv(path: Path) -> Table:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = [line for line in itertools.islice(file, 3) if line.strip()]
             header_line = lines[0] if lines else ""
-            separator = max(",;\t", key=header_line.count)
+            separator = max(",;\t", key=_QUOTED.sub("", header_line).count)  # a quoted name may hold some
             header = [name.strip() for name in next(csv.reader([header_line], delimiter=separator), [])]
         if len(lines) < 2:
             raise InputError(f"{path}: no rows under the header")
@@ -29,12 +34,28 @@ def read_csv(path: Path) -> Table:
             )
         with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):  # rows longer than the header
             frame = pd.read_csv(path, sep=separator, encoding="utf-8-sig", skipinitialspace=True, index_col=False)
+        _require_whole(path, separator, len(next(csv.reader(lines[1:], delimiter=separator))))
     except (pd.errors.ParserWarning, pd.errors.ParserError) as e:
         if header_line.lstrip().startswith(("#", "//", "%")):
             raise InputError(f"{path}: begins with a comment; the first line must be the columns' names") from None
         if isinstance(e, pd.errors.ParserError):
             raise broken(path, e) from None
         raise InputError(f"{path}: rows have more fields than the header names; give every column a name") from None
-    except (UnicodeDecodeError, csv.Error, pd.errors.EmptyDataError) as e:
+    except UnicodeDecodeError as e:
+        raise InputError(
+            f"{path}: is no UTF-8 text (byte {e.object[e.start]:#x}); save it with that encoding"
+        ) from None
+    except (csv.Error, pd.errors.EmptyDataError) as e:
         raise broken(path, e) from None
     return {str(name).strip(): frame[name].to_numpy() for name in frame.columns}
+
+
+def _require_whole(path: Path, separator: str, width: int) -> None:
+    """Refuse a file whose last row has no end and lacks fields: the last number in it may be a part of one."""
+    with path.open("rb") as file:
+        file.seek(max(file.seek(0, os.SEEK_END) - _LONGEST, 0))
+        last = file.read().rpartition(b"\n")[2].rpartition(b"\r")[2].decode("utf-8", "replace")
+    if last.strip() and len(last) < _LONGEST and len(next(csv.reader([last], delimiter=separator))) < width:
+        raise InputError(
+            f"{path}: its last row is cut off, {last[:40]!r} where {width} fields are wanted; remove that row"
+        )

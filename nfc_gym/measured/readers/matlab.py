@@ -13,11 +13,11 @@ from nfc_gym.measured.readers.registry import Table, broken
 
 
 def read_mat(path: Path) -> Table:
-    """Variables by name; fields of structs as `struct.field`."""
+    """Variables by name; fields of structs as `struct.field`, of arrays of structs as `struct[0].field`."""
     import scipy.io
 
     data = path.read_bytes()
-    if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
+    if b"\x89HDF" in (data[:4], data[512:516]) or b"MATLAB 7.3" in data[:128]:
         raise InputError(f"{path}: a MATLAB v7.3 file; save it with `save('{path.name}', ..., '-v7')`")
     try:
         require_sound(data)
@@ -29,8 +29,14 @@ def read_mat(path: Path) -> Table:
 
 
 def _flat(content: dict[str, Any], prefix: str) -> list[tuple[str, NDArray[Any]]]:
-    """Structs become `struct.field`."""
+    """Structs become `struct.field`, arrays of them, such as Simulink's `signals`, `struct[0].field`."""
     found: list[tuple[str, NDArray[Any]]] = []
     for name, value in content.items():
-        found += _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else [(prefix + name, np.asarray(value))]
+        if isinstance(value, dict):
+            found += _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, list) and value and all(isinstance(v, dict) for v in value):
+            for i, one in enumerate(value):
+                found += _flat(one, f"{prefix}{name}[{i}].")
+        else:
+            found.append((prefix + name, np.asarray(value)))
     return found

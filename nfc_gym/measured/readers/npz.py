@@ -2,16 +2,18 @@
 
 import zipfile
 import zlib
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 
 from nfc_gym.core import InputError
-from nfc_gym.measured.readers.registry import Table, broken
+from nfc_gym.measured.readers.registry import Table, broken, wanted
 
 
-def read_npz(path: Path) -> Table:
-    """Arrays by name; pickled objects are refused."""
+def read_npz(path: Path, columns: Collection[str] | None = None) -> Table:
+    """Arrays by name; pickled objects are refused. Of arrays that none of `columns` belongs to only the name is read:
+    there may be pictures among them."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             if not isinstance(archive, np.lib.npyio.NpzFile):
@@ -22,7 +24,7 @@ def read_npz(path: Path) -> Table:
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
                 raise InputError(f"{path}: column {twice[0]!r} appears more than once")
-            return {name: archive[name] for name in names}
+            return {name: archive[name] if wanted(name, columns) else np.empty(0) for name in names}
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError) as e:

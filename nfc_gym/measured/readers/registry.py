@@ -37,7 +37,7 @@ def register_reader(suffix: str, reader: Reader | SelectiveReader, selective: bo
     """Have files that end in `suffix` (`".bag"`) read by `reader`: path -> columns (T,), arrays (T, k) or scalars.
 
     A `selective` reader also takes the names of the columns that are wanted, or None for all; of the others it may give
-    a sample only, so that they can be suggested for a name that is misspelt.
+    a sample only or an empty array, so that they can be suggested for a name that is misspelt.
     """
     _SUFFIXES[suffix.lower()] = _Entry(reader, selective=selective)
 
@@ -108,6 +108,11 @@ def read_table(path: Path, part: str = "", names: Collection[str] | None = None)
     return table
 
 
+def wanted(column: str, names: Collection[str] | None) -> bool:
+    """Whether one of `names` is that column or an entry of it, `column[i]`; None is every column."""
+    return names is None or any(name == column or name.startswith(f"{column}[") for name in names)
+
+
 def _entry(path: Path) -> _Entry | None:
     return _folder(path) or (None if path.is_dir() else _SUFFIXES.get(path.suffix.lower()))
 
@@ -136,7 +141,7 @@ def _as_seconds(values: NDArray[Any]) -> NDArray[Any]:
     if values.dtype.kind not in "Mm":
         return values
     fine = "datetime64[ns]" if values.dtype.kind == "M" else "timedelta64[ns]"
-    return values.astype(fine).astype(np.int64) * 1e-9
+    return np.where(np.isnat(values), np.nan, values.astype(fine).astype(np.int64) * 1e-9)
 
 
 def broken(path: Path, why: object, advice: str = "copy it again, or leave it out of `logs`") -> InputError:

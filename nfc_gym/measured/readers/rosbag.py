@@ -24,6 +24,8 @@ from nfc_gym.measured.readers.ros_columns import Columns, Missing, Types, column
 from nfc_gym.measured.readers.streams import Stream, Streams
 
 LARGEST_MESSAGE = 1 << 16  # bytes
+_MCAP = b"\x89MCAP0\r\n\x01"  # magic and the header's opcode; its length follows, then the profile
+_PROFILE_AT, _LONGEST_PROFILE = len(_MCAP) + 8, 64  # bytes
 _CHUNK = 4096  # messages that are held before they become columns
 _TF = "tf2_msgs/msg/TFMessage"
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"
@@ -47,6 +49,8 @@ def read_bag(path: Path, names: Collection[str] | None = None) -> Streams:
     highlevel = needed(path, "rosbags.highlevel", "ros")
     typesys = needed(path, "rosbags.typesys", "ros")
     common = typesys.get_typestore(typesys.Stores.LATEST)
+    if path.suffix == ".mcap":
+        _require_ros(path)
     with parsing(path, _ADVICE), highlevel.AnyReader([path], default_typestore=common) as bag:
         types = Types(bag.typestore)
         topics, left_out, count = _messages(bag, types, names)
@@ -61,6 +65,20 @@ def read_bag(path: Path, names: Collection[str] | None = None) -> Streams:
         why = "; ".join(f"{topic}: {reason}" for topic, reason in left_out.items()) or "it holds no message"
         raise InputError(f"{path}: no topic that can be read ({why})")
     return Streams(streams, left_out)
+
+
+def _require_ros(path: Path) -> None:
+    """Refuse an MCAP file that says that it is of something else: its messages are JSON, Protobuf or the like."""
+    with path.open("rb") as file:
+        start = file.read(_PROFILE_AT + 4 + _LONGEST_PROFILE)
+    size = int.from_bytes(start[_PROFILE_AT : _PROFILE_AT + 4], "little")
+    profile = start[_PROFILE_AT + 4 : _PROFILE_AT + 4 + size]
+    if start.startswith(_MCAP) and size <= _LONGEST_PROFILE and profile != b"ros2":
+        name = profile.decode("utf-8", "replace") or "none"
+        raise InputError(
+            f"{path}: its profile is {name!r}, and messages of ros2 alone are read; save its topics as columns of CSV, "
+            "Parquet or npz"
+        )
 
 
 def _messages(bag: Any, types: Types, names: Collection[str] | None) -> tuple[dict[str, "_Topic"], dict[str, str], int]:
