@@ -17,6 +17,8 @@ from nfc_gym.measured.design import Design
 from nfc_gym.measured.distances import Ask, Distances
 from nfc_gym.measured.experiment import Stage
 from nfc_gym.measured.questions import TOLD, Present, look, rivalries
+from nfc_gym.measured.recount import excluded
+from nfc_gym.measured.story import rivals_of
 from nfc_gym.measured.wording import number
 
 _SECONDS = 5.0  # of the motions that are compared: families differ in kind, not in length
@@ -29,7 +31,7 @@ class Advice:
 
     Attributes:
       rows: the identifiability table, the rows of claims with `sigma`: how far their nearest rival lies in these logs.
-      findings: in words, for `report.json`.
+      findings: in words, for `report.json`: what to record next, and who is an equivalent no more.
     """
 
     rows: list[dict[str, Any]]
@@ -42,13 +44,15 @@ def advise(
     """Measure how far each claim lies from its rivals, and look for a motion where that is too near.
 
     Args:
-      report: `effects` and `identifiability`, as in `report.json`.
+      report: `effects` and `identifiability`, as in `report.json`. Equivalents of a claim that lie far enough away to
+        be told, and that all segments exclude where the search saw but some, are taken out of `effects`.
       present: the logs at hand, seen from the extended model.
     """
     rows = [dict(r) for r in report["identifiability"]]
     if not present.lens.plant.effects:
         return Advice(rows, [])
     say("how far the claims lie from their rivals")
+    seen = round(present.repeats * len(present.lens.problem))
     asks, pairs, before = _apart(bench, logs, report, present)
     if bench.mode == "rollout" and min(before, default=np.inf) <= TOLD:
         # The present's few segments speak for all: nobody is sent to record more before as many are seen as `excite`
@@ -61,16 +65,43 @@ def advise(
             sigma, rival = min(own)
             row |= {"sigma": float(sigma), "worst_mimic": rival, "distinguishable": bool(sigma > TOLD)}
     near = [i for i, s in enumerate(before) if s <= TOLD]
+    told_apart = [(a, p) for a, p, s in zip(asks, pairs, before, strict=True) if s > TOLD]
+    findings = _recounted(bench, logs, report, told_apart, seen, say, seed) if bench.mode == "rollout" else []
     if not near:
-        return Advice(rows, [])
+        return Advice(rows, findings)
     open_asks = [asks[i] for i in near]
     told = _best_motion(bench, logs, present, open_asks, say, seed)
-    findings = []
     for k, i in enumerate(near):
         claim, rival = pairs[i]
         text = f"{claim} and {rival} lie {number(before[i], 2)} sigma apart in these logs, too near to choose."
         findings.append({"kind": "advice", "text": f"{text} {told(k)}"})
     return Advice(rows, findings)
+
+
+def _recounted(
+    bench: Bench,
+    logs: Sequence[Log],
+    report: dict[str, Any],
+    pairs: Sequence[tuple[Ask, tuple[str, str]]],
+    seen: int,
+    say: Callable[[str], None],
+    seed: int,
+) -> list[dict[str, Any]]:
+    """Take out of the report the equivalents that all segments exclude, of which the search saw so many; in words."""
+    effects = {e["id"]: e for e in report["effects"]}
+    listed = [(ask, p) for ask, p in pairs if p[1] in rivals_of(effects.get(p[0], {}), report["effects"])]
+    segments = len(bench.searched(logs))
+    if not listed or segments <= seen:
+        return []
+    findings = []
+    for (_, (claim, rival)), gone in zip(
+        listed, excluded(bench, logs, [ask for ask, _ in listed], say, seed), strict=True
+    ):
+        if gone:
+            effects[claim]["equivalents"] = [i for i in effects[claim]["equivalents"] if i != rival]
+            text = f"{rival} does as well as {claim} on the {seen} segments that were searched, and is excluded by all"
+            findings.append({"kind": "recount", "text": f"{text} {segments}: it is no equivalent."})
+    return findings
 
 
 def _apart(

@@ -2,7 +2,9 @@
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -86,6 +88,7 @@ def excite(
     mujoco.set_mju_user_warning(lambda message: None)
     say = teller(console, time.monotonic())
     dataset, noticed = require(mapping)
+    _require_no_log(out, mapping.parent, [entry.path for entry in dataset.mapping.logs])
     warned(console, noticed)
     bench = make_bench(dataset, jobs)
     task, report = _task(bench, fit, seconds, seed, say)
@@ -123,6 +126,25 @@ def _outputs(out: Path, overwrite: bool) -> Path:
         if path.exists() and not overwrite:
             raise InputError(f"{path} exists: choose another --out, or say --overwrite to replace it")
     return out
+
+
+def _require_no_log(out: Path, folder: Path, globs: Sequence[str]) -> None:
+    """Refuse a file that the mapping would read as a log from then on."""
+    for pattern in globs:
+        if _matches((folder.absolute() / pattern).parts, out.absolute().parts):
+            raise InputError(
+                f"--out {out}: the mapping's logs {pattern!r} would take the commands for a recording; choose a file "
+                "that it does not match"
+            )
+
+
+def _matches(pattern: Sequence[str], parts: Sequence[str]) -> bool:
+    """Whether a path is what a glob finds, part by part; `**` stands for any folders."""
+    if not pattern or not parts:
+        return not pattern and not parts
+    if pattern[0] == "**":
+        return _matches(pattern[1:], parts) or _matches(pattern, parts[1:])
+    return fnmatch(parts[0], pattern[0]) and _matches(pattern[1:], parts[1:])
 
 
 def _task(bench: Bench, folder: Path | None, seconds: float, seed: int, say: Any) -> tuple[_Task, dict[str, Any]]:

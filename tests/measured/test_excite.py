@@ -258,6 +258,30 @@ def test_bad_input_is_told_in_one_line(mapping: Path, args: list[str], words: st
 
 
 @pytest.mark.parametrize(
+    ("pattern", "out", "words"),
+    [("*.csv", "excite.csv", "logs '*.csv' would take the commands for a recording"),
+     ("./**/*.csv", "next/deep/a.csv", "would take the commands"),
+     ("next/*.csv", "next/deep/a.csv", ""), ("[f-v]*.csv", "next.csv", "would take"), ("[f-v]*.csv", "a.csv", "")],
+)  # fmt: skip
+def test_the_commands_are_not_written_where_they_would_be_read_as_a_log(
+    tmp_path: Path, pattern: str, out: str, words: str
+) -> None:
+    path = record(tmp_path)
+    if pattern.startswith("next"):
+        (tmp_path / "next").mkdir()
+        for log in tmp_path.glob("*.csv"):
+            log.rename(tmp_path / "next" / log.name)
+    (tmp_path / "next/deep").mkdir(parents=True, exist_ok=True)
+    logs = path.read_text().split("time:")[0].split("logs:")[1]
+    path.write_text(path.read_text().replace(logs, f'\n  - {{path: "{pattern}"}}\n'))
+    args = ("excite", path, "--out", tmp_path / out, "--seconds", 2, "--tries", 2, "--jobs", 1)
+    result = call(*args)
+    assert result.exit_code == (2 if words else 0), result.stderr
+    assert words in plain(result.stderr)
+    assert (tmp_path / out).exists() == (not words)
+
+
+@pytest.mark.parametrize(
     ("edits", "words"),
     [
         ([('controls:\n  "ctrl:motor": {column: torque, unit: Nm}\n', "")], "names no `controls`"),
