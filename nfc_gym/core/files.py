@@ -67,7 +67,10 @@ def _part(path: Path) -> Path:
 def _becoming(path: Path, part: Path) -> Iterator[Path]:
     """Put a written part in the place of its file, or away."""
     try:
+        part.touch()
+        mode = part.stat().st_mode  # as the user's mask has it: safetensors makes files that nobody else may read
         yield part
+        os.chmod(part, mode)
         with open(part, "rb") as handle:
             os.fsync(handle.fileno())
         os.replace(part, path)

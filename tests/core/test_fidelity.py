@@ -89,6 +89,17 @@ def test_files_are_whole_or_as_before(tmp_path: Path) -> None:
     assert path.read_text() == "second"
 
 
+def test_a_file_may_be_read_by_whom_the_users_mask_says(tmp_path: Path) -> None:
+    """Whatever the permissions that the library which writes it gives to its files."""
+    plain, path = tmp_path / "plain.txt", tmp_path / "a.txt"
+    plain.write_text("")
+    with replacing(path) as part:
+        part.unlink()
+        part.write_text("private")
+        part.chmod(0o600)
+    assert path.stat().st_mode == plain.stat().st_mode
+
+
 def test_two_may_replace_a_file_at_once(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     with replacing(path) as outer:
