@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.data import Batch
 
 DENSITIES = ("score", "mixture", "flow")
@@ -52,6 +53,8 @@ class NetworkConfig:
     components: int = 8
 
     def __post_init__(self) -> None:
+        if isinstance(self.families, str):  # whose letters would be taken for names
+            raise InputError(f"structure head: families is a tuple of names, got {self.families!r}")
         object.__setattr__(self, "families", tuple(self.families))
         if self.density not in DENSITIES:
             raise InputError(f"no density named {self.density!r}; there are: {', '.join(DENSITIES)}")
@@ -62,9 +65,13 @@ class NetworkConfig:
             )
         if len(self.families) == 1:
             raise InputError(f"structure head: two families or more, the first 'none', got {self.families}")
-        for name in ("hidden", "depth", "draws", "components"):
-            if getattr(self, name) < 1:
-                raise InputError(f"network: {name} must be 1 or more, got {getattr(self, name)}")
+        if len(set(self.families)) < len(self.families):
+            raise InputError(f"structure head: families named twice: {', '.join(self.families)}")
+        for name in ("width", "hidden", "depth", "draws", "components"):
+            require_whole(f"network: {name}", getattr(self, name), 1)
+        require_whole("network: features", self.features, 0)
+        if not 0 <= self.dropout < 1:
+            raise InputError(f"network: dropout is a share in [0, 1), got {self.dropout:g}")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values that JSON holds."""

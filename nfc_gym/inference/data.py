@@ -8,7 +8,9 @@ A batch is a dict of named tensors with a leading axis of windows:
   family   (B,) int16, index of the injected effect's family, 0 for none (where the structure head is trained)
 """
 
+import hashlib
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -48,9 +50,10 @@ class TensorWindows:
     """Windows held in memory, on any device.
 
     Args:
-      tensors: a batch as above that holds all windows.
+      tensors: a batch as above that holds all windows; arrays and other kinds of numbers are made float32 tensors.
       manifest: what is known of them.
-      told: plain values, by name, in which training from other windows would be another training.
+      told: plain values, by name, in which training from other windows would be another training; without them it is
+        by their `contents` that a saved state of training tells these windows from others.
       noise: (H+1, s) standard deviation of what is added to the states anew in each pass; None adds nothing.
 
     Raises:
@@ -62,6 +65,7 @@ class TensorWindows:
         self, tensors: Batch, manifest: Mapping[str, Any] | None = None, told: Mapping[str, Any] | None = None,
         noise: Tensor | None = None,
     ) -> None:  # fmt: skip
+        tensors = {name: _tensor(name, value) for name, value in tensors.items()}
         require_batch(tensors)
         self.tensors, self.noise = tensors, noise
         self.manifest: Mapping[str, Any] = dict(manifest or {})
@@ -69,6 +73,15 @@ class TensorWindows:
 
     def __len__(self) -> int:
         return len(self.tensors["psi"])
+
+    @cached_property
+    def contents(self) -> str:
+        """A digest of all numbers: other windows have another."""
+        found = hashlib.sha256()
+        for name, tensor in sorted(self.tensors.items()):
+            found.update(f"{name} {tuple(tensor.shape)} {tensor.dtype} ".encode())
+            found.update(tensor.detach().cpu().flatten().view(torch.uint8).numpy().data)
+        return found.hexdigest()[:16]
 
     def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
         """See `WindowSet.batches`."""
@@ -154,6 +167,12 @@ class StoredWindows:
         parts = (self.rows[:cut], self.rows[cut:])
         first, last = (StoredWindows(self.stored, rows, self.maps, self.noise) for rows in parts)
         return first, last
+
+
+def _tensor(name: str, value: Any) -> Tensor:
+    """A batch's entry as networks take it; one that is so already stays the same tensor."""
+    tensor = torch.as_tensor(value)
+    return tensor.float() if name in _AXES and name != "family" else tensor
 
 
 def require_batch(tensors: Batch) -> None:

@@ -48,7 +48,10 @@ def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
         )
     for name in ("network", "average", "best"):
         own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
-        getattr(run, name).load_state_dict(own)
+        try:
+            getattr(run, name).load_state_dict(own)
+        except RuntimeError:  # the configuration is the same, so that the shapes follow from the windows' own
+            raise InputError(f"{path} is of windows of other sizes: remove it to train anew") from None
     state = run.optimiser.state_dict()
     for key, tensor in tensors.items():
         if key.startswith("optimiser/"):
@@ -65,6 +68,8 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     Raises:
       InputError: it is truncated, or no such file.
     """
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; want a file that ends in .safetensors")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:

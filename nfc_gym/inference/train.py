@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.inference.data import Batch, WindowSet
+from nfc_gym.core.whole import require_whole
+from nfc_gym.inference.data import Batch, TensorWindows, WindowSet
 from nfc_gym.inference.learner import Learner
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.random import mixed, seeded
@@ -53,11 +54,12 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch", "patience"):
-            if getattr(self, name) < 1:
-                raise InputError(f"training: {name} must be 1 or more, got {getattr(self, name)}")
+        for name, least in (("epochs", 1), ("batch", 1), ("patience", 1), ("warmup", 0), ("seed", 0)):
+            require_whole(f"training: {name}", getattr(self, name), least)
         if not 0 < self.rate < 1 or not 0 <= self.average < 1:
             raise InputError(f"training: rate in (0, 1) and average in [0, 1), got {self.rate:g}, {self.average:g}")
+        if not self.clip > 0 or not self.decay >= 0:  # a gradient cut to less than 0 would lead uphill
+            raise InputError(f"training: clip above 0 and decay 0 or more, got {self.clip:g}, {self.decay:g}")
 
 
 @dataclass
@@ -157,10 +159,12 @@ class _Run:
 
     def describe(self) -> dict[str, object]:
         """What a saved state must agree in."""
-        config = asdict(replace(self.config, save_every=0.0))
+        config, told = asdict(replace(self.config, save_every=0.0)), getattr(self.windows, "told", {})
+        if not told and isinstance(self.windows, TensorWindows):
+            told = {"contents of the windows": self.windows.contents}
         return {
             "config": config, "network": self.network.config.to_dict(), "prior": self.network.prior.to_dict(),
-            "windows": len(self.windows), "held_out": len(self.held_out), "of": getattr(self.windows, "told", {}),
+            "windows": len(self.windows), "held_out": len(self.held_out), "of": told,
         }  # fmt: skip
 
     def loop(self, file: Path | None, report: Report) -> None:

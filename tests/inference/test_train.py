@@ -9,6 +9,7 @@ import torch
 from problems import box, gaussian, linear_windows, motion_windows, network
 
 from nfc_gym.core import InputError
+from nfc_gym.inference.config import NetworkConfig
 from nfc_gym.inference.data import StoredWindows, TensorWindows
 from nfc_gym.inference.progress import Quiet
 from nfc_gym.inference.train import TrainConfig, train
@@ -84,6 +85,75 @@ def test_a_state_of_something_else_is_refused(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:-1000])
     with pytest.raises(InputError, match="truncated"):
         train(network(windows), windows, held_out, replace(QUICK, epochs=1), folder=tmp_path)
+
+
+def test_a_state_of_other_windows_of_the_same_sizes_is_refused(tmp_path: Path) -> None:
+    once = replace(QUICK, epochs=1)
+    windows, held_out = motion_windows(200).split(0.1)
+    done = train(network(windows), windows, held_out, once, folder=tmp_path)
+    assert train(network(windows), windows, held_out, once, folder=tmp_path).held_out == done.held_out
+    others = motion_windows(200, seed=1).split(0.1)
+    with pytest.raises(InputError, match=r"is of another run \(contents of the windows '\w{16}', now '\w{16}'\)"):
+        train(network(windows), *others, once, folder=tmp_path)
+    named = [TensorWindows(w.tensors, told={"seed": 1}) for w in others]  # who says what they are is believed
+    train(network(windows), *named, once, folder=tmp_path / "named")
+    train(network(windows), *(TensorWindows(w.tensors, told={"seed": 1}) for w in (windows, held_out)), once,
+          folder=tmp_path / "named")  # fmt: skip
+
+
+def test_a_state_of_windows_of_another_length_is_refused(tmp_path: Path) -> None:
+    once, told = replace(QUICK, epochs=1), {"seed": 1}
+    whole = motion_windows(200).tensors
+    short = {**whole, "states": whole["states"][:, 2:], "actions": whole["actions"][:, 2:]}
+    windows, held_out = TensorWindows(whole, told=told).split(0.1)
+    train(network(windows), windows, held_out, once, folder=tmp_path)
+    windows, held_out = TensorWindows(short, told=told).split(0.1)
+    with pytest.raises(InputError, match="is of windows of other sizes: remove it to train anew"):
+        train(network(windows), windows, held_out, once, folder=tmp_path)
+
+
+def test_numbers_of_other_kinds_are_taken_as_float32() -> None:
+    single = motion_windows(100)
+    double = TensorWindows({k: t.double() if t.is_floating_point() else t for k, t in single.tensors.items()})
+    arrays = TensorWindows({k: t.numpy() for k, t in single.tensors.items()})  # type: ignore[misc]
+    expected = train(network(single), *single.split(0.2), replace(QUICK, epochs=1))
+    for other in (double, arrays):
+        assert other.contents == single.contents
+        assert train(network(other), *other.split(0.2), replace(QUICK, epochs=1)).held_out == expected.held_out
+    assert all(TensorWindows(single.tensors).tensors[k] is t for k, t in single.tensors.items())  # nothing is copied
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"epochs": 1.5}, r"training: epochs is 1\.5, want a whole number, 1 or more"),
+        ({"batch": True}, "training: batch is True, want a whole number"),
+        ({"seed": -1}, "training: seed is -1, want a whole number, 0 or more"),
+        ({"warmup": -1}, "training: warmup is -1"),
+        ({"clip": 0.0}, "training: clip above 0 and decay 0 or more, got 0, 0.0001"),
+        ({"decay": -1.0}, "training: clip above 0 and decay 0 or more, got 1, -1"),
+        ({"rate": float("nan")}, "training: rate in"),
+    ],
+)
+def test_settings_that_would_not_train_are_refused(change: dict[str, float], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        TrainConfig(**change)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"width": 0}, "network: width is 0, want a whole number, 1 or more"),
+        ({"hidden": 1.5}, r"network: hidden is 1\.5, want a whole number"),
+        ({"features": -1}, "network: features is -1, want a whole number, 0 or more"),
+        ({"dropout": 1.0}, r"network: dropout is a share in \[0, 1\), got 1"),
+        ({"families": "none"}, "families is a tuple of names, got 'none'"),
+        ({"families": ("none", "drag", "drag")}, "families named twice: none, drag, drag"),
+    ],
+)
+def test_networks_that_cannot_be_are_refused(change: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        NetworkConfig(**change)  # type: ignore[arg-type]
 
 
 def test_a_run_that_diverges_keeps_its_last_good_weights() -> None:
