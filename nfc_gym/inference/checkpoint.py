@@ -59,7 +59,7 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
     try:
         about = json.loads(metadata["about"])
         own = PriorBox.from_dict(about["prior"])
-        config, sizes = NetworkConfig(**about["network"]), Sizes(**about["sizes"])
+        config, sizes, notes = NetworkConfig(**about["network"]), Sizes(**about["sizes"]), dict(about["notes"])
     except (KeyError, TypeError, ValueError) as e:
         raise InputError(f"{path}: its metadata describe no network that this version knows ({e})") from None
     if config.delta_s and sizes.place and about.get("frame") != FRAME:
@@ -74,6 +74,7 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
     network = Network(config, sizes, own)
     try:
         network.load_state_dict(tensors)
-    except RuntimeError as e:
+        given = Encoded(**kept) if kept else None
+    except (RuntimeError, TypeError) as e:
         raise InputError(f"{path}: its weights are not those of the network that it describes ({e})") from None
-    return network.eval(), Encoded(**kept) if kept else None, about["notes"]
+    return network.eval(), given, notes

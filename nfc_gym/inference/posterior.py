@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.network import Encoded, Network
 from nfc_gym.inference.random import seeded
@@ -20,6 +21,7 @@ from nfc_gym.inference.space import PriorBox
 
 Array = NDArray[np.float64]
 _ROWS, _MAPS = 65536, 64  # samples that are drawn in one batch, without maps and with
+_LARGEST = float(np.finfo(np.float32).max)  # in which networks compute
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,9 @@ class NeuralPosterior:
             if elevation.shape != (128, 128):
                 raise InputError(f"window: elevation must have shape (128, 128), got {elevation.shape}")
         for name, x in (("states", states), ("actions", actions), ("elevation", elevation)):
-            if x is not None and not np.isfinite(x).all():
-                raise InputError(f"window: {name} holds {x[~np.isfinite(x)][0]:g}; every entry must be finite")
+            odd = np.empty(0) if x is None else x[~(np.abs(x) <= _LARGEST)]
+            if len(odd):
+                raise InputError(f"window: {name} holds {odd[0]:g}; every entry must be finite, also in float32")
         return states, actions, elevation
 
     def _window(self) -> Encoded:
@@ -138,8 +141,7 @@ class NeuralPosterior:
 
         `how` goes to the density: `steps=` and `stochastic=True` of a score model.
         """
-        if n < 1:
-            raise InputError(f"sample: n must be 1 or more, got {n}")
+        require_whole("sample: n", n, 1)
         kept, maps = self._window(), None
         blocks = 2 if "delta_s" in self.parts else 1
         with seeded(rng, kept.mean.device):
@@ -166,7 +168,7 @@ class NeuralPosterior:
         density: `steps=` of a score model.
 
         Raises:
-          InputError: x has no psi, holds what this network does not infer, or was not given a window.
+          InputError: x has no psi, holds what this network does not infer or of another width, or no window was given.
         """
         kept = self._window()
         if x.psi is None:
@@ -174,6 +176,9 @@ class NeuralPosterior:
         extra = [p for p in x.given if p not in self.network.blocks]
         if extra:
             raise InputError(f"log_prob: {extra[0]} has no density here; there is: {', '.join(self.network.blocks)}")
+        if x.delta_s is not None and x.delta_s.shape[-1] != self.network.sizes.states:
+            want = self.network.sizes.states
+            raise InputError(f"log_prob: delta_s must end in {want} values, got shape {x.delta_s.shape}")
         psi = np.atleast_2d(x.psi)
         z, free = self.prior.to_z(psi), np.array(self.prior.free)
         u = self.prior.u_of(psi)[:, free]

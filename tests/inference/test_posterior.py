@@ -211,6 +211,26 @@ def test_bad_windows_are_refused() -> None:
         posterior.given(window).log_prob(Fidelity(None, np.zeros((1, 2))))
 
 
+def test_what_no_density_or_draw_can_be_asked_is_refused() -> None:
+    posterior, window = cart()
+    given = posterior.given(window)
+    drawn = given.sample(3, rng())
+    assert drawn.psi is not None
+    for n in (0, 2.5, True):
+        with pytest.raises(InputError, match=f"sample: n is {n}, want a whole number, 1 or more"):
+            given.sample(n, rng())  # type: ignore[arg-type]
+    for steps in (0, -1):  # without a step it would be the prior that is drawn, or its density
+        for ask in (lambda s: given.sample(3, rng(), steps=s), lambda s: given.log_prob(Fidelity(drawn.psi), steps=s)):
+            with pytest.raises(InputError, match=f"steps is {steps}, want a whole number, 1 or more"):
+                ask(steps)
+    with pytest.raises(InputError, match=r"delta_s must end in 2 values, got shape \(3, 5\)"):
+        given.log_prob(Fidelity(drawn.psi, np.zeros((3, 5))))
+    states = np.array(window.states, float)
+    states[4, 1] = 1e39
+    with pytest.raises(InputError, match=r"states holds 1e\+39; every entry must be finite, also in float32"):
+        posterior.given(Window(states, window.actions))
+
+
 def test_a_robots_psi_is_drawn_from_a_file(tmp_path: Path) -> None:
     with gymnasium.make("nfc_gym/JackalFlat-v0", context=["psi"]) as env:
         prior = PriorBox.of(env.unwrapped.psi_space, "jackal")
@@ -263,3 +283,26 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path: Path) -> None:
         load(path)
     with pytest.raises(InputError, match=r"ends in \.safetensors"):
         posterior.save(tmp_path / "p.pt")
+
+
+@pytest.mark.parametrize("spoil", ["notes", "mean", "odd"])
+def test_a_checkpoint_that_lacks_a_part_is_told_as_that(tmp_path: Path, spoil: str) -> None:
+    posterior, window = cart()
+    path = tmp_path / "p.safetensors"
+    posterior.given(window).save(path)
+    tensors, metadata = read(path)
+    about = json.loads(metadata["about"])
+    if spoil == "notes":
+        del about["notes"]
+    elif spoil == "mean":
+        del tensors["given/mean"]
+    else:
+        tensors["given/odd"] = torch.zeros(1)
+    save_file(tensors, path, metadata | {"about": json.dumps(about)})
+    with pytest.raises(InputError, match=f"^{path}: its (metadata describe no|weights are not those of the) network"):
+        load(path)
+
+
+def test_a_folder_is_no_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"{tmp_path} is a folder; want a file"):
+        load(tmp_path)

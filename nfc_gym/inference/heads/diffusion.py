@@ -14,6 +14,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from nfc_gym.core.whole import require_whole
+
 Field = Callable[[Tensor, int], Tensor]  # (x, i) -> v of x's shape at the i-th angle of a grid
 On = Callable[
     [Tensor], Field
@@ -26,7 +28,11 @@ def angles(steps: int, like: Tensor) -> Tensor:
     """(steps + 1,) from pi / 2 down to `FLOOR`, denser towards the end, where narrow posteriors take shape.
 
     Of the type and on the device of `like`, and made there.
+
+    Raises:
+      InputError: no step at all, which would give noise for an answer.
     """
+    require_whole("steps", steps, 1)
     even = torch.linspace(1, 0, steps + 1, dtype=torch.float64, device=like.device)
     return (FLOOR + (MOST - FLOOR) * even.pow(3)).to(like.dtype)
 
