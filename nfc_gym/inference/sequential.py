@@ -169,10 +169,13 @@ def _calibrate(network: Network, held_out: TensorWindows, seed: int) -> None:
 
 
 def _renew(network: Network, seed: int) -> None:
-    """Give a network the weights that a new one begins with; its scales stay."""
+    """Give a network the weights that a new one begins with; the scales of what it sees and says stay."""
     new = Network(network.config, network.sizes, network.prior, seed)
     with torch.no_grad():
         for own, other in zip(network.parameters(), new.parameters(), strict=True):
+            own.copy_(other)
+        # The width that the last round's weights were calibrated to is theirs: a new flow begins at N(0, I).
+        for own, other in zip(network.density.buffers(), new.density.buffers(), strict=True):
             own.copy_(other)
 
 

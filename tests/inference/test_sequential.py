@@ -12,7 +12,7 @@ from nfc_gym.core import Fidelity, InputError
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Quiet
 from nfc_gym.inference.proposals import SLACK, Around, Corrected, Proposed, SequentialConfig, TruncatedPrior, told
-from nfc_gym.inference.sequential import sequential
+from nfc_gym.inference.sequential import _renew, sequential
 from nfc_gym.inference.train import TrainConfig, train
 
 X = torch.tensor([[0.8, -0.5, 0.3]])
@@ -125,6 +125,18 @@ def test_a_later_round_may_train_new_weights() -> None:
         )
     ]
     assert apart[0] < 1e-6 < apart[1]
+
+
+def test_new_weights_begin_at_the_width_of_a_new_network() -> None:
+    windows = linear_windows(200)
+    net = network(windows, density="flow", linear=True)
+    fresh = network(windows, density="flow", linear=True, seed=3)
+    net.calibrate({**windows.tensors, "states": 3 * windows.tensors["states"]})
+    calibrated = {k: t.clone() for k, t in net.state_dict().items() if k.endswith("base.scale")}
+    assert all((t > 1.5).all() for t in calibrated.values())
+    _renew(net, 3)
+    for name, tensor in net.state_dict().items():
+        assert torch.equal(tensor, fresh.state_dict()[name]), name
 
 
 class Normal:
