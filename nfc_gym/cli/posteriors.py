@@ -256,16 +256,17 @@ def infer(
             raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
 
         seen = _window(posterior, window, log, until) if mapped else window
-        anew = None
+        from nfc_gym.inference.progress import Spoken
+
+        anew, report = None, Spoken()
         if refine is not None:
-            from nfc_gym.inference.progress import Spoken
             from nfc_gym.simulate.refined import refined
 
             anew = partial(
                 refined, simulations=refine, seed=seed, jobs=jobs or 0, device=learning.device_of(device or "auto"),
-                report=Spoken(),
+                report=report,
             )  # fmt: skip
-        drawn, found = learning.infer(posterior, seen, samples=samples, seed=seed, out=out, refined=anew)
+        drawn, found = learning.infer(posterior, seen, samples=samples, seed=seed, out=out, refined=anew, report=report)
         table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
         for each in found:
             note = "  not shown" if each.width >= learning.AS_WIDE else ""

@@ -17,6 +17,7 @@ from nfc_gym.core.files import replacing, require_writable
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import StoredWindows
+from nfc_gym.inference.encoders.base import SEEN
 from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.gains import gains
 from nfc_gym.inference.network import Network
@@ -44,9 +45,33 @@ def device_of(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        return torch.empty(0, device=name).device
+        device = torch.empty(0, device=name).device
     except (RuntimeError, AssertionError) as e:
         raise InputError(f"device {name!r}: {str(e).splitlines()[0]}; there is auto, cpu, and cuda on a GPU") from None
+    if device.type == "meta":  # whose tensors have shapes and no numbers
+        raise InputError(f"device {name!r} computes nothing; there is auto, cpu, and cuda on a GPU")
+    return device
+
+
+def require_prior(stored: Windows, prior: PriorBox) -> None:
+    """Refuse windows that were drawn from another box than a posterior's: their u would be read as other psi.
+
+    Raises:
+      InputError: other bounds or units; the message says of which parameter.
+    """
+    about = stored.manifest
+    drawn = replace(prior, units=about.psi_units, low=about.psi_low, high=about.psi_high)
+    prior.require_same(drawn, " + ".join(map(str, stored.folders)))
+
+
+def say_unfinished(stored: Windows, report: Report) -> None:
+    """A message where some of the windows that were asked for are still to be made."""
+    wanted = stored.manifest.windows
+    if not stored.manifest.complete:
+        report.message(
+            f"{stored.folders[0]}: {len(stored)} of {wanted} windows are there, and these are trained on; "
+            "`nfc-gym simulate` with the same arguments makes the rest"
+        )
 
 
 def train_posterior(
@@ -68,14 +93,16 @@ def train_posterior(
       noise: what multiplies the sensor noise that the windows' manifest assumes, for sensors that are better or worse.
 
     Raises:
-      InputError: no such windows, windows without maps where the network needs them, a name of another ending,
-        something else than a posterior is there, or nothing can be written there.
+      InputError: no such windows, windows of another prior or without maps where the network needs them, a name of
+        another ending, something else than a posterior is there, or nothing can be written there.
     """
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: a posterior is kept in a file that ends in .safetensors")
     kinds.require_kind(out, kinds.POSTERIOR)
     require_writable(out.absolute().parent)
     stored = Windows(folder, robot=prior.robot, psi_names=prior.names)
+    require_prior(stored, prior)
+    say_unfinished(stored, report)
     if config.elevation and "map" not in stored.names:
         raise InputError(f"{folder}: the windows have no elevation maps; make them with `nfc-gym simulate ... --maps`")
     if config.families:
@@ -109,14 +136,16 @@ def read_window(path: Path) -> Window:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    arrays: dict[str, Any] | None = None
     try:
         with path.open("rb") as file:
-            if not is_zipfile(file):  # NumPy would take it for a pickle, and advise to load it as such
-                raise InputError(f"{path} is no .npz file: a window of motion is {_FORM}")
-        with np.load(path, allow_pickle=False) as archive:
-            arrays: dict[str, Any] = {k: archive[k] for k in archive.files}
+            if is_zipfile(file):  # NumPy would take anything else for a pickle, and advise to load it as such
+                with np.load(path, allow_pickle=False) as archive:
+                    arrays = {k: archive[k] for k in archive.files}
     except (OSError, ValueError, EOFError, AttributeError, TypeError, BadZipFile) as e:
         raise InputError(f"{path} is no .npz file ({e}); want {_FORM}") from None
+    if arrays is None:
+        raise InputError(f"{path} is no .npz file: a window of motion is {_FORM}")
     missing = [k for k in ("states", "actions") if k not in arrays]
     if missing:
         raise InputError(f"{path}: no array {missing[0]!r}; there are: {', '.join(arrays) or 'none'}")
@@ -140,7 +169,7 @@ class Told(NamedTuple):
 
 def infer(
     posterior: Path, window: Path | Window, *, samples: int = 1000, seed: int = 0, out: Path | None = None,
-    refined: Callable[[NeuralPosterior, Window], NeuralPosterior] | None = None,
+    refined: Callable[[NeuralPosterior, Window], NeuralPosterior] | None = None, report: Report = quiet,
 ) -> tuple[Fidelity, list[Told]]:  # fmt: skip
     """Draw from a posterior given a window.
 
@@ -152,20 +181,26 @@ def infer(
       out: `.npz` for the draws (`psi`, and `delta_s` where it is inferred), or `.safetensors` for the posterior given
         this window; wrappers and `nfc-gym simulate --proposal` take either.
       refined: makes of the posterior one given the window, `simulate.refined`; None gives it the window.
+      report: is told where the window is unlike all that the posterior was trained on.
 
     Raises:
-      InputError: a damaged file, a window that is not the network's or whose actions are far outside [-1, 1], another
-        ending, something else than that is at `out`, or nothing can be written there.
+      InputError: a damaged file, a structure head, a window that is not the network's or whose actions are far outside
+        [-1, 1], another ending, something else than that is at `out`, or nothing can be written there.
     """
     if out is not None and out.suffix not in (".npz", ".safetensors"):
         raise InputError(f"{out}: draws are kept in .npz, the posterior given the window in .safetensors")
     if out is not None:
         kinds.require_kind(out, kinds.DRAWS if out.suffix == ".npz" else kinds.POSTERIOR)
         require_writable(out.absolute().parent)
+    if posterior.is_file() and kinds.kind_of(posterior) == kinds.STRUCTURE:
+        raise InputError(
+            f"{posterior} is a structure head, which knows families of effects and no psi: give it to `nfc-gym "
+            "close-loop --posterior`, and a posterior here"
+        )
     found, seen = load(posterior), window if isinstance(window, Window) else read_window(window)
-    given = _given(found, seen, "window" if isinstance(window, Window) else str(window))
-    if refined is not None:
-        given = refined(found, seen)
+    seen = _as_trained(found, seen, "window" if isinstance(window, Window) else str(window))
+    _say_unlike(found, seen, report)
+    given = found.given(seen) if refined is None else refined(found, seen)
     parts = [p for p in given.network.parts if p != "delta_e"]
     drawn = given.of(*parts).sample(samples, np.random.default_rng(seed))
     if out is not None and out.suffix == ".safetensors":
@@ -177,14 +212,17 @@ def infer(
     return drawn, told(given.prior, np.asarray(drawn.psi))
 
 
-def _given(posterior: NeuralPosterior, window: Window, name: str) -> NeuralPosterior:
-    """The posterior given a window; what is wrong with the window is said under its name.
+def _as_trained(posterior: NeuralPosterior, window: Window, name: str) -> Window:
+    """A window as the posterior's training set would have it: commands cut to [-1, 1], as the machine took them.
 
     A network answers motion that it has never seen with as much certainty as any other, so actions far outside [-1, 1]
     are refused here: in those rows that count.
+
+    Raises:
+      InputError: such actions, or a window that is not the network's; under the window's name.
     """
     try:
-        given = posterior.given(window)
+        posterior.given(window)
     except InputError as e:
         raise InputError(f"{name}: {str(e).removeprefix('window: ')}") from None
     actions = np.asarray(window.actions, float)
@@ -196,7 +234,24 @@ def _given(posterior: NeuralPosterior, window: Window, name: str) -> NeuralPoste
             f"{name}: actions are what env.step takes, in [-1, 1]; actions[{first + k}, {i}] is "
             f"{actions[first + k, i]:g}: raw commands, or other units?"
         )
-    return given
+    return replace(window, actions=np.clip(actions, -1, 1))
+
+
+def _say_unlike(posterior: NeuralPosterior, window: Window, report: Report) -> None:
+    """A message where a state is beyond all that the network can see for half of the window or longer.
+
+    It is not refused: a policy drives robots where excitation does not, and what a network makes of it may be right.
+    """
+    states = np.asarray(window.states, float)[-posterior.network.sizes.horizon - 1 :]
+    off = posterior.network.unlike(torch.as_tensor(states, dtype=torch.float32)).cpu().numpy()
+    if off.max() > SEEN:
+        i = int(off.argmax())
+        name = dict(enumerate(posterior.notes.get("states", ()))).get(i, "")
+        report.message(
+            f"states[:, {i}]{f' ({name})' if name else ''} has the median {np.median(states[:, i]):.4g}, {off[i]:.0f} "
+            "standard deviations from the training set's mean: if it is in the right unit and place, this is motion "
+            "that the posterior has seen little of; before you rely on the answer train on motion like it"
+        )
 
 
 def told(prior: PriorBox, psi: Array) -> list[Told]:

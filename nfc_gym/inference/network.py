@@ -153,6 +153,18 @@ class Network(Learner):
             return True
         return bool(np.allclose(signals.commands.cpu().numpy(), actions, atol=_SAME))
 
+    @torch.no_grad()
+    def unlike(self, states: Tensor) -> Tensor:
+        """(s,) spreads that the median of each state of one window (H+1, s), as logged, lies from the training set's.
+
+        It is 0 throughout where no encoder sees the states themselves.
+        """
+        signals = self.encoder.signals
+        device = self.free.device
+        if signals is None:
+            return torch.zeros(states.shape[1], device=device)
+        return signals.far(self.place(states[None].to(device))[0])
+
     def facing(self, states: Tensor) -> Tensor:
         """(B, 3) how windows as logged lie in the world, see `Place`; ahead where their place is not told."""
         if isinstance(self.place, Place):

@@ -92,8 +92,11 @@ class Windows:
           names: which arrays; none is all.
 
         Raises:
-          InputError: a window that holds a number that is not finite, or an array that does not exist.
+          InputError: a window or an array that does not exist, or a window that holds a number that is not finite.
         """
+        if len(rows) and not (np.min(rows) >= 0 and np.max(rows) < len(self)):
+            odd = rows[(rows < 0) | (rows >= len(self))][0]
+            raise InputError(f"windows: there is no window {odd}; the indices are 0 to {len(self) - 1}")
         unknown = [n for n in names if n not in self.names]
         if unknown:
             raise InputError(f"windows have no array {unknown[0]!r}; there are: {', '.join(self.names)}")

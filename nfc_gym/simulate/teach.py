@@ -12,6 +12,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import Batch, StoredWindows, TensorWindows
+from nfc_gym.inference.jobs import require_prior, say_unfinished
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.space import PriorBox
@@ -55,8 +56,8 @@ def train_structure(
       report: is told of the progress.
 
     Raises:
-      InputError: windows on rough ground, without effects, or of a robot that feels forces; something else than a
-        structure head is at `out`, or what a run with other windows or settings left there.
+      InputError: windows on rough ground, without effects, of another prior, or of a robot that feels forces; something
+        else than a structure head is at `out`, or what a run with other windows or settings left there.
     """
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: a structure head is kept in a file that ends in .safetensors")
@@ -66,12 +67,14 @@ def train_structure(
     require_unfeeling(machine)
     if machine.rough:
         raise InputError(f"{folder}: windows on rough ground; a structure head is trained on flat ground")
+    prior = PriorBox.of(machine.space, machine.kind.name)
+    require_prior(stored, prior)
+    say_unfinished(stored, report)
     cut = len(stored) - max(1, round(HELD_OUT * len(stored)))  # no repeat of a window is on both sides
     first, shares = taught(stored, np.tile(np.arange(cut), repeats), machine, noise, training.seed)
     held_out, _ = taught(stored, np.arange(cut, len(stored)), machine, noise, training.seed + 1)
     if shares[0] == 1:
         raise InputError(f"{folder}: no window has an effect; simulate them with --effects 0.75")
-    prior = PriorBox.of(machine.space, machine.kind.name)
     config = NetworkConfig(**{**config.to_dict(), "families": tuple(about.families)})
     network = Head(config, Sizes.of(first.tensors), prior, training.seed)
     state = out.with_name(out.name + ".training")

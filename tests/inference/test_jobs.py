@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,27 @@ from nfc_gym.core import InputError
 from nfc_gym.core.posterior import load_source
 from nfc_gym.inference import jobs
 from nfc_gym.inference.config import NetworkConfig
-from nfc_gym.inference.posterior import Window
+from nfc_gym.inference.posterior import Window, load
+from nfc_gym.inference.progress import Quiet
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig
 from nfc_gym.inference.windows import Windows
 from nfc_gym.simulate import simulate
 from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.teach import train_structure
 
 ENV = "nfc_gym/QuadcopterFlat-v0"
 SMALL = NetworkConfig(encoder="none", summaries=True, linear=True, delta_s=True, features=0, hidden=16, depth=1)
+
+
+class Heard(Quiet):
+    """Keeps the messages."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def message(self, text: str) -> None:
+        self.said.append(text)
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +168,48 @@ def test_actions_of_other_units_are_refused_in_the_rows_that_count(
     jobs.infer(posterior, longer, samples=10)
 
 
+def test_commands_beyond_what_the_machine_takes_are_seen_as_it_took_them(posterior: Path, motion: Path) -> None:
+    with np.load(motion) as one:
+        states, actions = one["states"].copy(), one["actions"].copy()
+    actions[3, 1], actions[7, 0] = 1.4, -1.2
+    cut, raw = (jobs.infer(posterior, Window(states, a), samples=20)[0].psi for a in (np.clip(actions, -1, 1), actions))
+    np.testing.assert_array_equal(raw, cut)
+
+
+def test_motion_that_no_window_of_the_training_set_was_like_is_said(
+    windows: Path, prior: PriorBox, motion: Path, tmp_path: Path
+) -> None:
+    out, small = tmp_path / "q.safetensors", replace(SMALL, encoder="nn", width=8)
+    jobs.train_posterior(windows, prior, out, small, TrainConfig(epochs=1, batch=32), device="cpu")
+    with np.load(motion) as one:
+        states, actions = one["states"].astype(float), one["actions"]
+    blow, degrees = states.copy(), states.copy()
+    blow[5:8, 12] = 50.0  # that much for a moment may be an impact
+    degrees[:, 12] = 57.3 * (1 + degrees[:, 12])
+    heard = Heard()
+    for each in (states, blow):
+        jobs.infer(out, Window(each, actions), samples=10, report=heard)
+    assert heard.said == []
+    jobs.infer(out, Window(np.concatenate([states[:7], degrees[1:]]), np.concatenate([actions[:7], actions[1:]])),
+               samples=10, report=heard)  # fmt: skip
+    (said,) = heard.said
+    middle = np.median(np.concatenate([states[6:7], degrees[1:]])[-21:, 12])
+    assert said.startswith(f"states[:, 12] (body:base:angvel@body.z) has the median {middle:.4g}, ")
+    file = tmp_path / "degrees.npz"
+    np.savez(file, states=degrees, actions=actions)
+    done = CliRunner().invoke(app, ["infer", str(out), str(file), "--samples", "10"])
+    assert done.exit_code == 0
+    assert "standard deviations from the training set's mean" in " ".join(done.stderr.split())
+
+
+def test_a_structure_head_is_told_as_that(posterior: Path, motion: Path, tmp_path: Path) -> None:
+    head = load(posterior)
+    head.notes["misfit"] = True
+    head.save(tmp_path / "head.safetensors")
+    with pytest.raises(InputError, match=r"head\.safetensors is a structure head, which knows families of effects"):
+        jobs.infer(tmp_path / "head.safetensors", motion)
+
+
 def test_a_window_of_another_robot_is_refused_by_its_files_name(posterior: Path, tmp_path: Path) -> None:
     file = tmp_path / "jackal.npz"
     np.savez(file, states=np.zeros((21, 15)), actions=np.zeros((20, 2)))
@@ -209,6 +264,7 @@ def test_files_that_are_something_else_are_refused(posterior: Path, motion: Path
     with pytest.raises(InputError) as caught:
         jobs.infer(posterior, text)
     assert "pickle" not in str(caught.value)
+    assert str(caught.value).count("no .npz") == 1
     for at, said in ((text, "no .npz"), (tmp_path / "gone.npz", "no such file")):
         with pytest.raises(InputError, match=said):
             jobs.infer(posterior, at)
@@ -230,6 +286,40 @@ def test_training_says_what_is_wrong(windows: Path, prior: PriorBox, tmp_path: P
     (other / "manifest.json").write_text(json.dumps(about | {"robot": "ant"}))
     with pytest.raises(InputError, match="'ant'"):
         jobs.train_posterior(other, prior, tmp_path / "a.safetensors", SMALL, TrainConfig(), device="cpu")
+    with pytest.raises(InputError, match="'meta' computes nothing; there is auto, cpu"):
+        jobs.device_of("meta")
+
+
+def test_windows_of_other_bounds_are_refused(windows: Path, prior: PriorBox, tmp_path: Path) -> None:
+    """As of another version of the robot: their u would be read as psi that nothing was simulated under."""
+    other = tmp_path / "other"
+    shutil.copytree(windows, other)
+    about = json.loads((other / "manifest.json").read_text())
+    about["psi_low"][0] -= 0.1
+    (other / "manifest.json").write_text(json.dumps(about))
+    said = rf"^{other} has low of '{prior.names[0]}' = {about['psi_low'][0]}, here it is {prior.low[0]}"
+    with pytest.raises(InputError, match=said):
+        jobs.train_posterior(other, prior, tmp_path / "a.safetensors", SMALL, TrainConfig(), device="cpu")
+    with pytest.raises(InputError, match=said):
+        train_structure(other, tmp_path / "s.safetensors", TrainConfig(epochs=1))
+
+
+def test_training_on_a_set_that_is_not_finished_is_said(windows: Path, prior: PriorBox, tmp_path: Path) -> None:
+    part = tmp_path / "part"
+    simulate(ENV, 60, part, jobs=1, per_shard=40)
+    (part / "shard_00001.safetensors").unlink()
+    about = json.loads((part / "manifest.json").read_text())
+    del about["finished"]["1"]  # as a run that was killed leaves it
+    (part / "manifest.json").write_text(json.dumps(about))
+    heard, once = Heard(), TrainConfig(epochs=1, batch=32)
+    jobs.train_posterior(part, prior, tmp_path / "a.safetensors", SMALL, once, device="cpu", report=heard)
+    assert heard.said == [
+        f"{part}: 40 of 60 windows are there, and these are trained on; `nfc-gym simulate` with the same arguments "
+        "makes the rest"
+    ]
+    heard.said.clear()
+    jobs.train_posterior(windows, prior, tmp_path / "b.safetensors", SMALL, once, device="cpu", report=heard)
+    assert heard.said == []
 
 
 def test_training_does_not_go_on_from_other_windows_or_other_noise(

@@ -152,6 +152,14 @@ def test_what_cannot_be_read_is_said_so(tmp_path: Path) -> None:
         Windows(tmp_path)
 
 
+def test_windows_that_do_not_exist_are_told_by_their_index(tmp_path: Path) -> None:
+    windows = Windows(written(tmp_path))
+    for odd in (len(windows), -1):
+        with pytest.raises(InputError, match=f"there is no window {odd}; the indices are 0 to {len(windows) - 1}"):
+            windows.take(np.array([0, odd]))
+    assert len(windows.take(np.zeros(0, int))["psi"]) == 0
+
+
 def test_numbers_that_are_not_finite_never_leave(tmp_path: Path) -> None:
     bad = arrays(MANIFEST, 0)
     bad["states"][4, 1, 2] = np.nan

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 TINY = 1e-6  # spreads below this are a constant signal, which is left as it is
+SEEN = 10.0  # spreads from the mean, beyond which signals are cut: what lies farther out looks like that
 
 
 class Encoder(nn.Module):
@@ -98,7 +99,7 @@ class Tamed(nn.Module):
 
 
 class Signals(nn.Module):
-    """States, their steps and actions as one standardised series (B, H+1, 2 s + a), clipped at 10 spreads.
+    """States, their steps and actions as one standardised series (B, H+1, 2 s + a), clipped at `SEEN` spreads.
 
     What psi does shows in accelerations: a step s_{t+1} - s_t is a small difference of large numbers once states are
     standardised, so it comes as a channel of its own (0 at t = 0). The action at t leads from s_t to s_{t+1}; the last
@@ -129,7 +130,11 @@ class Signals(nn.Module):
         """(B, H+1, channels)."""
         steps = nn.functional.pad(self._scaled("ds", states.diff(dim=1)), (0, 0, 1, 0))
         actions = nn.functional.pad(self._scaled("a", actions), (0, 0, 0, 1))
-        return torch.cat([self._scaled("s", states), steps, actions], -1).clamp(-10, 10)
+        return torch.cat([self._scaled("s", states), steps, actions], -1).clamp(-SEEN, SEEN)
+
+    def far(self, states: Tensor) -> Tensor:
+        """(s,) spreads that the median of each state of one window (H+1, s) lies from the training set's mean."""
+        return self._scaled("s", states[None])[0].median(0).values.abs()
 
     @property
     def commands(self) -> Tensor:
