@@ -118,7 +118,7 @@ def _pairs(model: mujoco.MjModel | None, log: Log) -> Iterator[tuple[str, str, A
                 yield name, speed, time, values.reshape(len(time), -1)
             continue
         steps = quat_to_vector(quat_multiply(quat_conjugate(values[:-1]), values[1:]))
-        for other, frame in _gyros(model, log, parsed.object):
+        for other, frame in gyros(model, log, parsed.object):
             seen = rotate(values[:-1], steps) if frame is None else rotate_back(frame, steps)
             axes = log.channels[other].axes
             turned = np.concatenate([np.zeros((1, 3)), np.cumsum(seen, 0)])
@@ -132,7 +132,7 @@ def _samples(log: Log, channel: Channel) -> tuple[Array, Array]:
     return log.time[rows], channel.values[rows]
 
 
-def _gyros(model: mujoco.MjModel | None, log: Log, body: str) -> Iterator[tuple[str, Array | None]]:
+def gyros(model: mujoco.MjModel | None, log: Log, body: str) -> Iterator[tuple[str, Array | None]]:
     """Channels that measure a body's angular velocity, and the frame they do so in: None is the world's."""
     for name in log.channels:
         parsed = parse_channel(name)

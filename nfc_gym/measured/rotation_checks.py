@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 FASTEST_GYRO = 40.0  # rad/s; the usual full scale is 2000 deg/s = 35 rad/s
 TILT = 0.5  # rad; a machine that tilts further is looked at twice
+TAKEN_OUT = 0.2  # of gravity; an accelerometer that reads less, in the median, is in free fall or has it subtracted
 SLOW = 0.05  # rad/s; below this mean rate the scalar order cannot be told from the rates
 
 
@@ -88,7 +89,7 @@ def rate(name: str, channel: Channel) -> Iterator[Suspicion]:
 
 
 def gravity(name: str, sensor: str, channel: Channel, model: mujoco.MjModel) -> Iterator[Suspicion]:
-    """An accelerometer whose reading in m/s^2 is about 1: gravity in g."""
+    """An accelerometer whose reading in m/s^2 is about 1, gravity in g; or about 0, as if gravity were taken out."""
     s = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, sensor)
     if s < 0 or int(model.sensor_type[s]) != int(mujoco.mjtSensor.mjSENS_ACCELEROMETER):
         return
@@ -97,3 +98,8 @@ def gravity(name: str, sensor: str, channel: Channel, model: mujoco.MjModel) -> 
     if (values.shape[1] == 3 or channel.axes == (2,)) and 0.8 < size < 1.25:
         message = f"reads {size:.3g} m/s^2 where gravity is 9.81: in g?"
         yield Suspicion("error", f"channels.{name}", "g", message, "say `unit: g`")
+    pull = float(np.linalg.norm(model.opt.gravity))
+    if values.shape[1] == 3 and size < TAKEN_OUT * pull:
+        message = f"reads {size:.2g} m/s^2 on the whole where gravity is {pull:.3g}: taken out of it?"
+        advice = "name the raw reading, which at rest is gravity, upwards; unless the machine falls freely throughout"
+        yield Suspicion("warning", f"channels.{name}", "gravity", message, advice)

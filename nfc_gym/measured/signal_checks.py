@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.findings import Suspicion
+from nfc_gym.measured.frame_checks import exchanged
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
 from nfc_gym.measured.speed_checks import DEGREES, TURN, explained, rate_ratio, ratio, strangers, too_fast
@@ -52,6 +53,7 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
                 yield Suspicion(
                     "warning", f"known.{name.split(':')[0]}", "known", message, "cut the log where it changes"
                 )
+    yield from exchanged(model, log)
     yield from strangers(log)
     yield from too_fast(log)
     yield from _twins(log)
