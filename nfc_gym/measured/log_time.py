@@ -56,12 +56,13 @@ def _of_column(name: str, unit: str, columns: LogColumns) -> Array:
         raise InputError(f"column {name!r} never increases; name the column that holds the time, {coarse}")
     if back.size:
         k = int(back[0])
+        received = f"{name.removesuffix('.time')}.received"
         how = "stands still" if step[k] == 0 else "goes back"
         raise InputError(
             f"column {name!r} {how} at row {k + 1} ({time[k]:.6g} to {time[k + 1]:.6g} s, "
             f"{back.size} such row{'s' * (back.size > 1)}); "
             f"remove repeated rows, cut the file there into two logs, {coarse}"
-            + ("; or name the time of another topic" if name.startswith("/") else "")
+            + (f"; or name {received!r}, or the time of another topic" if received in columns else "")
         )
     longest = int(step.argmax())
     if step[longest] > LARGEST_GAP * np.median(step):

@@ -12,6 +12,9 @@ from writers import NS, START, Messages, typestore, write_bag
 
 from nfc_gym.core import InputError
 from nfc_gym.measured.align import Use, align
+from nfc_gym.measured.columns import LogColumns
+from nfc_gym.measured.entries import TimeColumn
+from nfc_gym.measured.log_time import time_of
 from nfc_gym.measured.readers import Streams, read_table
 
 pytest.importorskip("rosbags", reason="needs rosbags: pip install 'nfc_gym[ros]'")
@@ -146,6 +149,17 @@ def test_stamps_that_were_never_set_are_not_believed(tmp_path: Path) -> None:
         "/plain": "receive time, as its messages have no stamp",
     }
     np.testing.assert_allclose(table["/unset.time"], np.arange(5) * 0.1)
+
+
+def test_a_topic_whose_own_stamps_go_back_may_be_timed_by_its_receipt(tmp_path: Path) -> None:
+    stamps = START + np.array([1, 2, 3, 2, 3, 4]) * NS // 100
+    messages = [(START + i * NS // 100, make.command(int(ns), 0.1 * i)) for i, ns in enumerate(stamps)]
+    table = read_table(write_bag(tmp_path / "bag", STORE, {"/u": ("machine_msgs/msg/Stamped", messages)}))
+    with pytest.raises(InputError, match=r"goes back at row 3.*; or name '/u\.received', or the time of another topic"):
+        time_of(TimeColumn(columns=("/u.time",)), LogColumns(table), ["/u.data"])
+    np.testing.assert_allclose(
+        time_of(TimeColumn(columns=("/u.received",)), LogColumns(table), []), 0.01 * np.arange(6)
+    )
 
 
 def test_a_bag_of_several_files_is_one_log(tmp_path: Path) -> None:
