@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 from nfc_gym.core import InputError
 from nfc_gym.core.units import UNITS, si_unit, spread_to_si, to_si
 from nfc_gym.measured.columns import LogColumns
-from nfc_gym.measured.readers import read_table, register_reader, suffixes
+from nfc_gym.measured.readers import csv_file, read_table, register_reader, suffixes
 
 T = np.linspace(0, 1, 200)
 Q = np.random.default_rng(0).standard_normal(200)
@@ -132,6 +132,22 @@ def test_csv_of_another_encoding_says_so(tmp_path: Path, encoding: str, byte: st
     path.write_bytes("t;Winkel (°)\n0;1.5\n0.1;2.5\n".encode(encoding))
     with pytest.raises(InputError, match=rf"is no UTF-8 text \(byte {byte}\); save it with that encoding"):
         read_table(path)
+
+
+def test_long_csv_is_read_in_pieces_and_its_faults_are_found_in_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(csv_file, "_ROWS", 64)
+    path = tmp_path / "log.csv"
+    pd.DataFrame({"t": T, "q": Q, "note": ["idle"] * 200, "count": range(200)}).to_csv(path, index=False)
+    table = read_table(path, names={"t", "q", "count"})
+    np.testing.assert_array_equal(table["q"], Q)
+    np.testing.assert_array_equal(table["count"], np.arange(200))
+    assert table["note"].size == 0
+    assert read_table(path)["note"].tolist() == ["idle"] * 200
+    path.write_text(path.read_text() + "1,2,idle,3,4\n")
+    with pytest.raises(InputError, match="truncated or not a csv file"):
+        read_table(path, names={"t", "q"})
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".npz"])

@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 for _suffix, _reader, _selective in (
-    (".csv", read_csv, False),
+    (".csv", read_csv, True),
     (".parquet", read_parquet, True),
     (".npz", read_npz, True),
     (".mat", read_mat, False),

@@ -5,17 +5,22 @@ import itertools
 import os
 import re
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 
+import numpy as np
+
 from nfc_gym.core import InputError
-from nfc_gym.measured.readers.registry import Table, broken
+from nfc_gym.measured.readers.registry import Table, broken, wanted
 
 _QUOTED = re.compile(r'"[^"]*"')
 _LONGEST = 1 << 16  # bytes of a row
+_ROWS = 1 << 14  # rows that are read at once, of which the wanted columns are kept
 
 
-def read_csv(path: Path) -> Table:
-    """Columns by their header; separated by commas, semicolons or tabs."""
+def read_csv(path: Path, columns: Collection[str] | None = None) -> Table:
+    """Columns by their header; separated by commas, semicolons or tabs. Of those that none of `columns` belongs to only
+    the name is kept."""
     import pandas as pd
 
     header_line = ""
@@ -32,8 +37,14 @@ def read_csv(path: Path) -> Table:
             raise InputError(
                 f"{path}: column {twice[0]!r} appears {header.count(twice[0])} times; rename or remove one"
             )
-        with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):  # rows longer than the header
-            frame = pd.read_csv(path, sep=separator, encoding="utf-8-sig", skipinitialspace=True, index_col=False)
+        # Rows longer than the header are warned of, or refused; not with `usecols`, with which they pass.
+        with (
+            warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),
+            pd.read_csv(
+                path, sep=separator, encoding="utf-8-sig", skipinitialspace=True, index_col=False, chunksize=_ROWS
+            ) as frames,
+        ):
+            parts = [{str(n).strip(): f[n].to_numpy() for n in f if wanted(str(n).strip(), columns)} for f in frames]
         _require_whole(path, separator, len(next(csv.reader(lines[1:], delimiter=separator))))
     except (pd.errors.ParserWarning, pd.errors.ParserError) as e:
         if header_line.lstrip().startswith(("#", "//", "%")):
@@ -47,7 +58,9 @@ def read_csv(path: Path) -> Table:
         ) from None
     except (csv.Error, pd.errors.EmptyDataError) as e:
         raise broken(path, e) from None
-    return {str(name).strip(): frame[name].to_numpy() for name in frame.columns}
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} | {
+        name: np.empty(0) for name in header if name and name not in parts[0]
+    }
 
 
 def _require_whole(path: Path, separator: str, width: int) -> None:
