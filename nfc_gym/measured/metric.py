@@ -11,6 +11,7 @@ Array = NDArray[np.float64]
 _UNSTABLE = 30.0  # standard deviations that every number of an unstable block counts as
 _SEEN = 0.64  # of a squared error: where noise makes up more of it, the error is not counted
 _NOTHING = 0.05  # of the noise's variance: a squared error that exceeds it by less counts as taken away whole
+_SHARES = (0.0, *10.0 ** np.arange(-6, 1.5, 0.5))  # of the errors' variance, among which slack is looked for
 _TURN = 3.0  # standard deviations at which the loss turns from squared to linear
 
 
@@ -76,19 +77,48 @@ def unexplained_variance(problem: Problem, residual: Array, sigma: Array) -> Arr
     """
     values = np.where(problem.mask & np.isfinite(residual), residual, np.nan)
     expected = np.where(problem.mask, np.einsum("sii->si", sigma), np.nan)
-    c = problem.columns
-    kinds = list(zip(c.group, c.place, c.horizon.tolist(), strict=True))
-    out = np.zeros(len(c))
-    for kind in dict.fromkeys(kinds):
-        of = np.array([k == kind for k in kinds])
+    out = np.zeros(len(problem.columns))
+    for of in _kinds(problem):
         errors, known = values[:, of], expected[:, of]
         if not np.isfinite(errors).any():
             continue
-        spread = (1.4826 * np.nanmedian(np.abs(errors))) ** 2
+        spread = _spread(errors)
         # Where bodies touch, some blocks are far out for reasons of their own; they must not buy all the others slack.
         heavy = 0.0 if problem.rough else np.nanmean(np.minimum(errors**2, 9 * spread if spread > 0 else np.inf))
         out[of] = max(max(spread, heavy) - np.nanmedian(known), 0.0)
     return out
+
+
+def likeliest_slack(problem: Problem, residual: Array, sigma: Array) -> Array:
+    """(m,) slack by which a model's own errors are the likeliest: that of each kind of column, and some in all of them.
+
+    Noise that is carried through a roll-out goes the same way at all horizons. An error of its size may be impossible
+    across that way, of which no column by itself tells; and without slack there a model that mends half of the errors,
+    and so expects less noise, would be thought the worse for it.
+
+    Args:
+      residual: (S, m) of the model.
+      sigma: (S, m, m) covariance of the noise that it expects.
+    """
+    values = np.where(problem.mask & np.isfinite(residual), residual, np.nan)
+    least, spread = unexplained_variance(problem, residual, sigma), np.zeros(len(problem.columns))
+    for of in _kinds(problem):
+        if np.isfinite(values[:, of]).any():
+            spread[of] = _spread(values[:, of])
+    tried = [least + share * spread for share in _SHARES]
+    return min(tried, key=lambda extra: float(metric(problem, sigma, extra).surprise(residual[None]).sum()))
+
+
+def _kinds(problem: Problem) -> list[NDArray[np.bool_]]:
+    """(m,) which columns are of each kind: one quantity at one place and one horizon."""
+    c = problem.columns
+    kinds = list(zip(c.group, c.place, c.horizon.tolist(), strict=True))
+    return [np.array([k == kind for k in kinds]) for kind in dict.fromkeys(kinds)]
+
+
+def _spread(errors: Array) -> float:
+    """Variance by the middle of errors' spread; NaN are none."""
+    return float(1.4826 * np.nanmedian(np.abs(errors))) ** 2
 
 
 def metric(problem: Problem, sigma: Array, extra: Array | None = None) -> Metric:

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.fit import Fit, fit
-from nfc_gym.measured.metric import Metric, metric
+from nfc_gym.measured.metric import Metric, likeliest_slack, metric
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.settle import slack
 
 Array = NDArray[np.float64]
 _ROUNDS, _TURNS = 6, 2  # iterations of each fit, with the slopes at hand; fits and slacks in turns
@@ -54,7 +53,8 @@ def owned(fitted: Fit, fit_data: Data, select: Data, under: Metric) -> Owned:
     plant, sigma = fitted.plant, fit_data.expected(fitted).sigma
     best, by, extra = fitted, under, np.zeros(len(under.mask.T))
     for _ in range(_TURNS):
-        extra = slack(fit_data.problem, sigma, plant, best.x)
+        residual = fit_data.problem.residual(plant, best.x[None])[0]
+        extra = likeliest_slack(fit_data.problem, residual, sigma)
         before, by = by, metric(fit_data.problem, sigma, extra)
         best = fit(fit_data.problem, by, plant, best.x, _ROUNDS, known=by.translated(best.jacobian, before))
     on = metric(select.problem, select.expected(fitted).sigma, extra)

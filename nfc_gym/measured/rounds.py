@@ -1,6 +1,6 @@
 """One round of the search: refit the shortlist, judge it on the selection logs, and decide which law is accepted."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from nfc_gym.measured.arena import Arena, contains, contains_any
@@ -213,6 +213,9 @@ class Contest:
         like = mimics(self._known[new[0].id], others, self.screen.projected)
         return [arena.enter_beside(best, [s]) for s in (*kin, *like)]
 
+    def _look(self, effect: Effect) -> Screened:
+        return self._screened(effect.id) or self.screen.try_one(effect)
+
     def _screened(self, name: str) -> Screened | None:
         """A candidate as screening has it; None where there is none of that id.
 
@@ -352,7 +355,6 @@ class Contest:
         """
         arena, best = self.arena, believed[0]
         winner = arena.new(best)[0]
-        added = len(best.fitted.plant.effects) > len(arena.current.plant.effects)
 
         def enough(j: Judged) -> float:
             rival = arena.new(j)[0]
@@ -360,24 +362,32 @@ class Contest:
             return _SHARED if wider else NEARLY
 
         rivals = [j for j in believed if j.total > enough(j) * best.total and arena.ties(best, j)]
-        for parts in self._plainer(winner) if added else []:
-            plain = arena.enter_beside(best, parts)  # psi is the law's own: from elsewhere a fit may end in a hollow
-            if self._believed(plain) and plain.total > NEARLY * best.total and arena.ties(best, plain):
-                rivals.append(plain)
+        plainer = (p for p in self._plainer(best) if self._believed(p) and p.total > NEARLY * best.total)
+        rivals += [p for p in plainer if arena.ties(best, p)]
         chosen = min(rivals, key=lambda j: (len(j.fitted.x), -len(arena.new(j)[0].where), -j.total))
         return next((j for j in rivals if arena.nearer(j, chosen)), chosen)
 
-    def _plainer(self, law: Effect) -> list[list[Screened]]:
-        """The sets of plainer laws that a law contains, screened at its place."""
-        out = []
+    def _plainer(self, best: Judged) -> Iterator[Judged]:
+        """Fits of the plainer laws that the leading one contains, in its place.
+
+        Where it is an accepted law with values of its own at each place, that law leaves with it. Their psi begins as
+        the leading law's own: from elsewhere a fit may end in a hollow.
+        """
+        arena, look = self.arena, self._look
+        law, *more = arena.new(best)
+        gone = [e for e in arena.current.plant.effects if not any(e is kept for kept in best.fitted.plant.effects)]
+        if more or not law.simpler:
+            return
+        if gone:
+            arena = arena.without(gone[0])
+            look = Screen(arena.fit_data.problem, arena.under, arena.current).try_one
         for families in law.simpler:
-            parts = [p for f in families if (p := self._screened(f"{f}:{law.place}")) is not None]
+            plain = [e for f in families if (e := self.pool.get(f"{f}:{law.place}")) is not None]
             if isinstance(law, Each):
-                apart = [split(p.effect, self.screen.current.plant) for p in parts]
-                parts = [self.screen.try_one(a[0]) for a in apart if a is not None]
-            if len(parts) == len(families):
-                out.append(parts)
-        return out
+                plain = [apart[0] for e in plain if (apart := split(e, arena.current.plant)) is not None]
+            if len(plain) == len(families):
+                entered = arena.enter_beside(best, [look(e) for e in plain])
+                yield self.arena.judge(entered.fitted) if gone else entered
 
 
 def _too_many(ids: Sequence[str]) -> bool:

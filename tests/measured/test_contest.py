@@ -24,6 +24,7 @@ from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.rounds import Contest
 from nfc_gym.measured.screen import Screened, likeness
 from nfc_gym.physics.effects import FAMILIES
+from nfc_gym.physics.effects.each import each
 
 
 class Line(Problem):
@@ -258,10 +259,47 @@ def test_plainer_laws_are_tried_though_screening_left_them_out() -> None:
     """Friction by direction is dry friction and a preload together, neither of which leads alone in a large pool."""
     law, coulomb, force = (FAMILIES[f](("hinge",)) for f in ("directional_friction", "coulomb", "external_force"))
     screen = SimpleNamespace(try_one=lambda effect: SimpleNamespace(effect=effect))
-    arena = SimpleNamespace(fit_data=SimpleNamespace(problem=SimpleNamespace(rough=False)))
-    contest = Contest(arena, screen, [], 8, 0.02, [law, coulomb, force])  # pyright: ignore[reportArgumentType]
-    sets = [[p.effect for p in parts] for parts in contest._plainer(law)]
-    assert sets == [[coulomb], [coulomb, force]]
+    best = SimpleNamespace(fitted=SimpleNamespace(plant=SimpleNamespace(effects=[law])))
+    arena = SimpleNamespace(
+        fit_data=SimpleNamespace(problem=SimpleNamespace(rough=False)),
+        current=SimpleNamespace(plant=SimpleNamespace(effects=[])),
+        new=lambda judged: [law],
+        enter_beside=lambda leader, picks: [p.effect for p in picks],
+    )
+    contest: Any = Contest(arena, screen, [], 8, 0.02, [law, coulomb, force])  # pyright: ignore[reportArgumentType]
+    assert list(contest._plainer(best)) == [[coulomb], [coulomb, force]]
+
+
+def test_plainer_laws_take_the_place_of_an_accepted_one_that_wants_values_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Friction by direction at all joints alike came first; with values at each joint it is two plainer laws there."""
+    alike, coulomb, force, other = (
+        FAMILIES[f](("hip", "knee")) for f in ("directional_friction", "coulomb", "external_force", "armature")
+    )
+    parts = lambda effect: each([type(effect)((name,)) for name in effect.where])  # noqa: E731
+    monkeypatch.setattr("nfc_gym.measured.rounds.split", lambda effect, plant: (parts(effect), None))
+    monkeypatch.setattr("nfc_gym.measured.rounds.Screen", lambda *_: SimpleNamespace(try_one=screened))
+    screened = lambda effect: SimpleNamespace(effect=effect)  # noqa: E731
+    law = parts(alike)
+
+    def arena(effects: list) -> Any:
+        return SimpleNamespace(
+            fit_data=SimpleNamespace(problem=SimpleNamespace(rough=False)),
+            under=None,
+            current=SimpleNamespace(plant=SimpleNamespace(effects=effects)),
+            new=lambda judged: [law],
+            without=lambda effect: arena([e for e in effects if e is not effect]),
+            enter_beside=lambda leader, picks: SimpleNamespace(fitted=[*effects, *(p.effect for p in picks)]),
+            judge=lambda fitted: [e.id for e in fitted],
+        )
+
+    best = SimpleNamespace(fitted=SimpleNamespace(plant=SimpleNamespace(effects=[other, law])))
+    contest: Any = Contest(arena([alike, other]), None, [], 8, 0.02, [alike, coulomb, force])  # pyright: ignore[reportArgumentType]
+    assert list(contest._plainer(best)) == [
+        ["armature:hip+knee", "coulomb:hip+knee:each"],
+        ["armature:hip+knee", "coulomb:hip+knee:each", "external_force:hip+knee:each"],
+    ]
 
 
 def candidate(name: str, columns: list[list[float]]) -> Screened:

@@ -1,9 +1,11 @@
 """Whitening gives unit variance under its own covariance; the loss is a square near zero and a line far out."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from nfc_gym.measured.metric import TURN, loss, loss_weight, metric, unexplained_variance
+from nfc_gym.measured.metric import TURN, likeliest_slack, loss, loss_weight, metric, unexplained_variance
 from nfc_gym.measured.problem import Columns, Problem
 
 SIZE, WIDTH = 3, 5
@@ -126,3 +128,29 @@ def test_what_one_metric_whitened_is_seen_by_another() -> None:
     residual = rng.normal(size=(1, SIZE, WIDTH))
     seen = other.translated(one.whiten(residual)[0][..., None], one)[..., 0]
     np.testing.assert_allclose(seen, other.whiten(residual)[0], rtol=1e-9)
+
+
+def test_a_model_that_errs_less_is_the_likelier_though_it_expects_less_noise() -> None:
+    """Noise that goes the same way in both columns; errors of its size across that way, of which no column tells."""
+    rng, blocks = np.random.default_rng(3), 4000
+    problem = Plain(np.ones((blocks, 2), bool))
+    along = np.ones((2, 2)) + 1e-8 * np.eye(2)
+
+    def surprise(noise: float, error: float, slack: Callable = likeliest_slack) -> float:
+        sigma = np.broadcast_to(noise**2 * along, (blocks, 2, 2))
+        residual = error * rng.normal(size=(blocks, 1)) * [1, -1] + 1e-4 * noise * rng.normal(size=(blocks, 1))
+        return float(metric(problem, sigma, slack(problem, residual, sigma)).surprise(residual[None]).sum())
+
+    worse, better, right = (2.0, 4.0), (1.0, 0.9), (1.0, 0.0)
+    assert surprise(*worse) > surprise(*better) + blocks
+    assert surprise(*better) > surprise(*right) + blocks
+    # Column by column nothing is missing in the better one, whose errors are then beyond belief.
+    assert surprise(*worse, slack=unexplained_variance) < surprise(*better, slack=unexplained_variance) - blocks
+
+
+def test_slack_is_least_where_the_noise_explains_the_errors() -> None:
+    rng, blocks = np.random.default_rng(5), 4000
+    problem, sigma = Plain(np.ones((blocks, 2), bool)), np.array([[1.0, 0.6], [0.6, 1.0]])
+    residual = rng.multivariate_normal(np.zeros(2), sigma, blocks)
+    extra = likeliest_slack(problem, residual, np.broadcast_to(sigma, (blocks, 2, 2)))
+    assert (extra < 0.05).all()

@@ -1,6 +1,8 @@
 """Looking closer where bodies may touch: sizes are climbed, and blocks with large errors are never left out."""
 
 import copy
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.fisher import Lens, repeated
 from nfc_gym.measured.fit import Fit, stand
-from nfc_gym.measured.lookout import Lookout
+from nfc_gym.measured.lookout import Lookout, _pursued
 from nfc_gym.measured.metric import loss, metric
 from nfc_gym.measured.screen import Screen, answer, ladder
 from nfc_gym.measured.segments import Layout
@@ -188,3 +190,14 @@ def test_a_model_without_free_parameters_answers_nothing() -> None:
     model = mujoco.MjModel.from_xml_string(MODEL)
     bare = Fit(Plant(model, ParameterSpace(model, [])), np.zeros(0), np.ones((5, 3)), np.zeros((5, 3, 0)))
     assert answer(bare, np.ones((2, 5, 3))).shape == (2, 0)
+
+
+def test_sets_of_places_and_the_best_of_each_family_are_pursued_whatever_straight_lines_say() -> None:
+    of = lambda family, where, gain: SimpleNamespace(effect=SimpleNamespace(family=family, where=where), gain=gain)  # noqa: E731
+    lead = [of("gain", (f"joint_{i}",), 100.0 - i) for i in range(45)]
+    late = [
+        of("inertia", ("knee",), 5.0), of("gain", ("a", "b"), 4.0), of("inertia", ("hip",), 3.0),
+        of("inertia", ("l", "r"), 2.0), of("lag", ("l", "r"), 0.0),
+    ]  # fmt: skip
+    found: Any = [*lead, *late]
+    assert _pursued(found) == [*lead[:40], late[0], late[1], late[3]]
