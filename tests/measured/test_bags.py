@@ -225,6 +225,23 @@ def test_a_flipped_bit_is_refused_or_harmless(tmp_path: Path, at: float, bit: in
     assert isinstance(table, Streams)
 
 
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+def test_a_compressed_recording_is_read_by_its_folder(tmp_path: Path, mode: str) -> None:
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with writer as bag:
+        connection = bag.add_connection("/u", "machine_msgs/msg/Stamped", typestore=STORE)
+        for i in range(20):
+            ns = START + i * NS
+            bag.write(connection, ns, STORE.serialize_cdr(make.command(ns, float(i)), "machine_msgs/msg/Stamped"))
+    np.testing.assert_array_equal(read_table(tmp_path / "bag")["/u.data"], np.arange(20))
+    file = next(p for p in (tmp_path / "bag").iterdir() if p.name != "metadata.yaml")
+    with pytest.raises(InputError, match=r"compressed.* name the .*folder"):
+        read_table(file)
+
+
 def test_an_mcap_file_of_other_messages_says_so(tmp_path: Path) -> None:
     path = write_bag(
         tmp_path / "bag",

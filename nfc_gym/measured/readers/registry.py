@@ -96,6 +96,7 @@ def read_table(path: Path, part: str = "", names: Collection[str] | None = None)
     if entry is None:
         raise InputError(
             f"{path}: no reader for {path.suffix or 'a file without suffix'}; known: {', '.join(_SUFFIXES)}"
+            f"{_packed(path)}"
         )
     _require(path)
     arguments = ((part,) if entry.parts else ()) + ((names,) if entry.selective else ())
@@ -134,6 +135,12 @@ def _why_no_log(path: Path) -> str:
     if inside & {".db3", ".mcap"}:
         return "; a rosbag2 folder without metadata.yaml: write it with `ros2 bag reindex`, or name the file inside"
     return f"; a folder is a log where it holds {' or '.join(_FOLDERS)}"
+
+
+def _packed(path: Path) -> str:
+    """What to do with a compressed file of a recording."""
+    inside = path.suffix == ".zstd" and Path(path.stem).suffix in _SUFFIXES
+    return "; of a recording that was compressed name the folder, with its metadata.yaml" if inside else ""
 
 
 def _as_seconds(values: NDArray[Any]) -> NDArray[Any]:

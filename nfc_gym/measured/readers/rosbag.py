@@ -26,6 +26,7 @@ from nfc_gym.measured.readers.streams import Stream, Streams
 LARGEST_MESSAGE = 1 << 16  # bytes
 _MCAP = b"\x89MCAP0\r\n\x01"  # magic and the header's opcode; its length follows, then the profile
 _PROFILE_AT, _LONGEST_PROFILE = len(_MCAP) + 8, 64  # bytes
+_ZSTD = b"\x28\xb5\x2f\xfd"  # magic; a message begins with its encoding
 _CHUNK = 4096  # messages that are held before they become columns
 _TF = "tf2_msgs/msg/TFMessage"
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"
@@ -96,6 +97,9 @@ def _messages(bag: Any, types: Types, names: Collection[str] | None) -> tuple[di
         silent.pop(name, None)
         if len(raw) > LARGEST_MESSAGE:
             refused[name] = f"its messages are larger than {LARGEST_MESSAGE >> 10} KiB"
+            continue
+        if raw[: len(_ZSTD)] == _ZSTD:
+            refused[name] = "its messages are compressed: name the recording's folder, whose metadata.yaml says how"
             continue
         if msgtype not in bag.typestore.fielddefs:
             refused[name] = f"its type {msgtype} is not defined in the recording: record it again as MCAP"
