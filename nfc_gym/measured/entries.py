@@ -3,10 +3,11 @@
 import re
 from typing import Annotated, Any, Literal, Self, cast
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from nfc_gym.core import units
+from nfc_gym.measured.readers.streams import normal_name
 from nfc_gym.measured.yaml_marks import suggest
 from nfc_gym.physics.parameters import Parameter
 
@@ -79,6 +80,7 @@ class _Columns(Strict):
         for name in value:
             if re.fullmatch(r"[-+]?\d+(\.\d*)?([eE][-+]?\d+)?", name):
                 raise PydanticCustomError("literal", "'{name}' is a number, not a column; use `scale`", {"name": name})
+        value = tuple(map(normal_name, value))
         twice = [name for name in value if value.count(name) > 1]
         if twice:
             raise PydanticCustomError("twice", "column '{name}' appears twice", {"name": twice[0]})
@@ -153,7 +155,7 @@ class Measured(_Signal):
     order: Literal["wxyz", "xyzw"] | None = None
     axes: tuple[Literal["x", "y", "z"] | Annotated[int, Field(ge=0)], ...] | None = None
     smooth: Annotated[int, Field(ge=1)] = 1
-    mask: str | None = None
+    mask: Annotated[str, AfterValidator(normal_name)] | None = None
     shift: Finite = 0.0  # s by which its stamps are late: a sample stamped t was taken at t - shift
 
     @property

@@ -1,6 +1,7 @@
 """Bags that `rosbags` writes come back field by field and stamp by stamp; damaged ones are refused by name."""
 
 import sys
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,16 @@ def test_joints_are_addressed_by_name_whatever_their_order(tmp_path: Path) -> No
     table = read_table(write_bag(tmp_path / "b", STORE, {"/js": ("sensor_msgs/msg/JointState", steady)}))
     np.testing.assert_array_equal(table["/js.position"][:, 1], table["/js.position[knee]"])
     assert "/js.velocity" not in table  # empty in every message
+
+
+def test_joints_with_accents_are_addressed_however_they_were_written(tmp_path: Path) -> None:
+    name = unicodedata.normalize("NFD", "hüfte")
+    messages = [(START + i * NS, make.joints(START + i * NS, [name], [0.1 * i])) for i in range(5)]
+    table = read_table(write_bag(tmp_path / "bag", STORE, {"/js": ("sensor_msgs/msg/JointState", messages)}))
+    assert isinstance(table, Streams)
+    column = unicodedata.normalize("NFC", "/js.position[hüfte]")
+    np.testing.assert_allclose(table[column], 0.1 * np.arange(5))
+    assert table.owner(column) is table.streams[0]
 
 
 def test_two_publishers_of_one_topic_are_two_sampled_sets_of_joints(tmp_path: Path) -> None:

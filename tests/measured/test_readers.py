@@ -1,7 +1,9 @@
 """Readers: what is written comes back; what is damaged, foreign or empty is refused by name."""
 
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +18,7 @@ from hypothesis.extra.numpy import arrays
 from nfc_gym.core import InputError
 from nfc_gym.core.units import UNITS, si_unit, spread_to_si, to_si
 from nfc_gym.measured.columns import LogColumns
+from nfc_gym.measured.entries import Measured
 from nfc_gym.measured.readers import csv_file, read_table, register_reader, suffixes
 
 T = np.linspace(0, 1, 200)
@@ -168,6 +171,18 @@ def test_what_nobody_asks_for_is_not_read(tmp_path: Path, suffix: str) -> None:
     assert list(table) == ["t", "q", "picture"]  # the name is there, to be suggested
     assert table["picture"].size == 0
     assert read_table(path)["picture"].shape == (4000, 500)
+
+
+@pytest.mark.parametrize(("written", "asked"), [("NFD", "NFC"), ("NFC", "NFD")])
+def test_accented_letters_are_one_name_however_they_are_written(tmp_path: Path, written: Any, asked: Any) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(unicodedata.normalize(written, "t,Größe,gültig\n0,1,1\n1,2,0\n"), encoding="utf-8")
+    name, mask = (unicodedata.normalize(asked, n) for n in ("Größe", "gültig"))
+    entry = Measured.model_validate({"column": name, "unit": "m", "mask": mask})
+    columns = LogColumns(read_table(path, names={"t", *entry.columns, str(entry.mask)}))
+    columns.time("t")
+    assert columns.one(entry.columns[0]).tolist() == [1, 2]
+    assert columns.mask(str(entry.mask)).tolist() == [True, False]
 
 
 def test_pickled_objects_are_not_opened(tmp_path: Path) -> None:

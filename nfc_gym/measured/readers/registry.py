@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core import InputError, NfcError
-from nfc_gym.measured.readers.streams import Streams
+from nfc_gym.measured.readers.streams import Streams, normal_name
 
 Table = dict[str, NDArray[Any]]
 Reader = Callable[[Path], Table]
@@ -103,7 +103,7 @@ def read_table(path: Path, part: str = "", names: Collection[str] | None = None)
     with parsing(path):
         table = entry.read(path, *arguments)
         if not isinstance(table, Streams):
-            table = {str(name): _as_seconds(np.asarray(values)) for name, values in table.items()}
+            table = {normal_name(str(name)): _as_seconds(np.asarray(values)) for name, values in table.items()}
     if not table:
         raise InputError(f"{path}: the file holds no column")
     return table
@@ -111,6 +111,7 @@ def read_table(path: Path, part: str = "", names: Collection[str] | None = None)
 
 def wanted(column: str, names: Collection[str] | None) -> bool:
     """Whether one of `names` is that column or an entry of it, `column[i]`; None is every column."""
+    column = normal_name(column)
     return names is None or any(name == column or name.startswith(f"{column}[") for name in names)
 
 

@@ -1,5 +1,6 @@
 """`Streams`: a table whose columns were sampled by several clocks, each at its own times."""
 
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -28,6 +29,11 @@ class Stream:
     received: Stamps
     clock: str
     columns: Mapping[str, NDArray[Any]]
+
+
+def normal_name(name: str) -> str:
+    """A column's name as it is compared: an accented letter is one character, whatever system wrote the file."""
+    return unicodedata.normalize("NFC", name)
 
 
 class Streams(dict[str, NDArray[Any]]):
@@ -60,8 +66,8 @@ class Streams(dict[str, NDArray[Any]]):
         }
         for stream in streams:
             for column, values in stream.columns.items():
-                self[f"{stream.name}.{column}"] = values
-                self._owners[f"{stream.name}.{column}"] = stream
+                name = normal_name(f"{stream.name}.{column}")
+                self[name], self._owners[name] = values, stream
             for kind, label in (("stamps", "time"), ("received", "received")):
                 name = f"{stream.name}.{label}"
                 seconds = self.seconds(stream, kind)
