@@ -90,17 +90,15 @@ def _recounted(
     """Take out of the report the equivalents that all segments exclude, of which the search saw so many; in words."""
     effects = {e["id"]: e for e in report["effects"]}
     listed = [(ask, p) for ask, p in pairs if p[1] in rivals_of(effects.get(p[0], {}), report["effects"])]
-    segments = len(bench.searched(logs))
-    if not listed or segments <= seen:
+    whole = bench.searched(logs) if listed else None
+    if whole is None or len(whole) <= seen:
         return []
     findings = []
-    for (_, (claim, rival)), gone in zip(
-        listed, excluded(bench, logs, [ask for ask, _ in listed], say, seed), strict=True
-    ):
+    for (_, (claim, rival)), gone in zip(listed, excluded(whole, [ask for ask, _ in listed], say, seed), strict=True):
         if gone:
             effects[claim]["equivalents"] = [i for i in effects[claim]["equivalents"] if i != rival]
             text = f"{rival} does as well as {claim} on the {seen} segments that were searched, and is excluded by all"
-            findings.append({"kind": "recount", "text": f"{text} {segments}: it is no equivalent."})
+            findings.append({"kind": "recount", "text": f"{text} {len(whole)}: it is no equivalent."})
     return findings
 
 

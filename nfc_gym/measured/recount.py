@@ -8,30 +8,27 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from nfc_gym.core.log import Log
-from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.contest import bootstrap, clusters, dispersion, losses, price
 from nfc_gym.measured.distances import Ask
 from nfc_gym.measured.fit import fit
 from nfc_gym.measured.metric import metric
+from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.settle import slack
 
 LEVEL = 0.025  # as in the contest
 _ROUNDS = 12  # iterations of each fit
 
 
-def excluded(
-    bench: Bench, logs: Sequence[Log], asks: Sequence[Ask], say: Callable[[str], None], seed: int
-) -> list[bool]:
+def excluded(whole: Problem, asks: Sequence[Ask], say: Callable[[str], None], seed: int) -> list[bool]:
     """Whether each rival, refitted to all segments, explains them worse than what it is a rival of.
 
     Args:
+      whole: the segments.
       asks: questions of one truth.
 
     Returns:
       One bool each, at the contest's level. False where bodies touch: there slopes alone do not lead to the best fit.
     """
-    whole = bench.searched(logs)
     if whole.rough or not asks:
         return [False] * len(asks)
     plant, x = asks[0].truth.plant, asks[0].truth.x

@@ -45,13 +45,13 @@ def machine(tmp_path: Path) -> Machine:
 def test_who_explains_the_logs_worse_is_excluded_and_who_does_better_is_not(machine: Machine) -> None:
     bench, logs, fitted = machine(lively)
     dry, viscous = fitted(*DRY), fitted(*VISCOUS)
-    assert excluded(bench, logs, [Ask(dry, viscous, TOLD), Ask(dry, dry, TOLD)], print, 0) == [True, False]
-    assert excluded(bench, logs, [Ask(viscous, dry, TOLD)], print, 0) == [False]
+    assert excluded(bench.searched(logs), [Ask(dry, viscous, TOLD), Ask(dry, dry, TOLD)], print, 0) == [True, False]
+    assert excluded(bench.searched(logs), [Ask(viscous, dry, TOLD)], print, 0) == [False]
 
 
 def test_who_explains_the_logs_as_well_is_not_excluded(machine: Machine) -> None:
     bench, logs, fitted = machine(steady)
-    assert excluded(bench, logs, [Ask(fitted(*DRY), fitted(*VISCOUS), TOLD)], print, 0) == [False]
+    assert excluded(bench.searched(logs), [Ask(fitted(*DRY), fitted(*VISCOUS), TOLD)], print, 0) == [False]
 
 
 def test_an_equivalent_that_the_searched_segments_alone_could_not_exclude_is_taken_out(machine: Machine) -> None:
