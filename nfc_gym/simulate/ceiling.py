@@ -43,11 +43,20 @@ def ceiling(
       nthread: threads of the simulation; 0 takes every core.
       before: (nv, nv) covariance of the velocities with which windows begin (`starts.spread`): then they are known
         through the first observation alone, as to whoever infers. None takes them as known exactly, a higher ceiling.
+
+    Raises:
+      InputError: windows or noise of another robot.
     """
     machine = Machine(environment)
     sd = machine.noise if noise is None else np.asarray(noise, float)
     if sd.shape != (machine.kind.proprio_size,):
         raise InputError(f"noise has shape {sd.shape}, want ({machine.kind.proprio_size},): one of each state entry")
+    got = windows["psi"].shape[-1], windows["actions"].shape[-1]
+    if got != (len(machine.space), machine.kind.action_size):
+        raise InputError(
+            f"ceiling: windows of {got[0]} parameters and {got[1]} actions; {machine.environment} has "
+            f"{len(machine.space)} and {machine.kind.action_size}"
+        )
     if motor == 0:
         cloud, pairs = 0, 1
     n, horizon, size = windows["actions"].shape

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
+from nfc_gym.core.whole import require_share, require_whole
 from nfc_gym.envs.quadcopter import Quadcopter
 from nfc_gym.envs.simulations import Simulations
 from nfc_gym.inference.detector import checked
@@ -66,7 +67,8 @@ class Replay:
       nthread: threads; the scores do not depend on them.
 
     Raises:
-      InputError: no such environment, a belief of other parameters, no ground where one is needed.
+      InputError: no such environment, a belief of other parameters, no ground where one is needed, fewer than 2 draws,
+        or a noise of motors that is no share.
     """
 
     def __init__(
@@ -75,8 +77,8 @@ class Replay:
         standing: VectorEnv | Callable[[], Any] | None = None, seed: int = 0, nthread: int = 1,
     ) -> None:  # fmt: skip
         self.machine = machine = Machine(environment)
-        if draws < 2:
-            raise InputError(f"replay: draws must be 2 or more, got {draws}")
+        require_whole("replay: draws", draws, 2)
+        require_share("replay: motor", motor)
         maps = [] if ground is None else [ground] if isinstance(ground, Heightfield) else list(ground)
         if machine.rough != bool(maps):
             raise InputError(
@@ -95,6 +97,10 @@ class Replay:
         self.lacks: tuple[Effect, Array] | None = None  # what every replay has beyond the model, see `under`
         self._residuals: Residuals
         self._sims: Simulations | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without its simulations, which no pickle holds: they are made anew for the next windows."""
+        return {k: v for k, v in self.__dict__.items() if k != "_residuals"} | {"_sims": None}
 
     def require_observed(self) -> None:
         """Raises `InputError` for a robot whose `proprio` does not tell its state: windows then need a `start`."""

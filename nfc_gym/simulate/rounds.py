@@ -9,6 +9,7 @@ import numpy as np
 import safetensors.numpy
 
 from nfc_gym.core.errors import InputError, MissingExtra
+from nfc_gym.core.whole import require_share, require_whole
 from nfc_gym.simulate import workers
 from nfc_gym.simulate.draws import Array
 from nfc_gym.simulate.machine import MOTOR, Machine
@@ -30,6 +31,9 @@ class Simulator:
       noise: what multiplies the sensors' noise, which is added to the states.
       recorded: motion that the windows repeat in place of excitation, see `recorded.Recorded`.
       names: arrays of the batch, as of `Windows`; `map` and `delta_e`, where named, are rebuilt.
+
+    Raises:
+      InputError: a share outside [0, 1], jobs that are no number of processes, or a noise below 0.
     """
 
     environment: str
@@ -42,6 +46,13 @@ class Simulator:
     names: Sequence[str] = ("states", "actions", "delta_s", "family")
     recorded: Recorded | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("effects", "motor", "policy_share"):
+            require_share(f"simulator: {name}", getattr(self, name))
+        require_whole("simulator: jobs", self.jobs, 0)
+        if not 0 <= self.noise < np.inf:
+            raise InputError(f"simulator: noise multiplies the sensors' own, want 0 or more, got {self.noise!r}")
+
     def __call__(self, psi: Array, rng: np.random.Generator) -> dict[str, Any]:
         """A batch of tensors with a leading axis of n windows.
 
@@ -50,7 +61,7 @@ class Simulator:
           rng: draws the seed, from which all else follows, and the sensors' noise.
 
         Raises:
-          InputError: psi of another size or outside the prior's box, or an array that windows do not have.
+          InputError: psi of another size or outside the prior's box, no psi, or an array that windows do not have.
           MissingExtra: torch is not installed.
         """
         return self._batch(len(psi), units(np.asarray(psi, float), Machine(self.environment).space, len(psi)), rng)
@@ -71,6 +82,7 @@ class Simulator:
             import torch
         except ImportError:
             raise MissingExtra("rounds of inference need torch: pip install 'nfc_gym[inference]'") from None
+        require_whole("simulator: the number of windows", n, 1)
         machine = Machine(self.environment)
         if self.recorded is not None:
             self.recorded.require(machine)

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable
 from nfc_gym.core.posterior import Sampler, load_source
-from nfc_gym.core.whole import require_whole
+from nfc_gym.core.whole import require_share, require_whole
 from nfc_gym.inference.windows import Manifest, Windows, WindowWriter
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.simulate import workers
@@ -111,12 +111,14 @@ def _check(
     ):
         require_whole(name, value, least)
     for name, share in (("effects", effects), ("policy_share", policy_share), ("motor", motor)):
-        if not 0 <= share <= 1:  # nan is no share either
-            raise InputError(f"{name} is {share!r}, want a share from 0 to 1")
+        require_share(name, share)
 
 
 def _opened(proposal: Sampler | str | Path | None) -> Sampler | None:
-    return load_source(proposal) if isinstance(proposal, str | Path) else proposal
+    found = load_source(proposal) if isinstance(proposal, str | Path) else proposal
+    if found is not None and not isinstance(found, Sampler):
+        raise InputError(f"proposal: want a file, or something with sample(n, rng), got {type(found).__name__}")
+    return found
 
 
 def drawn(sampler: Sampler, machine: Machine, seed: int, shard: int, n: int) -> Array:
@@ -146,7 +148,11 @@ def units(psi: Array | None, space: ParameterSpace, n: int) -> Array:
 
 def settled(policy: Act | str | Path | None) -> Act | str | None:
     """A policy as plans have it: a path is made absolute, as workers may stand elsewhere."""
-    return policy if callable(policy) or policy is None else str(Path(policy).resolve())
+    if callable(policy) or policy is None:
+        return policy
+    if not isinstance(policy, str | Path):
+        raise InputError(f"policy: want a file, or a callable of observations, got {type(policy).__name__}")
+    return str(Path(policy).resolve())
 
 
 def _digest(sampler: Sampler | None, seed: int, machine: Machine) -> str | None:

@@ -94,6 +94,11 @@ def test_noise_of_another_robot_is_refused(jackal: dict[str, np.ndarray]) -> Non
         ceiling("nfc_gym/JackalFlat-v0", jackal, noise=np.ones(52))
 
 
+def test_windows_of_another_robot_are_refused(jackal: dict[str, np.ndarray]) -> None:
+    with pytest.raises(InputError, match="windows of 17 parameters and 2 actions; nfc_gym/AntFlat-v0 has 21 and 8"):
+        ceiling("nfc_gym/AntFlat-v0", jackal)
+
+
 def test_a_residual_is_added_after_each_control_step(jackal: dict[str, np.ndarray]) -> None:
     machine = Machine("nfc_gym/JackalFlat-v0")
     one = {k: v[:1] for k, v in jackal.items()} | {"actions": jackal["actions"][:1, :2]}

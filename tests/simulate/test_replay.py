@@ -1,5 +1,8 @@
 """The replay: against the Kalman filter in closed form, and on a Jackal with and without faults."""
 
+import pickle
+from copy import deepcopy
+
 import gymnasium
 import mujoco
 import numpy as np
@@ -8,7 +11,9 @@ import pytest
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.inference.detector import WindowDetector
 from nfc_gym.inference.rates import Threshold, auroc
+from nfc_gym.physics.effects import build
 from nfc_gym.simulate import start
+from nfc_gym.simulate.bank import Fault, ReplayBank, faults_of
 from nfc_gym.simulate.ensemble import innovation
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
@@ -143,6 +148,25 @@ def test_bad_input_is_refused(machine: Machine, replay: Replay) -> None:
         Replay("nfc_gym/AntFlat-v0", draws=2).score(np.zeros((1, 51, 52)), np.zeros((1, 50, 8)))
     with pytest.raises(InputError, match="start must be finite"):
         replay.score(np.zeros((1, 51, 15)), np.zeros((1, 50, 2)), np.zeros((1, 3)))
+    with pytest.raises(InputError, match=r"replay: draws is 2\.5, want a whole number, 2 or more"):
+        Replay(JACKAL, draws=2.5)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"replay: motor is -0\.1, want a share from 0 to 1"):
+        Replay(JACKAL, motor=-0.1)
+
+
+def test_a_replay_that_has_scored_is_pickled_and_copied(machine: Machine, replay: Replay) -> None:
+    """With its threshold, and a bank of them, one of which has an effect."""
+    windows = trials(machine, np.tile(machine.space.nominal, (20, 1)), 3)
+    states, actions = windows["states"], windows["actions"]
+    detector = WindowDetector(replay).calibrated(states, actions, 0.2)
+    again = pickle.loads(pickle.dumps(detector))
+    assert again.threshold == detector.threshold
+    np.testing.assert_array_equal(again.scorer.score(states[:2], actions[:2]), replay.score(states[:2], actions[:2]))
+    weak = Fault("weak", np.ones(17), build("loss", machine.model.actuator(0).name, {"fraction": 0.3}))
+    bank = ReplayBank(JACKAL, faults=[*faults_of(machine)[:1], weak], draws=4)
+    expected = bank.gains(states[:2], actions[:2])
+    for other in (pickle.loads(pickle.dumps(bank)), deepcopy(bank)):
+        np.testing.assert_array_equal(other.gains(states[:2], actions[:2]), expected)
 
 
 @pytest.mark.parametrize("vector", [False, True])

@@ -42,3 +42,26 @@ def test_maps_where_they_are_named_and_errors_where_nothing_is() -> None:
         Simulator(JACKAL, jobs=1, names=("walls",))(psi, np.random.default_rng(0))
     with pytest.raises(InputError, match=r"base_mass is .* outside"):
         Simulator(JACKAL, jobs=1)(3 * psi, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"effects": 2.0}, r"simulator: effects is 2\.0, want a share from 0 to 1"),
+        ({"motor": float("nan")}, "simulator: motor is nan, want a share"),
+        ({"policy_share": -0.1}, r"simulator: policy_share is -0\.1"),
+        ({"jobs": 1.5}, r"simulator: jobs is 1\.5, want a whole number, 0 or more"),
+        ({"noise": -1.0}, r"noise multiplies the sensors' own, want 0 or more, got -1\.0"),
+        ({"noise": float("nan")}, "want 0 or more, got nan"),
+    ],
+)
+def test_settings_that_make_no_windows_are_refused(wrong: dict[str, float], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        Simulator(JACKAL, **wrong)  # type: ignore[arg-type]
+
+
+def test_no_window_at_all_is_refused() -> None:
+    simulator, rng = Simulator(JACKAL, jobs=1), np.random.default_rng(0)
+    for ask in (lambda: simulator.draw(0, rng), lambda: simulator(np.zeros((0, 17)), rng)):
+        with pytest.raises(InputError, match="the number of windows is 0, want a whole number, 1 or more"):
+            ask()

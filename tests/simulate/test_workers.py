@@ -210,6 +210,8 @@ def test_policies_from_files_move_their_share(tmp_path: Path) -> None:
         ({"effects": 1.5}, "effects is 1.5"),
         ({"motor": float("nan")}, "motor is nan"),
         ({"seed": -1}, "seed is -1"),
+        ({"policy": 42}, "policy: want a file, or a callable of observations, got int"),
+        ({"proposal": 42}, r"proposal: want a file, or something with sample\(n, rng\), got int"),
     ],
 )
 def test_bad_input_is_said_so(tmp_path: Path, wrong: dict, why: str) -> None:
