@@ -65,6 +65,7 @@ def simulate(
     Example: nfc-gym simulate JackalFlat --windows 100000 --out windows/jackal
     """
     with outcome(ctx, resumes=True):
+        _require_used(policy is not None, "for --policy: give --policy too", **_asked(ctx, "policy_share"))
         kinds.require_kind(out, kinds.WINDOWS)
         from nfc_gym.simulate import simulate as run
 
@@ -146,6 +147,8 @@ def train(
     Example: nfc-gym train windows/jackal --out jackal.safetensors
     """
     with outcome(ctx, resumes=True):
+        of_posteriors = _asked(ctx, "encoder", "density", "delta_s", "maps")
+        _require_used(not structure, "for a posterior: give it without --structure", **of_posteriors)
         kinds.require_kind(out, kinds.STRUCTURE if structure else kinds.POSTERIOR)
         require_writable(out.absolute().parent)
         from nfc_gym.core import MissingExtra
@@ -280,11 +283,17 @@ def infer(
             say_written(out, "the posterior given this window")
 
 
+def _asked(ctx: typer.Context, *names: str) -> dict[str, object]:
+    """Those of some options that were given, in place of their defaults."""
+    return {name: ctx.params[name] for name in names if str(ctx.get_parameter_source(name)).endswith("COMMANDLINE")}
+
+
 def _require_used(used: bool, what: str, **options: object) -> None:
     """Refuse options that were given and would do nothing."""
     for name, value in options.items():
         if value is not None and not used:
-            raise InputError(f"--{name} {value} is {what}, or leave it out")
+            option = f"--{'' if value is not False else 'no-'}{name.replace('_', '-')}"
+            raise InputError(f"{option}{'' if isinstance(value, bool) else f' {value}'} is {what}, or leave it out")
 
 
 def _window(posterior: Path, mapping: Path, log: str | None, until: float | None) -> "Window":

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.config import Sizes
 from nfc_gym.inference.data import Batch
 from nfc_gym.inference.detector import checked
@@ -53,10 +54,11 @@ class ContrastConfig:
     elevation: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if self.features < 2 or not self.temperature > 0 or not 0 < self.share < 1:
+        require_whole("contrast: features", self.features, 2)
+        if not self.temperature > 0 or not 0 < self.share < 1:
             raise InputError(
-                "contrast: want features >= 2, temperature > 0 and a share between 0 and 1, "
-                f"got {self.features}, {self.temperature:g}, {self.share:g}"
+                "contrast: want a temperature > 0 and a share between 0 and 1, "
+                f"got {self.temperature:g}, {self.share:g}"
             )
 
     def to_dict(self) -> dict[str, Any]:

@@ -151,10 +151,11 @@ class StoredWindows:
     @property
     def told(self) -> dict[str, Any]:
         """Which windows these are, as far as training from others would be another training."""
-        about = self.manifest
-        return {"environment": about.environment, "the windows' seed": about.seed, "noise": self.noise} | {
-            f"the windows' {key}": value for key, value in about.settings.items()
-        }
+        found = {"environment": self.manifest.environment, "noise": self.noise}
+        for k, about in enumerate(getattr(self.stored, "manifests", (self.manifest,))):
+            whose = f"the windows' {{}}{f' in folder {k + 1}' if k else ''}"
+            found |= {whose.format(key): value for key, value in ({"seed": about.seed} | about.settings).items()}
+        return found
 
     def batches(self, size: int, seed: int | None) -> Iterator[Batch]:
         """See `WindowSet.batches`; None is an order of its own, the same each time."""

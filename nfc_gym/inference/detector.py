@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.rates import Threshold, threshold_at
 
 Array = NDArray[np.float64]
@@ -72,8 +73,7 @@ class WindowDetector:
     """
 
     def __init__(self, scorer: WindowScore, threshold: Threshold | None = None, every: int = 1) -> None:
-        if every < 1:
-            raise InputError(f"detector: every must be 1 or more, got {every}")
+        require_whole("detector: every", every, 1)
         self.scorer, self.every, self.calibration = scorer, every, threshold
         self.threshold = None if threshold is None else threshold.value
         self._empty()

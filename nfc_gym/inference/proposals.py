@@ -15,6 +15,7 @@ from scipy.linalg import solve_triangular
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior
 from nfc_gym.inference.space import PriorBox
@@ -59,8 +60,10 @@ class SequentialConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.rounds < 1 or self.simulations < 20 or self.samples < 100 or self.oversampling < 1:
-            raise InputError("sequential: want rounds >= 1, simulations >= 20, samples >= 100 and oversampling >= 1")
+        for name, least in (("rounds", 1), ("simulations", 20), ("samples", 100), ("oversampling", 1), ("seed", 0)):
+            require_whole(f"sequential: {name}", getattr(self, name), least)
+        if np.isnan(self.narrows):  # by which nothing would ever stop
+            raise InputError("sequential: narrows is nan, want nats that a round must win")
         if not 0 < self.quantile < 0.5 or not 0 < self.held_out < 1:
             raise InputError(f"sequential: quantile in (0, 0.5), held_out in (0, 1): {self.quantile}, {self.held_out}")
         if self.proposal not in PROPOSALS:

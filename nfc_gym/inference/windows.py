@@ -36,10 +36,10 @@ from nfc_gym.inference.shards import MAPS, Batch, WindowWriter, check_finite, ma
 
 __all__ = ["Batch", "Batches", "Manifest", "WindowWriter", "Windows", "packed", "shard_path"]
 
-# What folders must have in common to be read as one.
+# What folders must have in common to be read as one: all that says what a number in them means.
 ALIKE = (
-    "environment", "psi_names", "psi_low", "psi_high", "horizon", "state_names", "action_names", "families", "effects",
-    "terrain_kinds",
+    "environment", "psi_names", "psi_units", "psi_low", "psi_high", "horizon", "dt", "state_names", "action_names",
+    "state_noise", "families", "effects", "terrain_kinds", "terrain_scale",
 )  # fmt: skip
 
 
@@ -54,6 +54,7 @@ class Windows:
 
     Attributes:
       manifest: of the first folder, see `Manifest`.
+      manifests: of all of them.
 
     Raises:
       InputError: no manifest, another robot or parameters than wanted, folders of different kinds, a truncated or
@@ -67,7 +68,7 @@ class Windows:
         manifests = [Manifest.read(f) for f in self.folders]
         for folder, each in zip(self.folders, manifests, strict=True):
             _require(folder, each, manifests[0], robot, psi_names)
-        self.manifest = manifests[0]
+        self.manifest, self.manifests = manifests[0], tuple(manifests)
         opened = [_opened(f, m) for f, m in zip(self.folders, manifests, strict=True)]
         self._shards = [shard for shards in opened for shard in shards]
         kept = set.intersection(*(set(s) for s in self._shards))

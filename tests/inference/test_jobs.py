@@ -235,6 +235,29 @@ def test_options_that_would_do_nothing_are_refused(
     assert said in " ".join(done.output.split())
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["train", "--structure", "--encoder", "tcn"], "--encoder tcn is for a posterior: give it without --structure"),
+        (["train", "--structure", "--no-delta-s"], "--no-delta-s is for a posterior"),
+        (["train", "--structure", "--maps"], "--maps is for a posterior"),
+        (
+            ["simulate", "--windows", "3", "--policy-share", "0.4"],
+            "--policy-share 0.4 is for --policy: give --policy too",
+        ),
+    ],
+)
+def test_options_of_training_that_would_do_nothing_are_refused(
+    windows: Path, tmp_path: Path, given: list[str], said: str
+) -> None:
+    command, *options = given
+    what = str(windows) if command == "train" else ENV
+    done = CliRunner().invoke(app, [command, what, "--out", str(tmp_path / "x.safetensors"), *options])
+    assert done.exit_code == 2
+    assert said in " ".join(done.output.split())
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_single_window_held_out_judges_nothing(tmp_path: Path) -> None:
     simulate(ENV, 20, tmp_path / "few", jobs=1)
     out = str(tmp_path / "q.safetensors")

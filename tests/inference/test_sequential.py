@@ -217,12 +217,18 @@ def test_rounds_of_a_posteriors_draws_come_to_the_posterior() -> None:
 
 
 def test_bad_settings_are_refused() -> None:
-    with pytest.raises(InputError, match="rounds >= 1"):
+    with pytest.raises(InputError, match="rounds is 0, want a whole number, 1 or more"):
         SequentialConfig(rounds=0)
     with pytest.raises(InputError, match="quantile"):
         SequentialConfig(quantile=0.0)
     with pytest.raises(InputError, match="truncated, posterior, got 'prior'"):
         SequentialConfig(proposal="prior")
+    for wrong in ({"rounds": 1.5}, {"simulations": 19}, {"samples": 99}, {"oversampling": 0}, {"seed": -1}):
+        ((name, value),) = wrong.items()
+        with pytest.raises(InputError, match=f"sequential: {name} is {value}, want a whole number"):
+            SequentialConfig(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="narrows is nan"):
+        SequentialConfig(narrows=np.nan)
 
 
 def test_around_draws_the_prior_holds_the_posterior_and_is_the_prior_there() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import InputError
+from nfc_gym.inference.data import StoredWindows
 from nfc_gym.inference.shards import maps_path
 from nfc_gym.inference.windows import Manifest, Windows, WindowWriter, packed, shard_path
 
@@ -106,6 +107,20 @@ def test_rounds_are_read_as_one(tmp_path: Path) -> None:
     other = written(tmp_path / "c", (0,), replace(MANIFEST, psi_high=(3.0, 1.0)))
     with pytest.raises(InputError, match="another psi_high than the first folder"):
         Windows(first, other)
+    noisier = written(tmp_path / "d", (0,), replace(MANIFEST, state_noise=tuple(2 * sd for sd in MANIFEST.state_noise)))
+    with pytest.raises(InputError, match="another state_noise than the first folder"):
+        Windows(first, noisier)
+
+
+def test_training_tells_the_second_folder_from_others(tmp_path: Path) -> None:
+    """By its seed and settings, as the first: else a state of other windows would be gone on from."""
+    first = written(tmp_path / "a", (0,))
+    seconds = [written(tmp_path / str(k), (0,), replace(MANIFEST, seed=k)) for k in (1, 2)]
+    told = [StoredWindows(Windows(first, second)).told for second in seconds]
+    assert [t.pop("the windows' seed in folder 2") for t in told] == [1, 2]
+    assert told[0] == told[1]
+    alone = StoredWindows(Windows(first)).told
+    assert alone == {k: told[0][k] for k in alone}
 
 
 def test_another_set_is_not_mixed_in(tmp_path: Path) -> None:
