@@ -116,7 +116,7 @@ class LawSearch:
         outcome = Round([], 0.0, [arena.row(j) for j in sorted(entered, key=lambda j: -j.total)])
         if best is not None:
             arena.say(f"proposed {arena.label(best)}")
-            outcome.accepted, outcome.share = [arena.label(best)], best.gain / max(float(arena.base.sum()), 1e-9)
+            outcome.accepted, outcome.share = [arena.label(best)], arena.explained(best)
         else:
             outcome.reason = "no law gains more on unseen logs than chance and does what the others could not"
         self.rounds.append(outcome)

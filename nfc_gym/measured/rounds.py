@@ -106,7 +106,7 @@ class Contest:
             possible = self._alike(met, best, believed[0], priced=False)
             alike = alike if _too_many(possible) else possible
         outcome.accepted = [e.id for e in arena.new(best)]
-        outcome.share = best.gain / max(float(arena.base.sum()), 1e-9)
+        outcome.share = arena.explained(best)
         again = {arena.label(j) for j in judged}  # the others' fits are a first look
         outcome.equivalents = [i for i in alike[len(outcome.accepted) :] if i in again]
         for effect in arena.new(best):

@@ -288,12 +288,21 @@ class Yardstick:
         return {
             "id": self.label(j),
             "gain_fit": float(j.fit_gains.sum()),
-            "share": float(j.fit_gains.sum() / max(self.current.losses.sum(), 1e-9)),
+            "share": self._share(j.fit_gains, self.current.losses, lambda: j.fitted.losses),
             "gain_select": j.gain,
             "gain_select_low": j.lower,
             "generic": new[0].generic,
             "sentence": " ".join(e.say(thetas[id(e)]) for e in new),
         }
+
+    def explained(self, j: Judged) -> float:
+        """Share of the selection logs' misfit that a candidate explains, at most 1."""
+        return self._share(j.gains, self.base, lambda: losses(self.select.problem, self.on, j.fitted))
+
+    def _share(self, gains: Array, before: Array, after: Callable[[], Array]) -> float:
+        """Of a misfit (S,), told by the common metric: gains by metrics of their own are no part of it."""
+        gained = before.sum() - after().sum() if self.own else gains.sum()
+        return float(gained / max(before.sum(), 1e-9))
 
 
 def _of(fitted: Fit, effect: Effect) -> NDArray[np.bool_]:

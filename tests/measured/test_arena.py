@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.measured.arena import Arena
-from nfc_gym.measured.contest import Judged
+from nfc_gym.measured.contest import Judged, losses
 from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.owned import Data
@@ -71,6 +71,18 @@ def judged(fitted: Fit) -> Judged:
 def test_a_slope_is_likelier_only_where_the_data_bend(bend: float, likelier: bool) -> None:
     contest, problem = arena(bend)
     assert contest.likelier(judged(model(problem, [0.0, bend]))) == likelier
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_what_a_candidate_explains_is_told_by_the_common_metric_whatever_it_is_judged_by(own: bool) -> None:
+    """Gains by a metric of one's own may be of any size."""
+    contest, problem = arena(0.05)  # small errors: the loss is a square
+    contest.own, half = own, model(problem, [0.0, 0.025])
+    whole, left = (losses(contest.select.problem, contest.on, model(problem, [0.0, b])).sum() for b in (0.05, 0.025))
+    gains = np.full(60, -1e6 if own else (contest.base.sum() - left) / 60)
+    share = contest.explained(Judged(half, gains, gains, 0.0, 0.0))
+    assert share == pytest.approx(1 - left / contest.base.sum())
+    assert (left - whole) / (contest.base.sum() - whole) == pytest.approx(0.25, abs=0.1)  # of what the slope explains
 
 
 def test_own_slack_weighs_a_mended_quantity_however_large_the_error_was() -> None:

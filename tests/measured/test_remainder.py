@@ -196,7 +196,7 @@ def test_more_than_three_families_that_do_alike_are_no_claim(families: tuple, cl
     arena.label = lambda j: j.fitted.plant.effects[0].id
     arena.row = lambda j: {"id": arena.label(j), "generic": False}
     arena.judge = arena.again = lambda j: j
-    arena.own = False
+    arena.own, arena.explained = False, lambda j: 1.0
     arena.sharper = lambda fitted: arena
     arena.promises, arena.asked = (lambda s: s.gain), (lambda s, share: 0.0)
     arena.enter_apart = lambda *a: None
