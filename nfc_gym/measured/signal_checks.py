@@ -11,6 +11,7 @@ from nfc_gym.core import Channel, Log
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.frame_checks import exchanged
+from nfc_gym.measured.glitch_checks import glitches
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
 from nfc_gym.measured.speed_checks import DEGREES, TURN, explained, rate_ratio, ratio, strangers, too_fast
@@ -53,6 +54,7 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
                 yield Suspicion(
                     "warning", f"known.{name.split(':')[0]}", "known", message, "cut the log where it changes"
                 )
+    yield from glitches(log)
     yield from exchanged(model, log)
     yield from strangers(log)
     yield from too_fast(log)
