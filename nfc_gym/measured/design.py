@@ -35,10 +35,13 @@ class Design:
       stage: where sequences are tried.
       rivals: whether the questions are about rival explanations, each of which must be answered; else, about what
         would show, on the whole.
+
+    Attributes:
+      tried: how many sequences were judged.
     """
 
     def __init__(self, distances: Distances, stage: Stage, rivals: bool) -> None:
-        self.distances, self.stage, self.rivals = distances, stage, rivals
+        self.distances, self.stage, self.rivals, self.tried = distances, stage, rivals, 0
         # Where many effects are asked for they are small; rival explanations may move quite differently.
         models = [a.truth for a in distances.asks] if rivals else []
         self.models = [(m.plant, m.x) for m in {id(m): m for m in [*models, *distances.rivals]}.values()]
@@ -60,6 +63,7 @@ class Design:
 
     def judge(self, w: Array, scales: Sequence[float]) -> tuple[Array, Array, Array, Array]:
         """Sequences (N, T, nu) within bounds, their scales (N,), values (N,), -1 where there are none, and answers."""
+        self.tried += len(w)
         w, chosen, fine = self.within(w, scales)
         answers = np.zeros((len(w), len(self.distances.asks)))
         if fine.any():
@@ -124,27 +128,25 @@ class Design:
         """
         began = time.monotonic()
         best = self.families(rng, until=began + _FIRST * budget, most=tries)[0]
-        done = min(_DRAWS * len(FAMILIES), tries)
-        tick(done, best.value)
+        tick(self.tried, best.value)
         start = best
         series = Series(start.series, start.pattern, self.stage.time)
         options = {"verbose": -9, "seed": int(rng.integers(1, 2**31)), "popsize": 2 * _BATCH}
         import cma  # where it is used: see `fit.polish`
 
         walk = cma.CMAEvolutionStrategy(np.zeros(series.size), _STEP, options)
-        while done < tries and time.monotonic() - began < budget and not walk.stop():
+        while self.tried < tries and time.monotonic() - began < budget and not walk.stop():
             z = walk.ask()
-            w = np.stack([series(row) for row in z[: tries - done]])
+            w = np.stack([series(row) for row in z[: tries - self.tried]])
             parts = [self.judge(w[i : i + _BATCH], _REPAIR) for i in range(0, len(w), _BATCH)]
             w, _, value, answers = (np.concatenate(p) for p in zip(*parts, strict=True))
-            done += len(w)
             if len(w) == len(z):  # the last ones may be fewer
                 walk.tell(z, (-value).tolist())
             i = int(value.argmax())
             if value[i] > best.value:
                 best = replace(start, w=w[i], value=float(value[i]), answers=answers[i])
-            tick(done, best.value)
-        return best, done
+            tick(self.tried, best.value)
+        return best, self.tried
 
 
 @dataclass(frozen=True)

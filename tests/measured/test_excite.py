@@ -192,6 +192,8 @@ def test_logs_that_begin_under_a_force_still_get_commands_of_their_own(tmp_path:
     torque = np.loadtxt(tmp_path / "next.csv", delimiter=",", skiprows=1)[:, 1]
     assert torque[[0, -1]] == pytest.approx(0)
     assert np.abs(torque).max() > 0.2
+    again = excite(path, None, tmp_path / "few.csv", seconds=3.0, tries=250, budget=1e-9, jobs=1)
+    assert again["tried"] == 8  # the first that are rolled out at once, and time is up
 
 
 def test_what_only_a_controller_keeps_upright_gets_a_feed_forward(tmp_path: Path) -> None:
