@@ -256,7 +256,9 @@ def _say_unlike(posterior: NeuralPosterior, window: Window, report: Report) -> N
 
 def told(prior: PriorBox, psi: Array) -> list[Told]:
     """By parameter, in the prior's order, of those that are free: from draws (n, d)."""
-    middle, low, high = np.quantile(psi, [0.5, (1 - _LEVEL) / 2, (1 + _LEVEL) / 2], axis=0).tolist()
+    levels = [0.5, (1 - _LEVEL) / 2, (1 + _LEVEL) / 2]
+    # The k-th of n draws stands for k / (n + 1): else few draws of the prior itself would look narrower than the prior.
+    middle, low, high = np.quantile(psi, levels, axis=0, method="weibull").tolist()
     widths = [_LEVEL * (b - a) for a, b in zip(prior.low, prior.high, strict=True)]  # of the prior's own interval
     return [
         Told(prior.names[i], prior.units[i], middle[i], low[i], high[i], (high[i] - low[i]) / widths[i])

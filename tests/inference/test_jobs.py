@@ -92,6 +92,12 @@ def test_the_table_tells_the_width_over_the_prior(prior: PriorBox) -> None:
     assert told[1].width == pytest.approx(1, rel=0.03)
 
 
+def test_few_draws_of_the_prior_are_as_wide_as_the_prior(prior: PriorBox) -> None:
+    rng = np.random.default_rng(0)
+    few = [jobs.told(prior, prior.psi_of(rng.uniform(size=(20, len(prior))))) for _ in range(400)]
+    assert np.mean([t.width for told in few for t in told]) == pytest.approx(1, abs=0.01)
+
+
 def test_the_command_trains_and_the_other_tells(windows: Path, motion: Path, tmp_path: Path) -> None:
     file = tmp_path / "q.safetensors"
     run = CliRunner()
