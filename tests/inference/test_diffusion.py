@@ -63,9 +63,11 @@ def test_each_step_asks_the_field_once() -> None:
 
 
 def test_the_reverse_sde_draws_the_gaussian() -> None:
-    x = diffusion.reverse_sde(field, torch.randn(20000, 3, dtype=torch.float64), 200)
-    np.testing.assert_allclose(x.mean(0), MEAN, atol=0.02)
-    np.testing.assert_allclose(x.std(0), SPREAD, rtol=0.03)
+    """In the usual steps, ten times those of the ODE; a standard deviation of 100,000 draws is off by 0.2 %."""
+    for kind in (torch.float64, torch.float32):
+        x = diffusion.reverse_sde(field, torch.randn(100_000, 3, dtype=kind), 120).double()
+        np.testing.assert_allclose(x.mean(0), MEAN, atol=0.01)
+        np.testing.assert_allclose(x.std(0), SPREAD, rtol=0.01)
 
 
 def test_the_density_is_the_gaussians() -> None:

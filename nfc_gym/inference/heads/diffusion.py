@@ -22,6 +22,7 @@ On = Callable[
 ]  # a grid of angles (n,) -> the field on it; what depends on angles alone is computed once
 FLOOR = 2e-3  # smallest angle: detail of that size of the prior's spread is left as it is
 MOST = math.pi / 2
+_FADED = 1e-30  # of what a step from pi / 2 leaves of x, where the cosine is rounded to either side of 0
 
 
 def angles(steps: int, like: Tensor) -> Tensor:
@@ -75,16 +76,23 @@ def flow(field_on: On, noise: Tensor, steps: int = 12) -> Tensor:
 
 
 def reverse_sde(field_on: On, noise: Tensor, steps: int = 150) -> Tensor:
-    """Noise to samples by the reverse SDE, in its exact transitions given the mean of the clean x (Ho et al. 2020)."""
-    x = noise
+    """Noise to samples by the reverse SDE, in its exact transitions given the mean of the clean x (Ho et al. 2020).
+
+    From angle a to b, with fade = tan(b) / tan(a), x becomes
+        sin(b) / sin(a) fade x + cos(b) (1 - fade^2) clean + sin(b) sqrt(1 - fade^2) noise.
+    The clean x is what the last two say of the step's middle in log tan (Lu et al. 2022, "DPM-Solver++"): as it was at
+    the step's beginning, draws of Gaussians came out 2 to 5 % too narrow.
+    """
+    x, before = noise, None
     grid = angles(steps, noise)
     field = field_on(grid)
     for i, (a, b) in enumerate(pairwise(grid)):
-        v = field(x, i)
-        kept = (a.cos() / b.cos()) ** 2  # signal that the forward step from b to a leaves
-        fresh = (b.sin() / a.sin()) * (1 - kept).clamp(min=0).sqrt()
-        rest = (b.sin().square() - fresh.square()).clamp(min=0).sqrt()
-        x = b.cos() * clean(x, v, a) + rest * (a.sin() * x + a.cos() * v) + fresh * torch.randn_like(x)
+        now = clean(x, field(x, i), a)
+        fade = (b.sin() * a.cos() / (b.cos() * a.sin())).clamp(min=_FADED)
+        step, left = -fade.log(), 1 - fade.square()
+        middle = now if before is None else now + step / before[0] / 2 * (now - before[1])
+        x = b.sin() / a.sin() * fade * x + b.cos() * left * middle + b.sin() * left.sqrt() * torch.randn_like(x)
+        before = step, now
     return clean(x, field(x, steps), grid[-1])
 
 
