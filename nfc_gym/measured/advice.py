@@ -31,10 +31,12 @@ class Advice:
 
     Attributes:
       rows: the identifiability table, the rows of claims with `sigma`: how far their nearest rival lies in these logs.
+      effects: of the report, without the equivalents that all segments exclude where the search saw but some.
       findings: in words, for `report.json`: what to record next, and who is an equivalent no more.
     """
 
     rows: list[dict[str, Any]]
+    effects: list[dict[str, Any]]
     findings: list[dict[str, Any]]
 
 
@@ -44,13 +46,12 @@ def advise(
     """Measure how far each claim lies from its rivals, and look for a motion where that is too near.
 
     Args:
-      report: `effects` and `identifiability`, as in `report.json`. Equivalents of a claim that lie far enough away to
-        be told, and that all segments exclude where the search saw but some, are taken out of `effects`.
+      report: `effects` and `identifiability`, as in `report.json`.
       present: the logs at hand, seen from the extended model.
     """
     rows = [dict(r) for r in report["identifiability"]]
     if not present.lens.plant.effects:
-        return Advice(rows, [])
+        return Advice(rows, report["effects"], [])
     say("how far the claims lie from their rivals")
     seen = round(present.repeats * len(present.lens.problem))
     asks, pairs, before = _apart(bench, logs, report, present)
@@ -66,40 +67,42 @@ def advise(
             row |= {"sigma": float(sigma), "worst_mimic": rival, "distinguishable": bool(sigma > TOLD)}
     near = [i for i, s in enumerate(before) if s <= TOLD]
     told_apart = [(a, p) for a, p, s in zip(asks, pairs, before, strict=True) if s > TOLD]
-    findings = _recounted(bench, logs, report, told_apart, seen, say, seed) if bench.mode == "rollout" else []
+    effects, findings = report["effects"], []
+    if bench.mode == "rollout":
+        effects, findings = _recounted(bench, logs, effects, told_apart, seen, say, seed)
     if not near:
-        return Advice(rows, findings)
+        return Advice(rows, effects, findings)
     open_asks = [asks[i] for i in near]
     told = _best_motion(bench, logs, present, open_asks, say, seed)
     for k, i in enumerate(near):
         claim, rival = pairs[i]
         text = f"{claim} and {rival} lie {number(before[i], 2)} sigma apart in these logs, too near to choose."
         findings.append({"kind": "advice", "text": f"{text} {told(k)}"})
-    return Advice(rows, findings)
+    return Advice(rows, effects, findings)
 
 
 def _recounted(
     bench: Bench,
     logs: Sequence[Log],
-    report: dict[str, Any],
+    effects: list[dict[str, Any]],
     pairs: Sequence[tuple[Ask, tuple[str, str]]],
     seen: int,
     say: Callable[[str], None],
     seed: int,
-) -> list[dict[str, Any]]:
-    """Take out of the report the equivalents that all segments exclude, of which the search saw so many; in words."""
-    effects = {e["id"]: e for e in report["effects"]}
-    listed = [(ask, p) for ask, p in pairs if p[1] in rivals_of(effects.get(p[0], {}), report["effects"])]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Effects without the equivalents that all segments exclude, of which the search saw so many; and who they are."""
+    left = {e["id"]: dict(e) for e in effects}
+    listed = [(ask, p) for ask, p in pairs if p[1] in rivals_of(left.get(p[0], {}), effects)]
     whole = bench.searched(logs) if listed else None
     if whole is None or len(whole) <= seen:
-        return []
+        return effects, []
     findings = []
     for (_, (claim, rival)), gone in zip(listed, excluded(whole, [ask for ask, _ in listed], say, seed), strict=True):
         if gone:
-            effects[claim]["equivalents"] = [i for i in effects[claim]["equivalents"] if i != rival]
+            left[claim]["equivalents"] = [i for i in left[claim]["equivalents"] if i != rival]
             text = f"{rival} does as well as {claim} on the {seen} segments that were searched, and is excluded by all"
             findings.append({"kind": "recount", "text": f"{text} {len(whole)}: it is no equivalent."})
-    return findings
+    return list(left.values()), findings
 
 
 def _apart(

@@ -241,6 +241,7 @@ def _fold(
     tabled = time.monotonic() - began_table
     outcome["structure"] = None if suspects is None else suspects.told(close, pool, tabled)
     advice = advise(bench, [*fitting, *selecting], outcome, known, tell, seed)
+    outcome["effects"] = advice.effects
     claims = {e["id"] for e in outcome["effects"]}
     outcome["identifiability"] = [row | {"claimed": row["id"] in claims} for row in advice.rows]
     outcome["findings"] += advice.findings

@@ -64,7 +64,8 @@ def test_an_equivalent_that_the_searched_segments_alone_could_not_exclude_is_tak
         report = {"effects": [claim], "identifiability": rows}
         advice = advise(bench, logs, report, seen(look(bench, logs, dry.plant, dry.x)), lambda text: None, 0)
         assert advice.rows[0]["sigma"] > TOLD
-        return claim["equivalents"], [f["text"] for f in advice.findings if f["kind"] == "recount"]
+        assert claim["equivalents"] == ["damping_poly:shaft"]  # what is asked about stays as it is
+        return advice.effects[0]["equivalents"], [f["text"] for f in advice.findings if f["kind"] == "recount"]
 
     assert asked(lambda p: p) == (["damping_poly:shaft"], [])  # the search saw all of them, and has the last word
     few = lambda p: replace(p, repeats=0.5)  # noqa: E731
