@@ -18,7 +18,7 @@ from nfc_gym.measured.model_checks import model_findings
 from nfc_gym.measured.sign_checks import turned_round
 from nfc_gym.measured.signal_checks import suspicions
 from nfc_gym.measured.speed_checks import clock_unit
-from nfc_gym.measured.splits import find_logs
+from nfc_gym.measured.splits import Source, find_logs
 from nfc_gym.measured.stream_checks import stream_notes
 
 __all__ = ["Finding", "check", "examine", "require"]
@@ -73,25 +73,34 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
     except InputError as e:
         return None, [_finding("logs", str(e).removeprefix("logs: "))]
     found: list[tuple[str, Suspicion]] = []
-    logs: list[Log] = []
+    read: list[tuple[Source, Log]] = []
+    spoilt = 0
     for source in sources:
-        log, defects, alignment = read_log(mapping, source)
+        logs, defects, alignment = read_log(mapping, source)
         if alignment is not None:
             found += [(source.name, s) for s in stream_notes(alignment)]
         for defect in defects:
             found.append((source.name, Suspicion("error", defect.where, "defect", *parted(defect.text))))
-        if log is not None:
-            found += [(source.name, s) for s in suspicions(mapping, model, log)]
-            logs.append(log)
+        if any(log.name != source.name for _, log in logs):
+            found.append((source.name, _cut(logs)))
+        found += [(log.name, s) for _, log in logs for s in suspicions(mapping, model, log)]
+        spoilt, read = spoilt + bool(defects), [*read, *logs]
     shifts = {name: c.shift for name, c in mapping.channels.items()}
-    findings = gather(_weighed(found, len(sources)), len(sources))
-    findings += [*clock_offsets(model, logs, shifts), *shift_notes(shifts)]
-    if len(logs) < len(sources):
+    count = len(read) + spoilt
+    findings = gather(_weighed(found, count), count)
+    findings += [*clock_offsets(model, [log for _, log in read], shifts), *shift_notes(shifts)]
+    if spoilt:
         return None, findings
     try:
-        return assemble(mapping, path, sources, logs), findings
+        return assemble(mapping, path, read), findings
     except InputError as e:
         return None, [*findings, _finding("split", str(e).removeprefix("split: "))]
+
+
+def _cut(stretches: list[tuple[Source, Log]]) -> Suspicion:
+    seconds, count = sum(log.duration for _, log in stretches), len(stretches)
+    text = f"cut at its gaps: {count} stretch{'es' * (count > 1)}, {seconds:.3g} s in all"
+    return Suspicion("note", "time", "cut", text, "what is shorter than a segment is left out")
 
 
 def _weighed(found: list[tuple[str, Suspicion]], logs: int) -> list[tuple[str, Suspicion]]:

@@ -1,6 +1,6 @@
 """A mapping file and the logs it names, converted: SI units, quaternions scalar first, time from 0, splits assigned."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -18,6 +18,7 @@ from nfc_gym.measured.mapping import Mapping, Split, load_mapping
 from nfc_gym.measured.readers import Streams, Table, read_table
 from nfc_gym.measured.shifting import shift_table, too_long
 from nfc_gym.measured.splits import Fold, Source, divide, find_logs
+from nfc_gym.measured.stretches import stretches
 from nfc_gym.physics.effects.base import TIME
 
 Array = NDArray[np.float64]
@@ -38,6 +39,7 @@ class Dataset:
       folds: one, or with `by: rotate` one for each group that verifies.
       independent_splits: False where two splits share a log.
       files: the log files that were read.
+      whole: names of the logs before any was cut by time.
     """
 
     mapping: Mapping
@@ -46,6 +48,7 @@ class Dataset:
     folds: tuple[Fold, ...]
     independent_splits: bool
     files: tuple[Path, ...]
+    whole: tuple[str, ...]
 
     @property
     def folder(self) -> Path:
@@ -84,12 +87,13 @@ class Reading(NamedTuple):
     """What became of one log file.
 
     Attributes:
-      log: None where `defects` stop it from being used.
+      logs: it, or the stretches between its gaps, with what the mapping says of each; none where `defects` stop it from
+        being used.
       defects: everything that does.
       alignment: how its streams were brought to one time; None where the file has one time for all columns.
     """
 
-    log: Log | None
+    logs: list[tuple[Source, Log]]
     defects: list[Defect]
     alignment: Alignment | None = None
 
@@ -102,21 +106,22 @@ def load(path: Path | str) -> Dataset:
     """
     path = Path(path)
     mapping = load_mapping(path)
-    sources = find_logs(mapping, path.parent)
-    logs = []
-    for source in sources:
-        log, defects, _ = read_log(mapping, source)
-        if log is None:
+    read = []
+    for source in find_logs(mapping, path.parent):
+        logs, defects, _ = read_log(mapping, source)
+        if defects:
             raise InputError("\n".join(f"{source.path}: {p.where}: {p.text}" for p in defects))
-        logs.append(log)
-    return assemble(mapping, path, sources, logs)
+        read += logs
+    return assemble(mapping, path, read)
 
 
-def assemble(mapping: Mapping, path: Path, sources: list[Source], logs: list[Log]) -> Dataset:
+def assemble(mapping: Mapping, path: Path, read: Sequence[tuple[Source, Log]]) -> Dataset:
     """Divide logs that were read into splits; raises `InputError` where the rule cannot be followed."""
+    sources, logs = [s for s, _ in read], [log for _, log in read]
     division = divide(mapping.split, sources, logs)
     files = tuple(dict.fromkeys(file for s in sources for file in _files(s.path)))
-    return Dataset(mapping, path, division.logs, division.folds, division.independent, files)
+    whole = tuple(s.name for s in sources)
+    return Dataset(mapping, path, division.logs, division.folds, division.independent, files, whole)
 
 
 def _files(log: Path) -> list[Path]:
@@ -143,13 +148,13 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
     try:
         table = read_table(source.path, source.part, wanted)
     except InputError as e:
-        return Reading(None, [Defect("file", str(e).removeprefix(f"{source.path}: "))])
+        return Reading([], [Defect("file", str(e).removeprefix(f"{source.path}: "))])
     alignment = None
     if isinstance(table, Streams):
         streams = table
         alignment = defects.attempt("streams", lambda: _aligned(streams, mapping, used, defects))
         if alignment is None or defects:
-            return Reading(None, defects)
+            return Reading([], defects)
         table = alignment.table
     columns = LogColumns(table)
     names = [name for use in used for name in use.columns]
@@ -157,19 +162,20 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
     if time is None:
         if columns.rows or _counted(columns, names):
             _parts(mapping, columns, alignment, defects)  # what is wrong with the other columns is told with it
-        return Reading(None, defects, alignment)
+        return Reading([], defects, alignment)
     if alignment is None:
         moved = _shifted(mapping, table, time, used, defects)
         if moved is None:
-            return Reading(None, defects)
+            return Reading([], defects)
         columns, time = moved
     parts = _parts(mapping, columns, alignment, defects)
     parts["exogenous"].setdefault(TIME, time)  # that of the whole file, where a split by time cuts it
     if defects:
-        return Reading(None, defects, alignment)
+        return Reading([], defects, alignment)
     name, group, condition = source.name, source.group, source.condition
     log = defects.attempt("log", lambda: Log(name=name, time=time, group=group, condition=condition, **parts))
-    return Reading(log, defects, alignment)
+    logs = None if log is None else defects.attempt("time", lambda: list(stretches(mapping, source, log)))
+    return Reading(logs or [], defects, alignment)
 
 
 def _counted(columns: LogColumns, names: list[str]) -> bool:

@@ -92,13 +92,19 @@ class _Signal(_Columns):
 
 
 class TimeColumn(_Columns):
-    """Where the time is: a column; or, of logs that have no clock, the `interval` in s from one row to the next."""
+    """Where the time is: a column; or, of logs that have no clock, the `interval` in s from one row to the next.
+
+    `gaps` says what becomes of a log with a pause in it: it is refused, or cut there into logs of their own.
+    """
 
     unit: Annotated[str, BeforeValidator(_time_unit)] = "s"
     interval: Positive | None = None
+    gaps: Literal["refuse", "cut"] = "refuse"
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
+        if self.interval is not None and self.gaps == "cut":
+            raise PydanticCustomError("time", "rows `interval` apart have no gaps; leave out `gaps`")
         if self.interval is not None and self.columns:
             raise PydanticCustomError("both", "has both `column` and `interval`; keep one")
         if self.interval is not None and self.unit != "s":

@@ -35,7 +35,23 @@ def time_of(entry: TimeColumn, columns: LogColumns, names: Iterable[str]) -> Arr
     """
     if entry.interval is not None:
         return np.arange(columns.untimed(names)).astype(np.float64) * entry.interval
-    return _of_column(entry.columns[0], entry.unit, columns)
+    time = _of_column(entry.columns[0], entry.unit, columns)
+    found = gaps(time)
+    if len(found) and entry.gaps == "refuse":
+        step = np.diff(time)
+        longest = int(step.argmax())
+        raise InputError(
+            f"a gap of {step[longest]:.3g} s after row {longest}, at {time[longest]:.6g} s, where samples are "
+            f"{np.median(step):.3g} s apart ({len(found)} such gap{'s' * (len(found) > 1)}); say `gaps: cut` under "
+            "`time` to make a log of each stretch"
+        )
+    return time
+
+
+def gaps(time: Array) -> NDArray[np.intp]:
+    """Rows (g,) of increasing times (T,) after which the next one is late by more than sampling explains."""
+    step = np.diff(time)
+    return np.flatnonzero(step > LARGEST_GAP * np.median(step)) if len(step) else np.empty(0, np.intp)
 
 
 def _of_column(name: str, unit: str, columns: LogColumns) -> Array:
@@ -63,12 +79,5 @@ def _of_column(name: str, unit: str, columns: LogColumns) -> Array:
             f"{back.size} such row{'s' * (back.size > 1)}); "
             f"remove repeated rows, cut the file there into two logs, {coarse}"
             + (f"; or name {received!r}, or the time of another topic" if received in columns else "")
-        )
-    longest = int(step.argmax())
-    if step[longest] > LARGEST_GAP * np.median(step):
-        count = int((step > LARGEST_GAP * np.median(step)).sum())
-        raise InputError(
-            f"a gap of {step[longest]:.3g} s after row {longest}, at {time[longest]:.6g} s, where samples are "
-            f"{np.median(step):.3g} s apart ({count} such gap{'s' * (count > 1)}); cut the file there into logs"
         )
     return time

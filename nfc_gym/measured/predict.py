@@ -19,7 +19,6 @@ from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.segments import Cut, Layout, servos
 from nfc_gym.measured.shooting import RolloutProblem, interpolate
-from nfc_gym.measured.splits import find_logs
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -71,7 +70,7 @@ def predict(
         if logs:
             plant, x = models[fold.name]
             results |= _predict(bench, plant, x, logs, mode, restart, of)
-    joined = _join(results, frozenset(s.name for s in find_logs(dataset.mapping, dataset.folder)))
+    joined = _join(results, frozenset(dataset.whole))
     out.parent.mkdir(parents=True, exist_ok=True)
     with replacing(out) as part, open(part, "wb") as handle:
         np.savez_compressed(handle, **joined)  # type: ignore[arg-type]

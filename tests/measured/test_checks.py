@@ -67,7 +67,7 @@ def test_a_sound_data_set_has_no_findings(build: Build) -> None:
         (change("t", slice(100, 101), 0.5), ["time", "goes back", "row 100", "cut the file"]),
         (change("t", slice(100, 101), 0.99), ["time", "stands still", "row 100"]),
         (change("t", slice(100, 101), np.nan), ["time", "not a number", "row 100"]),
-        (gap, ["time", "gap of 0.51 s", "row 199", "cut the file there"]),
+        (gap, ["time", "gap of 0.51 s", "row 199", "`gaps: cut`"]),
         (change("q", slice(50, 60), np.nan), ["10 of 400 rows are NaN", "row 50", "mask"]),
         (change("goal", slice(5, 6), np.inf), ["controls.ctrl:servo", "1 of 400 rows"]),
         (scale("q", DEGREES), ["joint:hinge:pos", "in degrees", "unit"]),

@@ -218,3 +218,14 @@ def test_a_column_that_is_not_there_is_suggested(tmp_path: Path, dataset: Any) -
     said = told(dataset(tmp_path, ("/js.position[hinge]", "/js.positon[hinge]")), "error")
     assert "no column '/js.positon[hinge]'" in said
     assert "did you mean '/js.position[hinge]'" in said
+
+
+def test_a_bag_that_lost_all_topics_for_a_while_is_cut_there(tmp_path: Path, dataset: Any) -> None:
+    path = dataset(tmp_path, ("time: {column: /js.time}", "time: {column: /js.time, gaps: cut}"), gap=(2.0, 3.0))
+    logs = load(path).logs
+    assert [log.name for log in logs] == [f"run_{k}/{n}" for k in range(3) for n in (1, 2)]
+    for log in logs[:2]:
+        t = log.exogenous["exo:time"] + 0.2
+        np.testing.assert_allclose(log.channels["joint:hinge:pos"].values, np.sin(3 * t), atol=5e-3)
+    assert "cut at its gaps: 2 stretches" in told(path, "note")
+    assert told(path, "error") == ""
