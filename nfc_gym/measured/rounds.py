@@ -61,20 +61,10 @@ class Contest:
         First under the metric of the model so far, then the leading ones under the slack of the best of them. The first
         takes an error ten times the noise for one standard deviation, and all that mend most of it for equals.
         """
-        arena = self.arena
-        chance = self.screen.chance(self.screened, arena.blocks[0], arena.rng)
-        picks = shortlist(self.screened, self.short)
-        hopeful = [s for s in picks if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
-        # The report names the nearest even where there is no hope.
-        entered = sorted((arena.enter([s]) for s in hopeful or picks[:1]), key=lambda j: -j.total)
-        shared = self._shared(entered)
-        lucky = chance.get(arena.label(entered[0]), 0.0) if entered else 0.0
-        chance = {arena.label(j): lucky for j in shared} | chance
-        entered = sorted([*entered, *shared], key=lambda j: -j.total)
-        first = [j for j in entered if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
+        entered, first = self._entered()
         # Where the metric is as sharp as the noise already, the second look shows what the first has shown.
-        if not first or (arena.leftover < _SHARP and all(j.total < 0 for j in first)):
-            ranking = [arena.row(j) for j in entered]
+        if not first or (self.arena.leftover < _SHARP and all(j.total < 0 for j in first)):
+            ranking = [self.arena.row(j) for j in entered]
             return Round([], 0.0, ranking, reason="no candidate reduces the misfit more than chance does"), None
         judged, lost = self._final(first)
         arena = self.arena
@@ -91,8 +81,42 @@ class Contest:
             return outcome, None
         best, judged, believed = self._challenged(outcome, judged, believed)
         beaten = [arena.judge(j.fitted) for j in beaten if j.total > far]
-        met = [*judged, *beaten]
-        alike = self._alike(met, best, believed[0])
+        return self._accepted(outcome, best, judged, beaten, believed[0], entered)
+
+    def _entered(self) -> tuple[list[Judged], list[Judged]]:
+        """The shortlist, fitted and judged, best first; and those of it that gain more than chance would bring."""
+        arena = self.arena
+        chance = self.screen.chance(self.screened, arena.blocks[0], arena.rng)
+        picks = shortlist(self.screened, self.short)
+        hopeful = [s for s in picks if arena.promises(s) > HOPE * arena.asked(s, self.worth)]
+        # The report names the nearest even where there is no hope.
+        entered = sorted((arena.enter([s]) for s in hopeful or picks[:1]), key=lambda j: -j.total)
+        shared = self._shared(entered)
+        lucky = chance.get(arena.label(entered[0]), 0.0) if entered else 0.0
+        chance = {arena.label(j): lucky for j in shared} | chance
+        entered = sorted([*entered, *shared], key=lambda j: -j.total)
+        return entered, [j for j in entered if float(j.fit_gains.sum()) > chance.get(arena.label(j), 0.0)]
+
+    def _accepted(
+        self,
+        outcome: Round,
+        best: Judged,
+        judged: Sequence[Judged],
+        beaten: Sequence[Judged],
+        leading: Judged,
+        entered: Sequence[Judged],
+    ) -> tuple[Round, Judged | None]:
+        """The outcome with the law that is accepted and what explains the data as well; too many such are no finding.
+
+        Args:
+          outcome: of the round so far.
+          best: the law to accept.
+          judged, beaten: what it met in the sharper arena, and what lost to it before.
+          leading: of those that are believed, the one that gains most.
+          entered: all of the shortlist.
+        """
+        arena, met = self.arena, [*judged, *beaten]
+        alike = self._alike(met, best, leading)
         if _too_many(alike):
             # So many causes that do alike are no finding: each would be named for want of the others.
             outcome.reason = f"{len(alike)} effects explain it alike: {', '.join(alike)}"
@@ -103,7 +127,7 @@ class Contest:
         else:
             # What the data cannot exclude is told even where more parameters make it the less likely, short of so much
             # that it says nothing.
-            possible = self._alike(met, best, believed[0], priced=False)
+            possible = self._alike(met, best, leading, priced=False)
             alike = alike if _too_many(possible) else possible
         outcome.accepted = [e.id for e in arena.new(best)]
         outcome.share = arena.explained(best)
