@@ -34,6 +34,7 @@ import torch
 from anomalies.course import Course, Part, Settings, parts, replayed
 from anomalies.unconditional import Unconditional
 from numpy.typing import NDArray
+from options import count, ended, json_file, number, write_json
 from posteriors.keep import Kept
 from timing import Table
 
@@ -206,7 +207,7 @@ def main() -> None:
             if scores := bench.run(ends):
                 measure(table, bench, scores)
     if args.json:
-        args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
+        write_json(args.json, [asdict(r) for r in table.rows])
 
 
 def opened(out: Path, args: argparse.Namespace) -> tuple[Kept, int]:
@@ -223,29 +224,34 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--robots", nargs="+", default=["Jackal", "Ant"],
                         choices=("Jackal", "Ant", "Quadruped", "Humanoid", "Quadcopter"))  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="DIR", help="keeps finished parts: a stopped run goes on")
-    parser.add_argument("--nominal", type=int, default=10_000, help="windows that false alarms are counted on")
-    parser.add_argument("--held-out", type=int, default=5000, help="nominal windows that thresholds are taken from")
-    parser.add_argument("--faulty", type=int, default=500, help="windows of each fault and size")
-    parser.add_argument("--training", type=int, default=20_000, help="nominal windows of the contrastive net")
-    parser.add_argument("--epochs", type=int, default=30, help="of the contrastive net")
-    parser.add_argument("--effects", type=int, default=6, help="effects of the library, drawn")
-    parser.add_argument("--levels", type=int, default=2000, help="nominal windows that level the bank's faults")
+    parser.add_argument("--nominal", type=count(1), default=10_000, help="windows that false alarms are counted on")
+    parser.add_argument(
+        "--held-out", type=count(1), default=5000, help="nominal windows that thresholds are taken from"
+    )
+    parser.add_argument("--faulty", type=count(1), default=500, help="windows of each fault and size")
+    parser.add_argument("--training", type=count(1), default=20_000, help="nominal windows of the contrastive net")
+    parser.add_argument("--epochs", type=count(1), default=30, help="of the contrastive net")
+    parser.add_argument("--effects", type=count(0), default=6, help="effects of the library, drawn")
+    parser.add_argument("--levels", type=count(0), default=2000, help="nominal windows that level the bank's faults")
     parser.add_argument(
         "--lessons",
-        type=int,
+        type=count(1),
         default=1000,
         help="windows with drawn faults, beside those of --levels: what the bank's judge learns from",
     )
-    parser.add_argument("--draws", type=int, default=32, help="replays a window; of each machine in the bank half")
-    parser.add_argument("--width", type=float, default=0.02, help="of psi about nominal, in the prior's range")
-    parser.add_argument("--seed", type=int, help="default drawn, or the one that --out was begun with; printed")
-    parser.add_argument("--jobs", type=int, default=1, help="processes that replay")
+    parser.add_argument("--draws", type=count(1), default=32, help="replays a window; of each machine in the bank half")
+    parser.add_argument("--width", type=number(0, 1), default=0.02, help="of psi about nominal, in the prior's range")
+    parser.add_argument("--seed", type=count(0), help="default drawn, or the one that --out was begun with; printed")
+    parser.add_argument("--jobs", type=count(1), default=1, help="processes that replay")
     parser.add_argument("--device", default="cpu", help="that the contrastive net learns on: cpu or cuda")
     parser.add_argument(
-        "--stop", type=float, metavar="SECONDS", help="begin no new part after that time; the net's training is not cut"
+        "--stop",
+        type=number(0),
+        metavar="SECONDS",
+        help="begin no new part after that time; the net's training is not cut",
     )
     parser.add_argument("--quick", action="store_true", help="Jackal alone, a few windows: a minute, and says little")
-    parser.add_argument("--json", type=Path, help="write the rows here")
+    parser.add_argument("--json", type=json_file, help="write the rows here")
     args = parser.parse_args()
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 10, 10, 2
@@ -255,4 +261,4 @@ def _arguments() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

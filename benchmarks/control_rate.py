@@ -14,9 +14,9 @@ a core, where other work runs beside it.
 """
 
 import argparse
-import json
 import os
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -31,6 +31,7 @@ import gymnasium
 import numpy as np
 import timing
 import torch
+from options import count, ended, json_file, write_json
 from timing import Table
 
 import nfc_gym  # noqa: F401 (registers the ids)
@@ -46,6 +47,7 @@ from nfc_gym.simulate import simulate
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
 
+ROBOTS = ["Jackal", "Quadcopter", "Quadruped", "Ant", "Humanoid"]
 EVERY = 25  # control steps between two replays, as docs/adaptation.md has it
 REPLAYED = ("Jackal", "Quadcopter")  # what they observe is their state; the others' replay wants a state estimate
 PLAIN, LOOP = 1000.0, 25.0  # Hz, the goals: the policy alone; policy, monitor and posterior
@@ -143,12 +145,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--quick", action="store_true", help="one robot, few steps")
-    add("--robots", nargs="+", metavar="ROBOT", default=["Jackal", "Quadcopter", "Quadruped", "Ant"])
-    add("--threads", type=int, default=2, help="of the replays' physics")
-    add("--draws", type=int, default=100, help="of psi from the posterior, each step")
-    add("--repeats", type=int, default=5)
+    add("--robots", nargs="+", choices=ROBOTS, default=ROBOTS[:4])
+    add("--threads", type=count(0), default=2, help="of the replays' physics")
+    add("--draws", type=count(1), default=100, help="of psi from the posterior, each step")
+    add("--repeats", type=count(0), default=5)
     add("--clock", choices=("wall", "cpu"), default="wall", help="cpu: processor time, where cores are shared")
-    add("--json", type=Path, metavar="FILE", help="rows {name, value, unit, baseline, goal, holds, seeds}")
+    add("--json", type=json_file, metavar="FILE", help="rows {name, value, unit, baseline, goal, holds, seeds}")
     args = parser.parse_args()
     timing.use_clock(args.clock)
     torch.set_num_threads(1)
@@ -159,7 +161,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             measure(table, robot, Path(folder), threads, args.draws, repeats)
     if args.json:
-        args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
+        write_json(args.json, [asdict(r) for r in table.rows])
 
 
 def measure(table: Table, robot: str, folder: Path, threads: int, draws: int, repeats: int) -> None:
@@ -184,5 +186,6 @@ def measure(table: Table, robot: str, folder: Path, threads: int, draws: int, re
 
 if __name__ == "__main__":
     began = time.monotonic()
-    main()
+    code = ended(main)
     print(f"{time.monotonic() - began:.0f} s, load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    sys.exit(code)

@@ -12,7 +12,6 @@ The paper's scenarios of the Jackal's axle are what is measured where none is na
 """
 
 import argparse
-import json
 import os
 import secrets
 import sys
@@ -24,7 +23,8 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from posteriors.keep import Kept
+from options import count, ended, json_file, write_json
+from posteriors.keep import Kept, begun
 from worlds.counting import DROP, Drop, measure
 from worlds.scenarios import TABLE_III
 from worlds.world import ENGINES, World
@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             rows += [shown(r) for r in worlds(args, kept, place, scenario)]
     print(f"{sum(r['counts'] for r in rows)} of {len(rows)} worlds count")
     if args.json:
-        args.json.write_text(json.dumps({"rows": [figure(r, args) for r in rows], "worlds": rows}, indent=1))
+        write_json(args.json, {"rows": [figure(r, args) for r in rows], "worlds": rows})
     return 0
 
 
@@ -58,24 +58,25 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--scenarios", nargs="+", metavar="PARTS", help="such as axle+snow; default the paper's, or psi+effect")
     add("--engine", choices=ENGINES, default="mujoco", help="bullet: PyBullet, for Jackal, Quadcopter, Quadruped")
     add("--task", choices=("goal", "figure8"), help="of Jackal and Quadcopter; default goal")
-    add("--episodes", type=int, default=100)
-    add("--worlds", type=int, default=1, help="drawn of each scenario")
-    add("--threads", type=int, default=1, help="of the physics; 0 is all cores")
-    add("--find", type=int, metavar="K", help="go on until K of a scenario count")
-    add("--draws", type=int, default=20, help="worlds drawn at most by --find")
-    add("--seed", type=int, help="of what is hidden and of the episodes; default drawn")
+    add("--episodes", type=count(1), default=100)
+    add("--worlds", type=count(1), default=1, help="drawn of each scenario")
+    add("--threads", type=count(0), default=1, help="of the physics; 0 is all cores")
+    add("--find", type=count(1), metavar="K", help="go on until K of a scenario count")
+    add("--draws", type=count(1), default=20, help="worlds drawn at most by --find")
+    add("--seed", type=count(0), help="of what is hidden and of the episodes; default drawn")
     add("--out", type=Path, metavar="DIR", help="keeps finished worlds")
-    add("--json", type=Path, metavar="FILE")
+    add("--json", type=json_file, metavar="FILE")
     add("--quick", action="store_true", help="two worlds, a few episodes: a toy")
     args = parser.parse_args(argv)
     if args.quick:
         args.scenarios, args.episodes = args.scenarios or ["axle"], 4
-    known = args.out / "seed.json" if args.out else None
-    if args.seed is None:
-        args.seed = json.loads(known.read_text()) if known and known.is_file() else secrets.randbits(31)
-    if known:
-        args.out.mkdir(parents=True, exist_ok=True)
-        known.write_text(json.dumps(args.seed))
+    for place in args.places:  # a wrong name ends the run before its first world
+        for scenario in args.scenarios or default(place):
+            World(place, scenario, 0, engine=args.engine)
+    if args.out:
+        args.seed = begun(args.out, args.seed)
+    elif args.seed is None:
+        args.seed = secrets.randbits(31)
     return args
 
 
@@ -102,6 +103,8 @@ def worlds(args: argparse.Namespace, kept: Kept | None, place: str, scenario: st
             return told | {"again": again.drop, "counts": again.counts, "seconds": time.monotonic() - began}
 
         result = kept.once(world.name, row) if kept else row()
+        if kept and args.find and result["counts"] and "again" not in result:  # of a run without --find
+            kept.keep(world.name, result := row())
         yield result
         found += result["counts"]
         if args.find and found >= args.find:
@@ -139,4 +142,4 @@ def figure(row: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

@@ -10,13 +10,11 @@ and judged on the same observations, drawn from the prior predictive. `--quick` 
 """
 
 import argparse
-import json
 import os
 import statistics
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its core whenever another process has it
 
@@ -25,6 +23,7 @@ import torch
 from known.c2st import c2st
 from known.tasks import TASKS, LinearGaussian, Task
 from numpy.typing import NDArray
+from options import count, ended, json_file, write_json
 from timing import Table, race, use_clock
 
 from nfc_gym.core import Fidelity
@@ -134,18 +133,18 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="*", choices=TASKS, default=list(TASKS))
     parser.add_argument("--densities", nargs="+", choices=("score", "mixture", "flow"), default=["score"])
     parser.add_argument("--base", choices=("linear", "prior", "both"), default="both", help="where densities start")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--simulations", type=int, default=10_000)
-    parser.add_argument("--observations", type=int, default=10)
-    parser.add_argument("--samples", type=int, default=10_000)
-    parser.add_argument("--epochs", type=int, default=TRAINING.epochs)
+    parser.add_argument("--seeds", nargs="+", type=count(0), default=[0, 1, 2])
+    parser.add_argument("--simulations", type=count(1), default=10_000)
+    parser.add_argument("--observations", type=count(1), default=10)
+    parser.add_argument("--samples", type=count(1), default=10_000)
+    parser.add_argument("--epochs", type=count(1), default=TRAINING.epochs)
     parser.add_argument("--latency", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument(
         "--clock", choices=("wall", "cpu"), default="wall", help="of the latency; cpu on a busy machine"
     )
     parser.add_argument("--device", default="cpu", help="of the latency (default cpu)")
     parser.add_argument("--quick", action="store_true", help="one seed, few simulations and observations: a minute")
-    parser.add_argument("--json", type=Path, help="write the rows here")
+    parser.add_argument("--json", type=json_file, help="write the rows here")
     args = parser.parse_args()
     use_clock(args.clock)
     if args.quick:
@@ -161,8 +160,8 @@ def main() -> None:
     if args.latency:
         latency(table, 3 if args.quick else 25, args.clock, args.device)
     if args.json:
-        args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
+        write_json(args.json, [asdict(r) for r in table.rows])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

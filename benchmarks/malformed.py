@@ -30,6 +30,7 @@ from pathlib import Path
 import gymnasium
 from damage import FITS, INPUTS, OPTIONS, healthy
 from damage.case import FORMATS
+from options import count, ended, json_file, write_json
 from timing import Table
 
 from nfc_gym.cli import main as nfc_gym
@@ -232,14 +233,19 @@ INPUTS_WORDS = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a few hundred cases, under a minute")
-    parser.add_argument("--cases", type=int, help="how many (10 000)")
-    parser.add_argument("--seed", type=int, help="repeat the run of that seed")
+    parser.add_argument("--cases", type=count(1), help="how many (10 000)")
+    parser.add_argument("--seed", type=count(0), help="repeat the run of that seed")
     parser.add_argument("--only", default="", help="kinds of damage whose name holds this")
-    parser.add_argument("--case", type=int, help="only the case of that number, whose files stay")
-    parser.add_argument("--json", type=Path, help="write the rows there")
+    parser.add_argument("--case", type=count(0), help="only the case of that number, whose files stay")
+    parser.add_argument("--json", type=json_file, help="write the rows there")
     args = parser.parse_args()
+    if not any(args.only in kind for kind in (*INPUTS, *OPTIONS, *FITS)):
+        kinds = ", ".join(sorted({kind.partition(":")[0] for kind in (*INPUTS, *OPTIONS, *FITS)}))
+        parser.error(f"--only {args.only!r}: no kind of damage holds that; they begin with {kinds}")
+    if args.case is not None and args.seed is None:
+        parser.error(f"--case {args.case} is one of a run: give that run's --seed, which it printed")
     seed = secrets.randbits(32) if args.seed is None else args.seed
     cases = args.cases or (200 if args.quick else 10_000)
     print(f"seed {seed}, {cases} cases", flush=True)
@@ -258,11 +264,11 @@ def main() -> None:
     table.add("faults: tracebacks, hangs, warnings, losses, mute refusals", len(bench.faults), "1", at_most=0)
     table.add("slowest command", bench.slowest[0], "s", at_most=LIMIT)
     if args.json:
-        args.json.write_text(json.dumps([asdict(r) | {"seeds": [seed]} for r in table.rows], indent=1))
+        write_json(args.json, [asdict(r) | {"seeds": [seed]} for r in table.rows])
     sys.exit(bool(bench.faults))
 
 
 if __name__ == "__main__":
     faulthandler.enable()
     os.environ.setdefault("NO_COLOR", "1")
-    main()
+    sys.exit(ended(main))

@@ -19,6 +19,8 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from options import count, ended, json_file, write_json
+
 from nfc_gym.measured.dataset import load
 
 HERE = Path(__file__).resolve().parent
@@ -108,10 +110,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=HERE.parents[1] / "shared", help="folder with data/ and score/")
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument("--work", type=Path, default=Path("results/measured_sets"))
-    parser.add_argument("--jobs", type=int, default=0, help="threads of a loop; 0 takes all cores")
-    parser.add_argument("--at-once", type=int, default=1, help="folds of a set at a time, each with --jobs threads")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--jobs", type=count(0), default=0, help="threads of a loop; 0 takes all cores")
+    parser.add_argument(
+        "--at-once", type=count(1), default=1, help="folds of a set at a time, each with --jobs threads"
+    )
+    parser.add_argument("--seed", type=count(0), default=0)
+    parser.add_argument("--json", type=json_file)
     parser.add_argument("--figures", type=Path, metavar="FOLDER", help="draw one picture a set there")
     parser.add_argument(
         "--quick", action="store_true", help="one set and few families of effects, as an end-to-end check"
@@ -154,8 +158,8 @@ def main() -> None:
         )
         print(f"    {r['claims']}")
     if args.json:
-        args.json.write_text(json.dumps(rows, indent=1))
+        write_json(args.json, rows)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(ended(main))

@@ -21,7 +21,6 @@ minutes; its figures mean nothing.
 import argparse
 import json
 import os
-import secrets
 import sys
 import tempfile
 import time
@@ -32,7 +31,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from posteriors.keep import Kept
+from options import count, ended, json_file, number, write_json
+from posteriors.keep import Kept, begun
 from worlds import paper, tables
 from worlds.learning import Budget
 from worlds.machines import ROBOTS, nominal_space
@@ -53,8 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     limit_threads(args.threads)
     with tempfile.TemporaryDirectory() as folder:
         out = args.out or Path(folder)
-        out.mkdir(parents=True, exist_ok=True)
-        args.seed = master_seed(args.seed, out)
+        args.seed = begun(out, args.seed)
         if args.quick:
             toy(args, out)
         kept = Kept(out, {"seed": args.seed, "episodes": args.episodes, "steps": args.steps, "envs": args.envs,
@@ -69,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(text)
         if args.json:
             rows = [row for _, rows in parts for row in rows]
-            args.json.write_text(json.dumps({"rows": rows, "seed": args.seed}, indent=1, allow_nan=False))
+            write_json(args.json, {"rows": rows, "seed": args.seed})
     return 0
 
 
@@ -80,44 +79,38 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--places", nargs="+", choices=PLACES, default=list(PLACES), metavar="PLACE", help="of Table II")
     add("--grounds", nargs="+", choices=paper.GROUNDS, default=list(paper.GROUNDS), help="of Table III")
     add("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
-    add("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of learning")
-    add("--worlds", type=int, default=1, help="hidden worlds a scenario")
+    add("--seeds", nargs="+", type=count(0), default=[0, 1, 2], help="of learning")
+    add("--worlds", type=count(1), default=1, help="hidden worlds a scenario")
     add("--counting", type=Path, metavar="FILE", help="of `hidden_worlds.py --json`: Table II takes what counts there")
     add("--scenario", default="psi+effect", help="of Table II")
     add("--scenarios", nargs="+", metavar="PARTS", help="of Table III; default the paper's")
     add("--engine", choices=ENGINES, default="mujoco", help="of the true worlds; bullet: PyBullet")
     add("--task", choices=("goal", "figure8"), default="figure8", help="of Table III")
-    add("--episodes", type=int, default=100, help="that judge a policy")
+    add("--episodes", type=count(1), default=100, help="that judge a policy")
     add("--policies", type=Path, metavar="DIR")
     add("--posteriors", type=Path, metavar="DIR")
     add("--detectors", type=Path, metavar="DIR")
     add("--world-models", type=Path, metavar="DIR", help="of TD-MPC2")
-    add("--envs", type=int, default=1024)
-    add("--steps", type=int, default=20_000_000, help="control steps of learning in simulation")
-    add("--budget", type=float, default=1800.0, metavar="SECONDS", help="of learning in simulation")
-    add("--executed", type=int, default=10, help="episodes in the true world that adapting may use")
-    add("--ratio", type=float, default=1.0, help="updates of TD-MPC2 a control step in the true world; published: 1")
-    add("--threads", type=int, default=0, help="of the physics; 0 is all")
+    add("--envs", type=count(1), default=1024)
+    add("--steps", type=count(1), default=20_000_000, help="control steps of learning in simulation")
+    add("--budget", type=number(0), default=1800.0, metavar="SECONDS", help="of learning in simulation")
+    add("--executed", type=count(0), default=10, help="episodes in the true world that adapting may use")
+    add(
+        "--ratio", type=number(0), default=1.0, help="updates of TD-MPC2 a control step in the true world; published: 1"
+    )
+    add("--threads", type=count(0), default=0, help="of the physics; 0 is all")
     add("--device", default="cpu")
-    add("--seed", type=int, help="of what is hidden; default drawn once, and kept in --out")
+    add("--seed", type=count(0), help="of what is hidden; default drawn once, and kept in --out")
     add("--beside", type=Path, metavar="DIR", help="--out of an earlier run, perhaps with another budget")
-    add("--stop", type=float, metavar="SECONDS")
+    add("--stop", type=number(0), metavar="SECONDS")
     add("--kept", action="store_true", help="make the tables of the cells in --out")
     add("--out", type=Path, metavar="DIR")
-    add("--json", type=Path, metavar="FILE")
+    add("--json", type=json_file, metavar="FILE")
     add("--quick", action="store_true")
     args = parser.parse_args(argv)
     if args.kept and not (args.out and args.out.is_dir()):
         parser.error(f"--kept makes tables of the cells in --out: want a folder that is there, got {args.out}")
     return args
-
-
-def master_seed(given: int | None, out: Path) -> int:
-    """The given seed, else the one that the folder was begun with, else a new one; the folder keeps it."""
-    file = out / "seed.json"
-    seed = given if given is not None else json.loads(file.read_text()) if file.is_file() else secrets.randbits(31)
-    file.write_text(json.dumps(seed))
-    return seed
 
 
 def toy(args: argparse.Namespace, out: Path) -> None:
@@ -229,4 +222,4 @@ def file_of(folder: Path | None, place: str, suffixes: Sequence[str] = (".safete
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

@@ -23,6 +23,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from options import count, ended, number
 from posteriors.methods import METHODS, cell_name
 from posteriors.paper import ROBOTS, TERRAINS
 from posteriors.sets import HALF, JUDGE, TRAIN, environment, stored
@@ -227,26 +228,28 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="a toy: one cell of the Jackal's, on the processor")
     parser.add_argument("--windows", nargs="+", default=[f"{k}={v}" for k, v in WINDOWS.items()], metavar="NAME=COUNT")
     parser.add_argument("--residuals", nargs="*", default=[], metavar="NAME", help="environments with residual heads")
-    parser.add_argument("--residual-windows", type=int, default=20_480)
+    parser.add_argument("--residual-windows", type=count(0), default=20_480)
     methods = [m for group, _ in GROUPS for m in group]
     parser.add_argument("--methods", nargs="+", choices=methods, default=[m for m in methods if not METHODS[m].peer])
     parser.add_argument("--inputs", nargs="+", default=["summaries", "window"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--effects", type=float, default=0.0)
+    parser.add_argument("--seeds", nargs="+", type=count(0), default=[0])
+    parser.add_argument("--effects", type=number(0, 1), default=0.0)
     parser.add_argument("--gpus", nargs="+", default=["0"], help="their numbers, or cpu")
-    parser.add_argument("--per-gpu", type=int, default=3, help="processes that train on one GPU at the same time")
-    parser.add_argument("--jobs", type=int, default=0, help="processes that simulate; 0 takes all cores")
-    parser.add_argument("--stop", type=float, default=0, help="begin nothing new after these seconds")
-    parser.add_argument("--judges", type=int, default=2000)
-    parser.add_argument("--peer-judges", type=int, default=200, help="of those, for NPSE, whose densities take long")
-    parser.add_argument("--samples", type=int, default=256)
-    parser.add_argument("--budget", type=float, default=60, help="seconds of training a cell")
-    parser.add_argument("--epochs", type=int, default=200, help="at most")
-    parser.add_argument("--batch", type=int, default=1024)
-    parser.add_argument("--rate", type=float, default=1e-3)
-    parser.add_argument("--draws", type=int, default=8, help="of noise a window and step, of score models")
-    parser.add_argument("--few", type=int, default=50, help="windows that are replayed, or whose maps are drawn")
-    parser.add_argument("--ceiling-windows", type=int, default=8)
+    parser.add_argument("--per-gpu", type=count(1), default=3, help="processes that train on one GPU at the same time")
+    parser.add_argument("--jobs", type=count(0), default=0, help="processes that simulate; 0 takes all cores")
+    parser.add_argument("--stop", type=number(0), default=0, help="begin nothing new after these seconds")
+    parser.add_argument("--judges", type=count(1), default=2000)
+    parser.add_argument(
+        "--peer-judges", type=count(1), default=200, help="of those, for NPSE, whose densities take long"
+    )
+    parser.add_argument("--samples", type=count(1), default=256)
+    parser.add_argument("--budget", type=number(0), default=60, help="seconds of training a cell")
+    parser.add_argument("--epochs", type=count(1), default=200, help="at most")
+    parser.add_argument("--batch", type=count(1), default=1024)
+    parser.add_argument("--rate", type=number(0), default=1e-3)
+    parser.add_argument("--draws", type=count(1), default=8, help="of noise a window and step, of score models")
+    parser.add_argument("--few", type=count(1), default=50, help="windows that are replayed, or whose maps are drawn")
+    parser.add_argument("--ceiling-windows", type=count(1), default=8)
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
     args = parser.parse_args()
     if args.quick:
@@ -262,4 +265,4 @@ def _arguments() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(ended(main))

@@ -33,6 +33,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its core whenever another process has it
 
 import torch
+from options import count, ended, number
 from posteriors import extras, plots, report
 from posteriors.cases import WAYS
 from posteriors.ceilings import ceiling_of
@@ -43,7 +44,7 @@ from posteriors.methods import INPUTS, METHODS, cell_name, possible
 from posteriors.paper import ROBOTS, TERRAINS
 from posteriors.sets import Sets, environment, prior_of
 
-from nfc_gym.core.errors import InputError, MissingExtra
+from nfc_gym.core.errors import MissingExtra
 from nfc_gym.inference.progress import Spoken
 
 EXTRAS = ("ceiling", "residuals", "motion", "axle", "rounds", "plots")
@@ -154,31 +155,33 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--inputs", nargs="+", choices=list(INPUTS), default=["window", "summaries"])
     parser.add_argument("--extras", nargs="*", choices=EXTRAS, default=["ceiling"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--windows", type=int, default=100_000, help="to train on")
+    parser.add_argument("--seeds", nargs="+", type=count(0), default=[0])
+    parser.add_argument("--windows", type=count(1), default=100_000, help="to train on")
     parser.add_argument(
-        "--effects", type=float, default=0.0, help="share of the windows with an effect not in the model"
+        "--effects", type=number(0, 1), default=0.0, help="share of the windows with an effect not in the model"
     )
-    parser.add_argument("--residual-windows", type=int, default=20_480, help="that the residual heads learn from")
-    parser.add_argument("--judges", type=int, default=2000, help="windows not trained on")
-    parser.add_argument("--peer-judges", type=int, default=200, help="of those, for NPSE, whose densities take long")
-    parser.add_argument("--samples", type=int, default=512, help="draws a window")
-    parser.add_argument("--epochs", type=int, default=100, help="at most")
-    parser.add_argument("--budget", type=float, default=0, help="seconds of training a cell; 0 sets none")
-    parser.add_argument("--stop", type=float, default=0, help="begin nothing new after these seconds")
-    parser.add_argument("--batch", type=int, default=256)
-    parser.add_argument("--rate", type=float, default=5e-4)
-    parser.add_argument("--draws", type=int, default=8, help="of noise a window and step, of score models")
+    parser.add_argument("--residual-windows", type=count(0), default=20_480, help="that the residual heads learn from")
+    parser.add_argument("--judges", type=count(1), default=2000, help="windows not trained on")
+    parser.add_argument(
+        "--peer-judges", type=count(1), default=200, help="of those, for NPSE, whose densities take long"
+    )
+    parser.add_argument("--samples", type=count(1), default=512, help="draws a window")
+    parser.add_argument("--epochs", type=count(1), default=100, help="at most")
+    parser.add_argument("--budget", type=number(0), default=0, help="seconds of training a cell; 0 sets none")
+    parser.add_argument("--stop", type=number(0), default=0, help="begin nothing new after these seconds")
+    parser.add_argument("--batch", type=count(1), default=256)
+    parser.add_argument("--rate", type=number(0), default=5e-4)
+    parser.add_argument("--draws", type=count(1), default=8, help="of noise a window and step, of score models")
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
-    parser.add_argument("--jobs", type=int, default=0, help="processes of the simulation; 0 takes all cores")
+    parser.add_argument("--jobs", type=count(0), default=0, help="processes of the simulation; 0 takes all cores")
     parser.add_argument("--device", default="auto", help="cpu, cuda, or auto")
-    parser.add_argument("--ceiling-windows", type=int, default=8)
-    parser.add_argument("--ceiling-draws", nargs=2, type=int, default=[256, 32], metavar=("CLOUD", "PAIRS"))
-    parser.add_argument("--truths", type=int, default=20, help="of the sequential rounds")
-    parser.add_argument("--round", type=int, default=10_000, help="simulations a round")
+    parser.add_argument("--ceiling-windows", type=count(1), default=8)
+    parser.add_argument("--ceiling-draws", nargs=2, type=count(1), default=[256, 32], metavar=("CLOUD", "PAIRS"))
+    parser.add_argument("--truths", type=count(1), default=20, help="of the sequential rounds")
+    parser.add_argument("--round", type=count(1), default=10_000, help="simulations a round")
     parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=["on"], help="in which second rounds train")
-    parser.add_argument("--few", type=int, default=200, help="windows that are replayed, or whose maps are drawn")
-    parser.add_argument("--axles", type=int, default=100, help="windows with a lost axle")
+    parser.add_argument("--few", type=count(1), default=200, help="windows that are replayed, or whose maps are drawn")
+    parser.add_argument("--axles", type=count(0), default=100, help="windows with a lost axle")
     parser.add_argument("--quick", action="store_true", help="a toy: Jackal on flat ground, in a minute")
     args = parser.parse_args()
     if args.out is None and not args.quick:
@@ -192,7 +195,4 @@ def _arguments() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as e:
-        sys.exit(str(e))
+    sys.exit(ended(main))

@@ -11,7 +11,6 @@ policies, their curves and logs. `--quick` is a few seconds of JackalFlat on one
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -20,10 +19,12 @@ import time
 from pathlib import Path
 
 import numpy as np
+from options import count, ended, json_file, number, write_json
 
 from nfc_gym import assets
 from nfc_gym.adaptation import load_policy
 from nfc_gym.adaptation.evaluate import evaluate
+from nfc_gym.adaptation.network import NETS
 from nfc_gym.adaptation.worlds import vector_env
 
 ROBOTS = ("Humanoid", "Quadruped", "Quadcopter", "Ant", "Jackal")
@@ -103,15 +104,15 @@ def row(name: str, out: Path) -> dict[str, object]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, metavar="DIR", help="policies, curves and logs")
-    parser.add_argument("--seconds", type=float, default=480)
-    parser.add_argument("--steps", type=int, default=10**9)
+    parser.add_argument("--seconds", type=number(0), default=480)
+    parser.add_argument("--steps", type=count(1), default=10**9)
     parser.add_argument("--only", nargs="+", choices=IDS, default=IDS)
-    parser.add_argument("--net", default="small")
-    parser.add_argument("--envs", type=int, default=1024)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cores", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--net", choices=list(NETS), default="small")
+    parser.add_argument("--envs", type=count(1), default=1024)
+    parser.add_argument("--seed", type=count(0), default=0)
+    parser.add_argument("--cores", type=count(1), default=len(os.sched_getaffinity(0)))
     parser.add_argument("--start", type=Path)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=json_file)
     parser.add_argument("--quick", action="store_true")
     args = parser.parse_args()
     if args.quick:
@@ -141,9 +142,9 @@ def trained(args: argparse.Namespace) -> int:
             print(f"{name:16} {found['steps']:>12,} steps {found['seconds']:>6} s  {nominal}", end="")
             print(f"  random {found['baseline']:.1f}" if found["baseline"] is not None else f"  goal {found['goal']}")
     if args.json:
-        args.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+        write_json(args.json, rows)
     return max(codes.values())
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(ended(main))

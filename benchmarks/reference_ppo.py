@@ -14,7 +14,6 @@ finished runs are kept. `--quick` is a few thousand steps, of this package alone
 import argparse
 import contextlib
 import io
-import json
 import os
 import runpy
 import sys
@@ -34,6 +33,7 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from options import count, ended, json_file, write_json
 from posteriors.keep import Kept
 from timing import Table
 
@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 name, means["pretrain"], "", baseline=reference, at_least=reference, seeds=tuple(args.seeds)
             )  # fmt: skip
     if args.json:
-        args.json.write_text(json.dumps([asdict(row) for row in table.rows], indent=1), encoding="utf-8")
+        write_json(args.json, [asdict(row) for row in table.rows])
     return 0
 
 
@@ -74,11 +74,11 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--script", type=Path, metavar="FILE", help="CleanRL's ppo_continuous_action.py")
     add("--places", nargs="+", default=["AntFlat", "QuadrupedFlat", "HumanoidFlat"], metavar="PLACE")
-    add("--seeds", type=int, nargs="+", default=[0, 1])
-    add("--steps", type=int, default=600_000, help="control steps of each run")
-    add("--envs", type=int, default=256, help="simulations of `nfc-gym pretrain`")
+    add("--seeds", type=count(0), nargs="+", default=[0, 1])
+    add("--steps", type=count(1), default=600_000, help="control steps of each run")
+    add("--envs", type=count(1), default=256, help="simulations of `nfc-gym pretrain`")
     add("--out", type=Path, metavar="DIR", help="keeps finished runs")
-    add("--json", type=Path, metavar="FILE")
+    add("--json", type=json_file, metavar="FILE")
     add("--quick", action="store_true", help="a toy")
     args = parser.parse_args(argv)
     if args.script is not None and not args.script.is_file():
@@ -149,4 +149,4 @@ def theirs(place: str, seed: int, steps: int, script: Path) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

@@ -8,18 +8,17 @@ far the robot has moved. Differences are reported, not tuned away: another engin
 """
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
+from options import ended, json_file, write_json
 from timing import Table
 from worlds.judge import state_of
 from worlds.world import World
@@ -33,7 +32,7 @@ ENGINES = ("mujoco", "bullet")
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="two drives and one flight")
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--json", type=json_file, metavar="FILE")
     args = parser.parse_args(argv)
     if find_spec("pybullet") is None:
         print("second_engine: skipped, PyBullet is not installed: pip install 'nfc_gym[bench]'")
@@ -45,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, place, commands in TRIALS[:1] if args.quick else TRIALS:
         open_loop(table, name, place, commands)
     if args.json:
-        args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
+        write_json(args.json, [asdict(r) for r in table.rows])
     return 0
 
 
@@ -109,4 +108,4 @@ def open_loop(table: Table, name: str, place: str, commands: Callable[[int], Arr
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

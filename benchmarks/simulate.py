@@ -13,13 +13,13 @@ import os
 import sys
 import time
 from dataclasses import asdict
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import mujoco
 import numpy as np
 import safetensors
+from options import count, ended, json_file, write_json
 from timing import SEED, Table
 
 from nfc_gym.simulate import ground
@@ -72,17 +72,17 @@ def main() -> None:
     names = [f"{robot}{soil}" for robot in robots for soil in ("Flat", "Rough")]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=names)
-    parser.add_argument("--windows", type=int, default=2048, help="of a shard")
+    parser.add_argument("--windows", type=count(1), default=2048, help="of a shard")
     parser.add_argument("--quick", action="store_true", help="Jackal alone, 256 windows: half a minute")
-    parser.add_argument("--json", type=Path, help="write the rows here")
+    parser.add_argument("--json", type=json_file, help="write the rows here")
     args = parser.parse_args()
     print(f"mujoco {mujoco.__version__}, numpy {np.__version__}, safetensors {safetensors.__version__}; one thread")
     table = Table()
     for name in args.only or (names[:2] if args.quick else names):
         speed(table, name, 256 if args.quick else args.windows)
     if args.json:
-        args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
+        write_json(args.json, [asdict(r) for r in table.rows])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

@@ -13,7 +13,6 @@ The same command goes on where it was stopped.
 import argparse
 import json
 import os
-import secrets
 import shutil
 import sys
 import tempfile
@@ -26,6 +25,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from options import count, ended, json_file, number, write_json
+from posteriors.keep import begun, belongs
 from standin import plan
 from standin.heads import ENVIRONMENTS, STRONG, Course, judged, taught, threads
 from standin.robots import ROBOTS
@@ -58,24 +59,26 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--quick", action="store_true", help="a toy's head, one tiny trial of the Quadcopter")
     add("--robots", nargs="+", choices=list(ENVIRONMENTS), default=["quadcopter"])
-    add("--trials", type=int, default=6, help="machines a robot, each with one effect (default 6)")
-    add("--nulls", type=int, default=0, help="machines a robot without any")
-    add("--windows", type=int, default=Course().windows, help="that a head is trained on")
-    add("--epochs", type=int, default=Course().epochs, help="of its training, at most")
-    add("--jobs", type=int, default=1, help="processes that simulate its windows")
+    add("--trials", type=count(0), default=6, help="machines a robot, each with one effect (default 6)")
+    add("--nulls", type=count(0), default=0, help="machines a robot without any")
+    add("--windows", type=count(1), default=Course().windows, help="that a head is trained on")
+    add("--epochs", type=count(1), default=Course().epochs, help="of its training, at most")
+    add("--jobs", type=count(0), default=1, help="processes that simulate its windows")
     add("--device", default="cpu", help="that it is trained on (default cpu)")
-    add("--seed", type=int, help="repeats a run; default drawn, or the one that --out was begun with")
-    add("--stop", type=float, default=float("inf"), metavar="SECONDS", help="begin no trial after so long")
+    add("--seed", type=count(0), help="repeats a run; default drawn, or the one that --out was begun with")
+    add("--stop", type=number(0), default=float("inf"), metavar="SECONDS", help="begin no trial after so long")
     add("--out", type=Path, metavar="DIR", help="keeps windows, heads and finished trials, and results.json")
+    add("--json", type=json_file, metavar="FILE", help="figures {name, value, unit, baseline, goal, holds}")
     return parser.parse_args(argv)
 
 
 def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     """All that is asked for; finished parts are read back."""
     began = time.monotonic()
-    seed = _kept(folder / "seed.json", lambda: args.seed if args.seed is not None else secrets.randbits(31))
+    seed = begun(folder, args.seed)
     print(f"seed {seed} (drawn at run time unless given)", flush=True)
     course = Course(96, 64, 1, small=True) if args.quick else Course(args.windows, epochs=args.epochs)
+    belongs(folder, {"seed": seed, "windows": course.windows, "epochs": course.epochs, "small": course.small})
     rows: list[dict[str, Any]] = []
     for robot in args.robots:
         head = taught(robot, course, folder, seed, args.jobs, args.device)
@@ -89,7 +92,9 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
             print(said(trials[-1]), flush=True)
         rows += loop_rows(robot, trials)
     print(table(rows))
-    write_whole(folder / "results.json", json.dumps(clean({"seed": seed, "rows": rows}), indent=1))
+    for path in (folder / "results.json", args.json):
+        if path:
+            write_json(path, {"seed": seed, "rows": rows})
     return rows
 
 
@@ -209,4 +214,4 @@ def _kept(path: Path, make: Any) -> Any:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

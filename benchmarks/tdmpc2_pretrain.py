@@ -9,7 +9,6 @@ how each does in the nominal world, beside a policy of random actions. `--quick`
 """
 
 import argparse
-import json
 import os
 import sys
 import tempfile
@@ -21,6 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import torch
+from options import count, ended, json_file, number, write_json
 from pretrain import IDS, random_return
 from rich.console import Console
 from tdmpc2.pretraining import Pretraining, pretrain
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if "success" in found:
                 table.add(f"{place}: TD-MPC2, success", found["success"], "share", seeds=(args.seed,))
     if args.json:
-        args.json.write_text(json.dumps([asdict(row) for row in table.rows], indent=1))
+        write_json(args.json, [asdict(row) for row in table.rows])
     return code
 
 
@@ -65,16 +65,16 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--out", type=Path, metavar="DIR")
     add("--only", nargs="+", choices=IDS, default=["JackalFlat", "JackalRough", "AntFlat", "AntRough"], metavar="PLACE")
-    add("--steps", type=int, default=1_000_000, help="control steps of all simulations of a place together")
-    add("--seconds", type=float, help="of each place, whichever is used up first")
-    add("--envs", type=int, default=64)
-    add("--ratio", type=float, default=0.25, help="updates a control step; the published one is 1")
+    add("--steps", type=count(1), default=1_000_000, help="control steps of all simulations of a place together")
+    add("--seconds", type=number(0), help="of each place, whichever is used up first")
+    add("--envs", type=count(1), default=64)
+    add("--ratio", type=number(0), default=0.25, help="updates a control step; the published one is 1")
     add("--net", choices=list(NETS), default="5M")
-    add("--episodes", type=int, default=16, help="that judge each")
+    add("--episodes", type=count(1), default=16, help="that judge each")
     add("--device", default="auto")
-    add("--threads", type=int, default=0, help="of the physics; 0 is all")
-    add("--seed", type=int, default=0)
-    add("--json", type=Path, metavar="FILE")
+    add("--threads", type=count(0), default=0, help="of the physics; 0 is all")
+    add("--seed", type=count(0), default=0)
+    add("--json", type=json_file, metavar="FILE")
     add("--quick", action="store_true")
     args = parser.parse_args(argv)
     if args.quick:
@@ -86,4 +86,4 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

@@ -24,6 +24,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is drawn, and the suite
 
 import numpy as np
 import torch
+from options import count, ended, json_file, write_json
 from timing import Table
 
 EPISODES = 10  # at each point, as the authors
@@ -50,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                   seeds=tuple(args.seeds))  # fmt: skip
         print(f"    each seed {[round(v, 1) for v in found]}, published {list(theirs.get(at, ()))}", flush=True)
     if args.json:
-        args.json.write_text(json.dumps([asdict(row) for row in table.rows], indent=1))
+        write_json(args.json, [asdict(row) for row in table.rows])
     return 0
 
 
@@ -59,14 +60,14 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--task", default="cartpole-swingup", help="cartpole-swingup, pendulum-swingup, reacher-easy, or any other")
     add("--net", default="5M", help="5M, 1M (the authors' sizes) or toy")
-    add("--steps", type=int, default=200_000, help="of the simulation")
-    add("--every", type=int, default=100_000, metavar="STEPS", help="between two points of the curve")
-    add("--seeds", nargs="+", type=int, default=[0])
-    add("--batch", type=int, metavar="N", help="sequences an update; default the published 256")
-    add("--episodes", type=int, default=EPISODES, help="at each point")
+    add("--steps", type=count(1), default=200_000, help="of the simulation")
+    add("--every", type=count(1), default=100_000, metavar="STEPS", help="between two points of the curve")
+    add("--seeds", nargs="+", type=count(0), default=[0])
+    add("--batch", type=count(1), metavar="N", help="sequences an update; default the published 256")
+    add("--episodes", type=count(1), default=EPISODES, help="at each point")
     add("--device", default="auto")
     add("--out", type=Path, metavar="DIR")
-    add("--json", type=Path, metavar="FILE")
+    add("--json", type=json_file, metavar="FILE")
     add("--quick", action="store_true")
     return parser.parse_args(argv)
 
@@ -112,4 +113,4 @@ def curve(args: argparse.Namespace, seed: int) -> list[tuple[int, float]]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

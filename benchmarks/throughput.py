@@ -12,7 +12,6 @@ place of the time that passes: for machines that are busy with other things, whe
 
 import argparse
 import importlib.util
-import json
 import multiprocessing
 import os
 import sys
@@ -27,6 +26,7 @@ import gymnasium
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
+from options import ended, json_file, write_json
 from peers.ant_v5 import AntV5, AntV5ContactVectorEnv
 from timing import SEED, Table, race, use_clock
 
@@ -333,7 +333,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=sections, default=sections)
     parser.add_argument("--quick", action="store_true", help="fewer robots, sizes and turns: a minute on two cores")
     parser.add_argument("--clock", choices=("wall", "cpu"), default="wall")
-    parser.add_argument("--json", type=Path, help="write the rows here")
+    parser.add_argument("--json", type=json_file, help="write the rows here")
     args = parser.parse_args()
     quick = args.quick
     use_clock(args.clock)
@@ -358,8 +358,8 @@ def main() -> None:
     short = [r for r in table.rows if r.holds is False]
     print(f"{len(table.rows)} figures; {len(short)} fall short of their goal" + "".join(f"\n  {r.name}" for r in short))
     if args.json:
-        args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
+        write_json(args.json, [asdict(r) for r in table.rows])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

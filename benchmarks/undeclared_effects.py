@@ -23,6 +23,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from options import count, ended, json_file, number, write_json
 from standin import plan
 from standin.robots import ROBOTS
 from standin.row import Row, Task, from_json, to_json
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path in (args.json, args.out / "results.json" if args.out else None):
         if path:
             content = {"rows": results, "trials": [to_json(r) for r in rows]}
-            path.write_text(json.dumps(content, indent=1, allow_nan=False))
+            write_json(path, content)
     return 0 if args.kept or len(rows) == planned_count else 1
 
 
@@ -67,24 +68,23 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--quick", action="store_true", help="one tiny trial a robot, with one or two families in the contest")
     add("--robots", nargs="+", choices=list(ROBOTS), help="default all; with --quick the Quadcopter")
-    add("--trials", "--seeds", type=int, default=1, help="machines of each single effect, a robot (default 1)")
+    add("--trials", "--seeds", type=count(0), default=1, help="machines of each single effect, a robot (default 1)")
     add("--effects", nargs="+", choices=families, metavar="FAMILY", help="only these single effects")
-    add("--pairs", type=int, default=0, help="machines with two effects, a robot")
-    add("--outside", type=int, default=0, help="machines of each effect outside the library, a robot")
-    add("--nulls", type=int, default=0, help="machines without any effect, a robot")
-    add("--baselines", type=float, default=0.2, metavar="SHARE", help="of single effects with the slow baselines")
-    add("--seed", type=int, help="repeats a run; default drawn, or the one that --out was begun with")
-    add("--jobs", type=int, default=1, help="trials at a time, each a process")
-    add("--threads", type=int, help="of a trial; default 1, all cores with --jobs 1 and without --quick")
+    add("--pairs", type=count(0), default=0, help="machines with two effects, a robot")
+    add("--outside", type=count(0), default=0, help="machines of each effect outside the library, a robot")
+    add("--nulls", type=count(0), default=0, help="machines without any effect, a robot")
+    add(
+        "--baselines", type=number(0, 1), default=0.2, metavar="SHARE", help="of single effects with the slow baselines"
+    )
+    add("--seed", type=count(0), help="repeats a run; default drawn, or the one that --out was begun with")
+    add("--jobs", type=count(1), default=1, help="trials at a time, each a process")
+    add("--threads", type=count(0), help="of a trial; default 1, all cores with --jobs 1 and without --quick")
     add("--out", type=Path, metavar="DIR", help="keeps finished trials: a killed run goes on, a longer one adds")
     add("--begin", type=Path, metavar="FILE", help="take over seed and trials that an earlier run's --json wrote")
-    add("--most", type=int, metavar="N", help="of trials that are not finished only the first N of the plan")
+    add("--most", type=count(0), metavar="N", help="of trials that are not finished only the first N of the plan")
     add("--kept", action="store_true", help="no new trials: figures of those that --out holds")
-    add("--json", type=Path, metavar="FILE", help="figures {name, value, unit, baseline, goal, holds, seeds, ...}")
-    args = parser.parse_args(argv)
-    if args.most is not None and args.most < 0:
-        parser.error(f"--most {args.most}: it must be 0 or more trials")
-    return args
+    add("--json", type=json_file, metavar="FILE", help="figures {name, value, unit, baseline, goal, holds, seeds, ...}")
+    return parser.parse_args(argv)
 
 
 def master_seed(args: argparse.Namespace) -> int:
@@ -148,4 +148,4 @@ def shown(rows: Iterable[tuple[Row, str]]) -> Iterable[Row]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ended(main))

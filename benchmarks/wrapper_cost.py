@@ -8,8 +8,8 @@ does: nothing is skipped where a parameter is zero.
 """
 
 import argparse
-import json
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,6 +19,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from options import ended, json_file, write_json
 from timing import Table
 
 import nfc_gym  # noqa: F401 (registers the ids)
@@ -152,7 +153,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="two environments, fewer turns")
     rows = "rows {name, value, unit, baseline, goal, holds, seeds}"
-    parser.add_argument("--json", type=Path, metavar="FILE", help=rows)
+    parser.add_argument("--json", type=json_file, metavar="FILE", help=rows)
     args = parser.parse_args()
     count, turns = (200, 7) if args.quick else (500, 15)
     names = ["Ant-v5", "nfc_gym/JackalFlat-v0"] + ([] if args.quick else ["nfc_gym/AntFlat-v0"])
@@ -162,8 +163,8 @@ def main() -> None:
             steps(table, name, count, turns, Path(folder))
         resets(table, turns, count)
     if args.json:
-        args.json.write_text(json.dumps([asdict(r) for r in table.rows], indent=1))
+        write_json(args.json, [asdict(r) for r in table.rows])
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(ended(main))

@@ -2,11 +2,43 @@
 
 import json
 import os
+import secrets
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from nfc_gym.core.errors import InputError
+
+
+def begun(out: Path, given: int | None) -> int:
+    """The seed that a folder was begun with, else the given one, else a new one; the folder keeps it in `seed.json`.
+
+    Raises:
+      InputError: another one is given than the folder was begun with.
+    """
+    file = out / "seed.json"
+    kept = json.loads(file.read_text()) if file.is_file() else None
+    if kept is not None and given not in (None, kept):
+        raise InputError(f"{out} was begun with seed {kept}, not {given}: leave --seed out, or choose another folder")
+    seed = kept if kept is not None else given if given is not None else secrets.randbits(31)
+    out.mkdir(parents=True, exist_ok=True)
+    write(file, seed)
+    return seed
+
+
+def belongs(out: Path, settings: dict[str, Any]) -> None:
+    """Keep in a folder what its results depend on beside their names.
+
+    Raises:
+      InputError: it holds results of other settings.
+    """
+    file = out / "settings.json"
+    if file.is_file():
+        before = json.loads(file.read_text())
+        odd = [f"{k} {before.get(k)}, not {v}" for k, v in settings.items() if before.get(k) != v]
+        if odd:
+            raise InputError(f"{out} holds results of {', '.join(odd)}: give those, or another folder")
+    write(file, settings)
 
 
 class Kept:
@@ -23,13 +55,7 @@ class Kept:
     def __init__(self, out: Path, settings: dict[str, Any]) -> None:
         self.cells, self.out = out / "cells", out
         self.cells.mkdir(parents=True, exist_ok=True)
-        file = out / "settings.json"
-        if file.is_file():
-            before = json.loads(file.read_text())
-            odd = [f"{k} {before.get(k)}, not {v}" for k, v in settings.items() if before.get(k) != v]
-            if odd:
-                raise InputError(f"{out} holds results of {', '.join(odd)}: give those, or another folder")
-        write(file, settings)
+        belongs(out, settings)
 
     def once(self, name: str, make: Callable[[], dict[str, Any]], **of: Any) -> dict[str, Any]:
         """What `make` gives, or gave when it was called for this name before; what is `missing` is tried again.

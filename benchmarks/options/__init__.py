@@ -1,0 +1,84 @@
+"""What benchmarks share of their command lines: numbers with bounds, the file for the rows, and how a run ends."""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from nfc_gym.core.errors import NfcError
+from nfc_gym.core.files import write_whole
+
+
+def count(least: int) -> Callable[[str], int]:
+    """A whole number of at least so many, as the `type` of an argument."""
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{text!r}: want a whole number of at least {least}")
+        return value
+
+    return read
+
+
+def number(least: float, most: float = math.inf) -> Callable[[str], float]:
+    """A number within bounds, as the `type` of an argument."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            upper = f"of at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
+            raise argparse.ArgumentTypeError(f"{text!r}: want a number {upper}")
+        return value
+
+    return read
+
+
+def json_file(text: str) -> Path:
+    """A file that the rows can be written to, as the `type` of an argument: asked before the run, not after it."""
+    path = Path(text)
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is a folder: want a file")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: its folder cannot be made: {error.strerror}") from None
+    return path
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Whole or not at all; what is not finite becomes null, which JSON has."""
+    text = json.dumps(_finite(content), indent=1, allow_nan=False)
+    if path.exists() and not path.is_file():  # such as /dev/stdout
+        path.write_text(text, encoding="utf-8")
+    else:
+        write_whole(path, text)
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {k: _finite(v) for k, v in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(v) for v in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def ended(main: Callable[[], int | None]) -> int:
+    """Run a benchmark's `main`; bad input ends in a line and 2, as with `nfc-gym`, and Ctrl-C in 130."""
+    try:
+        return main() or 0
+    except NfcError as error:
+        print(f"{Path(sys.argv[0]).stem}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130

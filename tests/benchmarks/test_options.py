@@ -1,0 +1,154 @@
+"""What benchmarks share of their command lines, and what they say of arguments that cannot be."""
+
+import importlib
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+
+from nfc_gym.core.errors import InputError
+
+
+@pytest.mark.parametrize("text", ["0", "-3", "1.5", "many", "nan"])
+def test_a_count_names_the_value_and_what_would_be_valid(text: str) -> None:
+    from argparse import ArgumentTypeError
+
+    from options import count
+
+    with pytest.raises(ArgumentTypeError, match=rf"'{text}': want a whole number of at least 1"):
+        count(1)(text)
+    assert count(1)("1") == 1
+
+
+@pytest.mark.parametrize("text", ["-0.1", "1.5", "nan", "half"])
+def test_a_share_is_from_0_to_1(text: str) -> None:
+    from argparse import ArgumentTypeError
+
+    from options import number
+
+    with pytest.raises(ArgumentTypeError, match=rf"'{text}': want a number from 0 to 1"):
+        number(0, 1)(text)
+    assert number(0, 1)("0.25") == 0.25
+    assert number(0)("inf") == math.inf
+
+
+def test_where_rows_go_is_asked_before_the_run(tmp_path: Path) -> None:
+    from argparse import ArgumentTypeError
+
+    from options import json_file, write_json
+
+    file = json_file(str(tmp_path / "new" / "rows.json"))
+    write_json(file, [{"value": math.nan, "seeds": (0,)}])
+    assert json.loads(file.read_text()) == [{"value": None, "seeds": [0]}]
+    with pytest.raises(ArgumentTypeError, match="is a folder: want a file"):
+        json_file(str(tmp_path))
+    with pytest.raises(ArgumentTypeError, match="its folder cannot be made"):
+        json_file(str(file / "rows.json"))
+
+
+def test_bad_input_ends_in_a_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    from options import ended
+
+    def refusing() -> None:
+        raise InputError("place 'Moon': want a robot and its ground")
+
+    def stopped() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["benchmarks/some.py"])
+    assert ended(refusing) == 2
+    assert capsys.readouterr().err == "some: place 'Moon': want a robot and its ground\n"
+    assert ended(stopped) == 130
+    assert ended(lambda: None) == 0
+    assert ended(lambda: 1) == 1
+
+
+def test_a_folder_keeps_its_seed_where_another_is_refused(tmp_path: Path) -> None:
+    """An overwritten seed would make the folder refuse the very command that it was begun with."""
+    from posteriors.keep import begun
+
+    assert begun(tmp_path / "out", 7) == 7
+    with pytest.raises(InputError, match="was begun with seed 7, not 8: leave --seed out"):
+        begun(tmp_path / "out", 8)
+    assert begun(tmp_path / "out", None) == 7
+    assert begun(tmp_path / "else", None) == begun(tmp_path / "else", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "said"),
+    [
+        ("hidden_worlds", ["--places", "JackalFlat", "Moon"], "place 'Moon': want a robot and its ground"),
+        ("hidden_worlds", ["--scenarios", "axle", "fog"], "fog"),
+    ],
+)
+def test_a_wrong_name_ends_a_run_before_its_first_world(
+    name: str, words: list[str], said: str, tmp_path: Path
+) -> None:  # fmt: skip
+    with pytest.raises(InputError, match=said):
+        importlib.import_module(name).parse([*words, "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
+
+
+def test_worlds_that_a_run_without_find_kept_are_measured_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    import hidden_worlds
+    from posteriors.keep import Kept
+    from worlds.counting import Drop
+    from worlds.figures import Interval
+    from worlds.judge import Episodes
+
+    seeds = []
+
+    def measure(policy: str, world: object, episodes: int, seed: int, **_: object) -> Drop:
+        seeds.append(seed)
+        some = Interval(1.0, 0.0, 2.0)
+        return Drop(world, some, some, some, 0.5, Episodes([1.0], [1.0], [0.0], [1.0], [0.0], [0.0], [1]))
+
+    monkeypatch.setattr(hidden_worlds, "measure", measure)
+    kept = Kept(tmp_path, {})
+    plain = hidden_worlds.parse(["--seed", "3"])
+    finding = hidden_worlds.parse(["--seed", "3", "--find", "1"])
+    again = []
+    for args in (plain, finding, finding):
+        again += [row.get("again") for row in hidden_worlds.worlds(args, kept, "AntFlat", "psi+effect")]
+    assert again == [None, 0.5, 0.5]
+    assert seeds == [3, 3, 1_000_003]
+
+
+def test_a_structure_run_is_of_one_seed_and_one_course(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import structure
+
+    monkeypatch.setattr(structure, "taught", lambda *_: tmp_path / "head")
+    monkeypatch.setattr(structure, "judged", lambda *_: {})
+    monkeypatch.setattr(structure, "told_rows", lambda *_: [structure.row("r", "area", 1.0, "1")])
+    words = ["--trials", "0", "--windows", "512", "--out", str(tmp_path / "out")]
+    assert structure.main([*words, "--seed", "5", "--json", str(tmp_path / "rows.json")]) == 0
+    assert json.loads((tmp_path / "rows.json").read_text())["rows"][0]["name"] == "r: area"
+    with pytest.raises(InputError, match="was begun with seed 5, not 6"):
+        structure.main([*words, "--seed", "6"])
+    words[3] = "1024"
+    with pytest.raises(InputError, match="holds results of windows 512, not 1024"):
+        structure.main(words)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--only", "nonesuch"], "no kind of damage holds that; they begin with .*mapping"),
+        (["--case", "4"], "give that run's --seed"),
+    ],
+)
+def test_malformed_refuses_what_would_damage_nothing(
+    words: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    import re
+
+    import malformed
+
+    monkeypatch.setattr(sys, "argv", ["malformed.py", *words])
+    with pytest.raises(SystemExit):
+        malformed.main()
+    assert re.search(said, capsys.readouterr().err.replace("\n", " "))
