@@ -31,7 +31,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from options import count, ended, json_file, number, write_json
+from options import count, ended, json_file, number, read_json, write_json
 from posteriors.keep import Kept, begun
 from worlds import paper, tables
 from worlds.learning import Budget
@@ -134,7 +134,7 @@ def worlds_of(args: argparse.Namespace) -> list[World]:
     if not args.counting:
         return [World(p, args.scenario, args.seed + k, engine=args.engine) for p in args.places
                 for k in range(args.worlds)]  # fmt: skip
-    rows = [r for r in json.loads(args.counting.read_text())["worlds"] if r["counts"]]
+    rows = [r for r in read_json(args.counting, "worlds")["worlds"] if r["counts"]]
     worlds = []
     for place in args.places:
         own = [World(place, r["scenario"], r["seed"], engine=r["engine"]) for r in rows if r["place"] == place]

@@ -24,11 +24,11 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from options import count, ended, number
-from posteriors.methods import METHODS, cell_name
+from posteriors.methods import INPUTS, METHODS, cell_name
 from posteriors.paper import ROBOTS, TERRAINS
 from posteriors.sets import HALF, JUDGE, TRAIN, environment, stored
 
-from nfc_gym.core.errors import NfcError
+from nfc_gym.core.errors import InputError, NfcError
 
 TABLE = Path(__file__).with_name("posterior_table.py")
 # Windows to train on: fewer where a window of motion takes long to simulate.
@@ -97,11 +97,11 @@ def split(place: str) -> tuple[str, str]:
     """Robot and ground of an environment's name.
 
     Raises:
-      SystemExit: there is none of that name.
+      InputError: there is none of that name.
     """
     known = {r + t: (r, t) for r in ROBOTS for t in TERRAINS}
     if place not in known:
-        sys.exit(f"no environment {place!r}; there are: {', '.join(known)}")
+        raise InputError(f"no environment {place!r}; there are: {', '.join(known)}")
     return known[place]
 
 
@@ -122,6 +122,8 @@ def run(args: argparse.Namespace, place: str, name: str, flags: list[str], gpu: 
     env = os.environ | ({} if gpu in (None, "cpu") else {"CUDA_VISIBLE_DEVICES": gpu})
     with (args.out / "logs" / f"{place}_{name}.log").open("a") as log:
         code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=env, check=False).returncode
+    if code:
+        args.failed.append(f"{place} {name}")
     print(f"{time.monotonic() - args.began:6.0f} s  {place} {name}: {time.monotonic() - began:.0f} s"
           + (f", FAILED with {code}: see logs" if code else ""), flush=True)  # fmt: skip
 
@@ -137,10 +139,11 @@ def simulated(args: argparse.Namespace, place: str, windows: int, effects: float
     began = time.monotonic()
     env, said = environment(*split(place)), f"{windows} windows simulated"
     try:
-        for seed, count in ((JUDGE, args.judges), (TRAIN, windows)):
-            stored(args.out, env, count, seed, args.jobs, maps, effects)
+        for seed, wanted in ((JUDGE, args.judges), (TRAIN, windows)):
+            stored(args.out, env, wanted, seed, args.jobs, maps, effects)
     except NfcError as e:
         said = f"FAILED: {e}"
+        args.failed.append(place)
     now = time.monotonic()
     print(f"{now - args.began:6.0f} s  {place}: {said} in {now - began:.0f} s", flush=True)
     return not said.startswith("FAILED")
@@ -148,14 +151,15 @@ def simulated(args: argparse.Namespace, place: str, windows: int, effects: float
 
 def processors(args: argparse.Namespace, queue: Queue) -> None:
     """What the processors do, in order; it lets GPUs begin as windows are there."""
-    left = list(args.windows)
+    left: list[str] = []  # have windows, and no ceiling yet
     try:
         for i, place in enumerate(args.windows):
             if time.monotonic() > args.ends:
                 return
             if simulated(args, place, args.windows[place], args.effects):
                 queue.add(*cells(args, i, place))
-            if i + 1 >= _CEILINGS_AFTER:
+                left.append(place)
+            if i + 1 >= _CEILINGS_AFTER and left:
                 ceiling(args, left.pop(0))
         for place in left:
             ceiling(args, place)
@@ -192,17 +196,17 @@ def kept(args: argparse.Namespace, place: str, method: str, inputs: str, seed: i
     return file.is_file() and "missing" not in json.loads(file.read_text())
 
 
-def main() -> None:
+def main() -> int:
     """Command line."""
     args = _arguments()
     with tempfile.TemporaryDirectory() as folder:
         args.out = args.out or Path(folder)
-        fill(args)
+        return fill(args)
 
 
-def fill(args: argparse.Namespace) -> None:
-    """Threads that train and this one, which simulates, until all is done."""
-    args.began = time.monotonic()
+def fill(args: argparse.Namespace) -> int:
+    """Threads that train and this one, which simulates, until all is done; 1 where something failed."""
+    args.began, args.failed = time.monotonic(), []
     args.ends = args.began + args.stop if args.stop else float("inf")
     (args.out / "logs").mkdir(parents=True, exist_ok=True)
     queue = Queue()
@@ -212,14 +216,19 @@ def fill(args: argparse.Namespace) -> None:
     processors(args, queue)
     for thread in workers:
         thread.join()
-    print(f"{time.monotonic() - args.began:6.0f} s  done: {args.out / 'table.md'}")
+    table = args.out / "table.md"
+    said = f"FAILED: {', '.join(args.failed)}; " if args.failed else "done: "
+    print(f"{time.monotonic() - args.began:6.0f} s  {said}{table if table.is_file() else 'no table yet'}")
+    return 1 if args.failed else 0
 
 
 def _counts(pairs: list[str]) -> dict[str, int]:
     try:
-        return {place: int(count) for place, count in (p.split("=") for p in pairs)}
+        return {place: count(1)(text) for place, text in (p.split("=") for p in pairs)}
     except ValueError:
-        sys.exit(f"--windows {' '.join(pairs)}: want NAME=COUNT, as JackalFlat=100000")
+        raise InputError(f"--windows {' '.join(pairs)}: want NAME=COUNT, as JackalFlat=100000") from None
+    except argparse.ArgumentTypeError as error:
+        raise InputError(f"--windows {' '.join(pairs)}: {error}") from None
 
 
 def _arguments() -> argparse.Namespace:
@@ -231,7 +240,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--residual-windows", type=count(0), default=20_480)
     methods = [m for group, _ in GROUPS for m in group]
     parser.add_argument("--methods", nargs="+", choices=methods, default=[m for m in methods if not METHODS[m].peer])
-    parser.add_argument("--inputs", nargs="+", default=["summaries", "window"])
+    parser.add_argument("--inputs", nargs="+", choices=list(INPUTS), default=["summaries", "window"])
     parser.add_argument("--seeds", nargs="+", type=count(0), default=[0])
     parser.add_argument("--effects", type=number(0, 1), default=0.0)
     parser.add_argument("--gpus", nargs="+", default=["0"], help="their numbers, or cpu")

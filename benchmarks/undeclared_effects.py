@@ -23,7 +23,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from options import count, ended, json_file, number, write_json
+from options import count, ended, json_file, number, read_json, write_json
 from standin import plan
 from standin.robots import ROBOTS
 from standin.row import Row, Task, from_json, to_json
@@ -104,7 +104,7 @@ def taken_over(args: argparse.Namespace) -> None:
     """Put the seed and the trials of an earlier run's figures into `--out`, to go on from there."""
     if not args.out:
         sys.exit("--begin FILE wants --out DIR: where its trials are to be kept")
-    content = json.loads(args.begin.read_text())
+    content = read_json(args.begin, "rows", "trials")
     args.seed = content["rows"][0]["seeds"][0]
     master_seed(args)
     kept = plan.Kept(args.out)

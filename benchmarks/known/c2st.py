@@ -25,4 +25,5 @@ def c2st(a: Array, b: Array, seed: int = 0) -> float:
     judge = MLPClassifier((width, width), batch_size=500, early_stopping=True, max_iter=200, random_state=seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
+        warnings.filterwarnings("ignore", "Got `batch_size`", UserWarning)  # few draws are one batch
         return float(cross_val_score(judge, x, y, cv=KFold(5, shuffle=True, random_state=seed)).mean())

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from nfc_gym.core.errors import NfcError
+from nfc_gym.core.errors import InputError, NfcError
 from nfc_gym.core.files import write_whole
 
 
@@ -62,6 +62,23 @@ def write_json(path: Path, content: Any) -> None:
         path.write_text(text, encoding="utf-8")
     else:
         write_whole(path, text)
+
+
+def read_json(path: Path, *keys: str) -> dict[str, Any]:
+    """What another run's `--json` wrote, with these keys.
+
+    Raises:
+      InputError: the file is not there, or is something else.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; want the file that a run's --json wrote") from None
+    except ValueError:
+        content = None
+    if not isinstance(content, dict) or not set(keys) <= content.keys():
+        raise InputError(f"{path} is not what a run's --json wrote: want JSON with {', '.join(keys)}")
+    return content
 
 
 def _finite(content: Any) -> Any:

@@ -38,7 +38,10 @@ def player(name: str, world: World, seed: int) -> Policy:
         return Falco()
     from nfc_gym.adaptation.policy import load_policy
 
-    return load_policy(name)
+    try:
+        return load_policy(name)
+    except InputError as error:
+        raise InputError(f"policy {name!r} is neither falco nor random, nor a file or an id: {error}") from None
 
 
 def seen_by(policy: Policy, world: World, num_envs: int, **settings: Any) -> VectorEnv:

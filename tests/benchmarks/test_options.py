@@ -48,6 +48,56 @@ def test_where_rows_go_is_asked_before_the_run(tmp_path: Path) -> None:
         json_file(str(file / "rows.json"))
 
 
+def test_rows_of_another_run_are_read_or_refused(tmp_path: Path) -> None:
+    from options import read_json, write_json
+
+    file = tmp_path / "rows.json"
+    with pytest.raises(InputError, match=r"rows.json: No such file or directory; want the file that a run's --json"):
+        read_json(file, "worlds")
+    for content in ("{", "[]", '{"rows": []}'):
+        file.write_text(content)
+        with pytest.raises(InputError, match="is not what a run's --json wrote: want JSON with worlds"):
+            read_json(file, "worlds")
+    write_json(file, {"worlds": [1]})
+    assert read_json(file, "worlds") == {"worlds": [1]}
+
+
+def test_a_queue_with_a_failure_ends_in_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    import posterior_queue
+
+    def refused(*_: object) -> None:
+        raise InputError("the disk is full")
+
+    monkeypatch.setattr(posterior_queue, "stored", refused)
+    monkeypatch.setattr(posterior_queue, "run", lambda *_: pytest.fail("there are no windows for it"))
+    words = ["--windows", "JackalFlat=64", "--out", str(tmp_path), "--gpus", "cpu"]
+    monkeypatch.setattr(sys, "argv", ["posterior_queue.py", *words])
+    assert posterior_queue.main() == 1
+    said = capsys.readouterr().out
+    assert "JackalFlat: FAILED: the disk is full" in said
+    assert said.splitlines()[-1].endswith("FAILED: JackalFlat; no table yet")
+
+
+@pytest.mark.parametrize("windows", ["JackalFlat", "JackalFlat=-3", "JackalFlat=many", "Moon=3"])
+def test_a_queue_of_no_windows_is_refused(windows: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import posterior_queue
+
+    monkeypatch.setattr(sys, "argv", ["q", "--windows", windows, "--out", str(tmp_path / "out")])
+    with pytest.raises(InputError, match=windows.partition("=")[0]):
+        posterior_queue.main()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_policy_that_is_none_is_named_with_what_there_is() -> None:
+    from worlds.players import player
+    from worlds.world import World
+
+    with pytest.raises(InputError, match="policy 'nonsense' is neither falco nor random, nor a file or an id"):
+        player("nonsense", World("JackalFlat", "axle", 0), 0)
+
+
 def test_bad_input_ends_in_a_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     from options import ended
 
