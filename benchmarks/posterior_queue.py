@@ -200,8 +200,11 @@ def main() -> int:
     """Command line."""
     args = _arguments()
     with tempfile.TemporaryDirectory() as folder:
-        args.out = args.out or Path(folder)
-        return fill(args)
+        scratch, args.out = args.out is None, args.out or Path(folder)
+        code = fill(args)
+        if scratch and (args.out / "table.md").is_file():  # which goes with its folder
+            print((args.out / "table.md").read_text())
+        return code
 
 
 def fill(args: argparse.Namespace) -> int:

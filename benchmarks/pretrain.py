@@ -130,7 +130,7 @@ def trained(args: argparse.Namespace) -> int:
     shares, began = threads(args.only, args.cores), time.monotonic()
     running = {name: start(name, shares[name], k, args) for k, name in enumerate(args.only)}
     codes = {name: process.wait() for name, process in running.items()}
-    print(f"{time.monotonic() - began:.0f} s on {args.cores} cores, {visible_gpus()} GPUs")
+    print(f"{time.monotonic() - began:.0f} s, cores: {args.cores}, GPUs: {visible_gpus()}")
     rows = []
     for name in args.only:
         if codes[name]:

@@ -5,6 +5,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -78,6 +79,21 @@ def test_a_queue_with_a_failure_ends_in_1(
     said = capsys.readouterr().out
     assert "JackalFlat: FAILED: the disk is full" in said
     assert said.splitlines()[-1].endswith("FAILED: JackalFlat; no table yet")
+
+
+def test_a_queue_without_a_folder_prints_its_table(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    import posterior_queue
+
+    def filled(args: Any) -> int:
+        (args.out / "table.md").write_text("the table")
+        return 0
+
+    monkeypatch.setattr(posterior_queue, "fill", filled)
+    monkeypatch.setattr(sys, "argv", ["posterior_queue.py", "--quick"])
+    assert posterior_queue.main() == 0
+    assert "the table" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("windows", ["JackalFlat", "JackalFlat=-3", "JackalFlat=many", "Moon=3"])
