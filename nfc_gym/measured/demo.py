@@ -215,11 +215,13 @@ def jackal_mapping(weighed: float) -> str:
 
 def _show(console: Console, content: Mapping[str, Any], report: Mapping[str, Any], outcome: str, out: Path) -> None:
     claims = report["effects"]
-    table = Table("", "sealed in the envelope", "what the loop says", title="The envelope is opened", show_lines=True)
+    table = Table("", title="The envelope is opened", show_lines=True)
+    for title in ("sealed in the envelope", "what the loop says"):
+        table.add_column(title, overflow="fold")  # ids of many places have no blank to break at
     table.add_row("effect", content["hidden"], "; ".join(e["sentence"] for e in claims) or "no effect claimed")
     table.add_row(
-        "family: place",
-        f"{content['family']}: {'+'.join(content['where'])}",
+        "family:place",
+        f"{content['family']}:{'+'.join(content['where'])}",
         "\n".join([e["id"], *(f"or {q}" for q in e["equivalents"])]) if (e := claims[0] if claims else None) else "-",
     )
     for name, true in content["parameters"].items():

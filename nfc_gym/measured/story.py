@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from nfc_gym.measured.wording import DASH, counted, finite, listed, number, percent, plain, quantity
+from nfc_gym.physics.effects.words import together
 
 _WORSE = 1.02  # error after over error before from which a group is reported as made worse
 
@@ -155,7 +156,7 @@ def what(effect: dict[str, Any]) -> str:
     if not values:
         return f"{str(effect.get('family', '')).replace('_', ' ')} at {listed(places, 4)}"
     if len(places) > 3:
-        head = head.replace(" and ".join(places), listed(places, 4))
+        head = head.replace(together(places), listed(places, 4))
     return head[:1].lower() + head[1:] if head[1:2].islower() else head
 
 

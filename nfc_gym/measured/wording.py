@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from nfc_gym.physics.effects.words import together
+
 DASH = "–"
 _MINUS = "−"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -97,7 +99,7 @@ def listed(names: Sequence[Any], most: int = 6) -> str:
         return DASH
     if len(words) > most:
         words = [*words[: most - 1], f"{len(words) - most + 1} more"]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    return together(words)
 
 
 def counted(n: int, one: str, many: str | None = None) -> str:

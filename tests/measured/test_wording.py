@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from nfc_gym.measured import wording
-from nfc_gym.physics.effects import propose
+from nfc_gym.physics.effects import build, propose
 from nfc_gym.physics.effects.base import Scales
 from nfc_gym.physics.effects.law import Law
+from nfc_gym.physics.effects.words import together
 
 
 @pytest.mark.parametrize(
@@ -49,3 +50,11 @@ def test_every_smooth_law_of_one_variable_has_words() -> None:
     smooth = [e.id for e in propose(model, scales) if e.generic and not isinstance(e, Law)]
     assert len({wording.smooth(i) for i in smooth}) == len(smooth) > 0
     assert wording.smooth("generic_memory:knee") == "a smooth force by its past at knee"
+
+
+@pytest.mark.parametrize(("names", "said"), [("a", "a"), ("ab", "a and b"), ("abcd", "a, b, c and d")])
+def test_names_have_commas_and_one_and(names: str, said: str) -> None:
+    assert together(list(names)) == said
+    assert build("coulomb", list(names), {"level": 0.25})[0].say(np.array([0.25])).startswith(
+        f"Dry (Coulomb) friction at {said}: level 0.25"
+    )  # fmt: skip

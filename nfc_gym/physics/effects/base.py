@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.lookup import Rows
 from nfc_gym.physics.effects.param import Param
-from nfc_gym.physics.effects.words import with_spread
+from nfc_gym.physics.effects.words import together, with_spread
 from nfc_gym.physics.fields import ModelFields
 
 Array = NDArray[np.float64]
@@ -360,7 +360,7 @@ class Effect(ABC):
             size = with_spread(theta[i], None if sd is None or p.given else sd[i])
             unit = "" if p.unit == "1" else f" {p.unit}"
             parts.append(f"{p.name.replace('_', ' ')} {size}{unit}")
-        return f"{self.summary} at {' and '.join(self.where)}: {', '.join(parts)}."
+        return f"{self.summary} at {together(self.where)}: {', '.join(parts)}."
 
 
 def overrides(effect: Effect, hook: str) -> bool:

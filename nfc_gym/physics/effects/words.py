@@ -1,6 +1,7 @@
-"""Numbers as a reader wants them: to the digits that are known."""
+"""Numbers and names as a reader wants them: to the digits that are known, and with commas."""
 
 import math
+from collections.abc import Sequence
 
 _SMALL, _LARGE, _PLACES = 1e-4, 1e6, 6  # between which numbers are written without a power of ten; decimals at most
 
@@ -20,3 +21,9 @@ def with_spread(value: float, sd: float | None = None) -> str:
         return f"{value:.3g} ± {half:.2g}"
     decimals = max(places, 0)
     return f"{round(value, places) + 0.0:.{decimals}f} ± {half:.{decimals}f}"
+
+
+def together(names: Sequence[str]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
