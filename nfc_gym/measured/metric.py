@@ -11,7 +11,8 @@ Array = NDArray[np.float64]
 _UNSTABLE = 30.0  # standard deviations that every number of an unstable block counts as
 _SEEN = 0.64  # of a squared error: where noise makes up more of it, the error is not counted
 _NOTHING = 0.05  # of the noise's variance: a squared error that exceeds it by less counts as taken away whole
-_SHARES = (0.0, *10.0 ** np.arange(-6, 1.5, 0.5))  # of the errors' variance, among which slack is looked for
+_SHARES = (0.0, *10.0 ** np.arange(-5, 2))  # of the errors' variance, among which slack is looked for
+_PAST = 2  # of them in a row that do no better, after which no more is looked for
 _TURN = 3.0  # standard deviations at which the loss turns from squared to linear
 
 
@@ -105,8 +106,15 @@ def likeliest_slack(problem: Problem, residual: Array, sigma: Array) -> Array:
     for of in _kinds(problem):
         if np.isfinite(values[:, of]).any():
             spread[of] = _spread(values[:, of])
-    tried = [least + share * spread for share in _SHARES]
-    return min(tried, key=lambda extra: float(metric(problem, sigma, extra).surprise(residual[None]).sum()))
+    best, lowest, past = least, np.inf, 0
+    for share in _SHARES:
+        extra = least + share * spread
+        surprise = float(metric(problem, sigma, extra).surprise(residual[None]).sum())
+        if surprise < lowest:
+            best, lowest, past = extra, surprise, 0
+        elif (past := past + 1) == _PAST:
+            break
+    return best
 
 
 def _kinds(problem: Problem) -> list[NDArray[np.bool_]]:
