@@ -1,9 +1,10 @@
 """One round of the search: refit the shortlist, judge it on the selection logs, and decide which law is accepted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
-from nfc_gym.measured.arena import Arena, contains, contains_any
+from nfc_gym.measured.arena import Arena, contains
+from nfc_gym.measured.choice import Choice, too_many
 from nfc_gym.measured.contest import Judged, mechanism, shortlist
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.pairing import promising
@@ -11,10 +12,7 @@ from nfc_gym.measured.ranking import Round, known_as, ranked
 from nfc_gym.measured.screen import Screen, Screened, mimics
 from nfc_gym.measured.yardstick import HOPE
 from nfc_gym.physics.effects.base import Effect
-from nfc_gym.physics.effects.each import Each, split
 
-NEARLY = 0.95  # share of the best candidate's gain that a simpler law must reach to be preferred
-_SHARED = 0.8  # the same for the same law at a wider place
 _LEADING = 0.7  # of the best gain: what a law at several places must reach to be tried with values of their own
 _PAIRED = 3  # pairs of mechanisms that are tried
 _TOGETHER = 1.25  # of what the best gains alone, believed or not: what a pair must gain to be accepted at once
@@ -27,7 +25,6 @@ _FAINT = 0.02  # nats a number beyond the noise, below which two laws have nothi
 _RIVAL, _DUELS = 0.5, 2  # of the best gain: who comes so near meets the best again at half the step; how many do
 _BY_PSI = 0.1  # of a candidate's gain, beyond which its psi alone becomes the model to beat
 _NARROWER = 2  # sets within the leading law's own where it is fitted too, those that promise most
-_ALIKE = 3  # families that may explain the data alike for one of them to be claimed
 
 
 class Contest:
@@ -116,19 +113,19 @@ class Contest:
           entered: all of the shortlist.
         """
         arena, met = self.arena, [*judged, *beaten]
-        alike = self._alike(met, best, leading)
-        if _too_many(alike):
+        alike = self._choice.alike(met, best, leading)
+        if too_many(alike):
             # So many causes that do alike are no finding: each would be named for want of the others.
             outcome.reason = f"{len(alike)} effects explain it alike: {', '.join(alike)}"
             if (both := self._instead(best, judged, entered)) is None:
                 return outcome, None
-            outcome.reason, best, alike = "", both, self._alike([], both, both)
+            outcome.reason, best, alike = "", both, self._choice.alike([], both, both)
             outcome.ranking = [arena.row(best), *outcome.ranking]
         else:
             # What the data cannot exclude is told even where more parameters make it the less likely, short of so much
             # that it says nothing.
-            possible = self._alike(met, best, leading, priced=False)
-            alike = alike if _too_many(possible) else possible
+            possible = self._choice.alike(met, best, leading, priced=False)
+            alike = alike if too_many(possible) else possible
         outcome.accepted = [e.id for e in arena.new(best)]
         outcome.share = arena.explained(best)
         again = {arena.label(j) for j in judged}  # the others' fits are a first look
@@ -171,18 +168,18 @@ class Contest:
         Returns:
           The law, all that were judged, and those of them that are believed; the outcome's ranking has the new ones.
         """
-        arena, best = self.arena, self._simplest(believed)
+        arena, best = self.arena, self._choice.simplest(believed)
         if mimics := self._mimics(best, judged):
             judged = sorted([*judged, *mimics], key=lambda j: -j.total)
             outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in mimics])
-            best = self._simplest(believed := [j for j in judged if self._believed(j)])
+            best = self._choice.simplest(believed := [j for j in judged if self._believed(j)])
         if rivals := self._rivals(best, judged):
             duel = self._at_half([best, *rivals])
             # Their families' other forms were judged at the whole step alone, and lost to these there.
             families = {arena.new(j)[0].family for j in duel}
             judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
             outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in duel])
-            best = self._simplest(believed := [j for j in judged if self._believed(j)] or [best])
+            best = self._choice.simplest(believed := [j for j in judged if self._believed(j)] or [best])
         return best, judged, believed
 
     def _final(self, first: list[Judged]) -> tuple[list[Judged], list[Judged]]:
@@ -236,6 +233,10 @@ class Contest:
         others = [s for s in self.screened if s.effect.id not in asked]
         like = mimics(self._known[new[0].id], others, self.screen.projected)
         return [arena.enter_beside(best, [s]) for s in (*kin, *like)]
+
+    @property
+    def _choice(self) -> Choice:
+        return Choice(self.arena, self.worth, self.pool, self._look)
 
     def _look(self, effect: Effect) -> Screened:
         return self._screened(effect.id) or self.screen.try_one(effect)
@@ -297,26 +298,7 @@ class Contest:
         if not _FAINT < self.arena.leftover <= _LEFT:
             return None
         both = self._together(self._pairs(judged, entered), [best], judged)
-        return self._simplest(both) if both else None
-
-    def _alike(self, judged: Sequence[Judged], best: Judged, leading: Judged, *, priced: bool = True) -> list[str]:
-        """Ids of the law that is accepted and of what explains the data as well, each once."""
-        ids = [*(e.id for e in self.arena.new(best)), *self._equivalents(judged, best, leading, priced=priced)]
-        return list(dict.fromkeys(ids))
-
-    def _equivalents(
-        self, judged: Sequence[Judged], best: Judged, leading: Judged, *, priced: bool = True
-    ) -> list[str]:
-        """Ids of what explains the data as well as the law that is accepted, see `Arena.ties`."""
-        arena, chosen = self.arena, self.arena.new(best)
-        ids = [e.id for e in chosen]
-        rivals = [j for j in judged if j.total > NEARLY * best.total and arena.label(j) not in ids]
-        rivals = [j for j in rivals if arena.ties(leading, j, priced=priced)]
-        # Nor is one thing that two bodies could carry, hung on the one farther away.
-        rivals = [j for j in rivals if not any(arena.nearer(k, j) for k in (best, *rivals))]
-        # A law that has the chosen one, or another rival, as its special case is no further alternative.
-        laws = [*chosen, *(e for j in rivals for e in arena.new(j))]
-        return [arena.label(j) for j in rivals if not contains_any(arena.new(j), laws)]
+        return self._choice.simplest(both) if both else None
 
     def _apart(self, judged: Sequence[Judged]) -> list[Judged]:
         """Values of their own at each place: for what was accepted before, and for the leading laws at several places.
@@ -370,50 +352,3 @@ class Contest:
         gained = arena.judge(other)
         share = _BY_PSI * max(float(best.fit_gains.sum() + best.gains.sum()), 0.0)
         return other if gained.gain + float(gained.fit_gains.sum()) > share > 0 else None
-
-    def _simplest(self, believed: list[Judged]) -> Judged:
-        """Of the candidates that explain the data as well as the best: fewest parameters, then widest place.
-
-        A law whose own feature does not show gives way to the plainer laws that it contains; and a cause that like
-        parts share is likelier than the same cause in just one of them, unless the data tell them apart.
-        """
-        arena, best = self.arena, believed[0]
-        winner = arena.new(best)[0]
-
-        def enough(j: Judged) -> float:
-            rival = arena.new(j)[0]
-            wider = rival.family == winner.family and set(winner.where) < set(rival.where)
-            return _SHARED if wider else NEARLY
-
-        rivals = [j for j in believed if j.total > enough(j) * best.total and arena.ties(best, j)]
-        plainer = (p for p in self._plainer(best) if self._believed(p) and p.total > NEARLY * best.total)
-        rivals += [p for p in plainer if arena.ties(best, p)]
-        chosen = min(rivals, key=lambda j: (len(j.fitted.x), -len(arena.new(j)[0].where), -j.total))
-        return next((j for j in rivals if arena.nearer(j, chosen)), chosen)
-
-    def _plainer(self, best: Judged) -> Iterator[Judged]:
-        """Fits of the plainer laws that the leading one contains, in its place.
-
-        Where it is an accepted law with values of its own at each place, that law leaves with it. Their psi begins as
-        the leading law's own: from elsewhere a fit may end in a hollow.
-        """
-        arena, look = self.arena, self._look
-        law, *more = arena.new(best)
-        gone = [e for e in arena.current.plant.effects if not any(e is kept for kept in best.fitted.plant.effects)]
-        if more or not law.simpler:
-            return
-        if gone:
-            arena = arena.without(gone[0])
-            look = Screen(arena.fit_data.problem, arena.under, arena.current).try_one
-        for families in law.simpler:
-            plain = [e for f in families if (e := self.pool.get(f"{f}:{law.place}")) is not None]
-            if isinstance(law, Each):
-                plain = [apart[0] for e in plain if (apart := split(e, arena.current.plant)) is not None]
-            if len(plain) == len(families):
-                entered = arena.enter_beside(best, [look(e) for e in plain])
-                yield self.arena.judge(entered.fitted) if gone else entered
-
-
-def _too_many(ids: Sequence[str]) -> bool:
-    """Whether more families explain the data alike than one of them may be claimed among."""
-    return len({i.partition(":")[0] for i in ids}) > _ALIKE

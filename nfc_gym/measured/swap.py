@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 from nfc_gym.measured.arena import Arena, contains
+from nfc_gym.measured.choice import NEARLY
 from nfc_gym.measured.contest import shortlist
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.lookout import Lookout
-from nfc_gym.measured.rounds import NEARLY
 from nfc_gym.measured.screen import Screen, Screened, mimics
 from nfc_gym.physics.effects.base import Effect
 

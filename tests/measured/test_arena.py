@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from nfc_gym.measured.arena import Arena
+from nfc_gym.measured.choice import Choice
 from nfc_gym.measured.contest import Judged, losses
 from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Columns, Problem
-from nfc_gym.measured.rounds import Contest
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.friction import Coulomb
 from nfc_gym.physics.effects.inertial import Payload
@@ -225,6 +225,5 @@ def test_one_lump_on_either_of_two_bodies_is_one_equivalent() -> None:
         ties=lambda best, other, *, priced: True,
         nearer=lambda one, other: (one.law, other.law) == (near, far),
     )
-    contest: Any = object.__new__(Contest)
-    contest.arena = found
-    assert contest._equivalents(laws, laws[0], laws[0]) == ["lump:a"]
+    choice = Choice(found, 0.02, {}, lambda _: pytest.fail("nothing to look at"))
+    assert choice.alike(laws, laws[0], laws[0]) == ["shift:a", "lump:a"]

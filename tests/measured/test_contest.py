@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nfc_gym.measured.choice import Choice
 from nfc_gym.measured.contest import (
     Judged,
     bootstrap,
@@ -255,19 +256,21 @@ def test_friction_in_four_dresses_counts_as_one_mechanism_at_one_place() -> None
     ]  # fmt: skip
 
 
+def choice(arena: Any, pool: list[Any]) -> Choice:
+    return Choice(arena, 0.02, {e.id: e for e in pool}, lambda effect: SimpleNamespace(effect=effect))  # pyright: ignore[reportArgumentType]
+
+
 def test_plainer_laws_are_tried_though_screening_left_them_out() -> None:
     """Friction by direction is dry friction and a preload together, neither of which leads alone in a large pool."""
     law, coulomb, force = (FAMILIES[f](("hinge",)) for f in ("directional_friction", "coulomb", "external_force"))
-    screen = SimpleNamespace(try_one=lambda effect: SimpleNamespace(effect=effect))
-    best = SimpleNamespace(fitted=SimpleNamespace(plant=SimpleNamespace(effects=[law])))
+    best: Any = SimpleNamespace(fitted=SimpleNamespace(plant=SimpleNamespace(effects=[law])))
     arena = SimpleNamespace(
         fit_data=SimpleNamespace(problem=SimpleNamespace(rough=False)),
         current=SimpleNamespace(plant=SimpleNamespace(effects=[])),
         new=lambda judged: [law],
         enter_beside=lambda leader, picks: [p.effect for p in picks],
     )
-    contest: Any = Contest(arena, screen, [], 8, 0.02, [law, coulomb, force])  # pyright: ignore[reportArgumentType]
-    assert list(contest._plainer(best)) == [[coulomb], [coulomb, force]]
+    assert list(choice(arena, [law, coulomb, force])._plainer(best)) == [[coulomb], [coulomb, force]]
 
 
 def test_plainer_laws_take_the_place_of_an_accepted_one_that_wants_values_of_its_own(
@@ -278,8 +281,8 @@ def test_plainer_laws_take_the_place_of_an_accepted_one_that_wants_values_of_its
         FAMILIES[f](("hip", "knee")) for f in ("directional_friction", "coulomb", "external_force", "armature")
     )
     parts = lambda effect: each([type(effect)((name,)) for name in effect.where])  # noqa: E731
-    monkeypatch.setattr("nfc_gym.measured.rounds.split", lambda effect, plant: (parts(effect), None))
-    monkeypatch.setattr("nfc_gym.measured.rounds.Screen", lambda *_: SimpleNamespace(try_one=screened))
+    monkeypatch.setattr("nfc_gym.measured.choice.split", lambda effect, plant: (parts(effect), None))
+    monkeypatch.setattr("nfc_gym.measured.choice.Screen", lambda *_: SimpleNamespace(try_one=screened))
     screened = lambda effect: SimpleNamespace(effect=effect)  # noqa: E731
     law = parts(alike)
 
@@ -294,9 +297,8 @@ def test_plainer_laws_take_the_place_of_an_accepted_one_that_wants_values_of_its
             judge=lambda fitted: [e.id for e in fitted],
         )
 
-    best = SimpleNamespace(fitted=SimpleNamespace(plant=SimpleNamespace(effects=[other, law])))
-    contest: Any = Contest(arena([alike, other]), None, [], 8, 0.02, [alike, coulomb, force])  # pyright: ignore[reportArgumentType]
-    assert list(contest._plainer(best)) == [
+    best: Any = SimpleNamespace(fitted=SimpleNamespace(plant=SimpleNamespace(effects=[other, law])))
+    assert list(choice(arena([alike, other]), [alike, coulomb, force])._plainer(best)) == [
         ["armature:hip+knee", "coulomb:hip+knee:each"],
         ["armature:hip+knee", "coulomb:hip+knee:each", "external_force:hip+knee:each"],
     ]

@@ -105,9 +105,12 @@ def test_two_laws_must_leave_little_or_half(before: float, after: float, found: 
     [(0.05, 200.0, True), (0.05, 120.0, False), (0.01, 200.0, False), (0.5, 200.0, False)],
     ids=["much better", "hardly better", "nothing left", "tried before"],
 )
-def test_two_laws_where_too_many_do_alike(leftover: float, total: float, found: bool) -> None:
+def test_two_laws_where_too_many_do_alike(
+    leftover: float, total: float, found: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     both: Any = SimpleNamespace(total=total, fitted=SimpleNamespace(left=0.01))
     at: Any = standing(leftover)
     contest: Any = Contest(at, SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
-    contest._pairs, contest._believed, contest._simplest = lambda *_: [both], lambda j: True, lambda js: js[0]
+    monkeypatch.setattr(Contest, "_choice", SimpleNamespace(simplest=lambda judged: judged[0]))
+    contest._pairs, contest._believed = lambda *_: [both], lambda j: True
     assert contest._instead(SimpleNamespace(total=100.0), [], []) is (both if found else None)

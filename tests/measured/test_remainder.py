@@ -13,7 +13,7 @@ import yaml
 from hidden_laws import WHEEL, Machine, record, swing
 from rich.console import Console
 
-from nfc_gym.measured import rounds
+from nfc_gym.measured import choice, rounds
 from nfc_gym.measured.bench import candidates, make_bench
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.loop import close_loop
@@ -202,7 +202,7 @@ def test_more_than_three_families_that_do_alike_are_no_claim(families: tuple, cl
     arena.enter_apart = lambda *a: None
     monkeypatch.setattr(Contest, "_psi_alone", lambda self, best: None)
     monkeypatch.setattr(rounds, "contains", lambda law, plain: False)
-    monkeypatch.setattr(rounds, "contains_any", lambda laws, others: False)
+    monkeypatch.setattr(choice, "contains_any", lambda laws, others: False)
     traits = {"where": ("x",), "place": "x", "simpler": (), "kin": (), "generic": False}
     effect = lambda f: SimpleNamespace(id=f"{f}:x", family=f, **traits)  # noqa: E731
     screened: Any = [SimpleNamespace(effect=effect(f), gain=1.0) for f in families]
