@@ -24,6 +24,7 @@ from nfc_gym.inference.random import mixed
 Batch = dict[str, Tensor]
 _AXES = {"states": 3, "actions": 3, "psi": 2, "delta_s": 2, "delta_e": 3, "map": 3, "family": 1}
 _MAPS = ("map", "delta_e")
+_APART = 3  # stream of random numbers
 
 
 class WindowSet(Protocol):
@@ -165,9 +166,16 @@ class StoredWindows:
     def split(self, share: float) -> tuple["StoredWindows", "StoredWindows"]:
         """The first windows, and the last `share` of them: to train on and to hold out."""
         cut = len(self) - max(1, round(share * len(self)))
-        parts = (self.rows[:cut], self.rows[cut:])
-        first, last = (StoredWindows(self.stored, rows, self.maps, self.noise) for rows in parts)
-        return first, last
+        return self._of(self.rows[:cut]), self._of(self.rows[cut:])
+
+    def apart(self, n: int, seed: int) -> tuple["StoredWindows", "StoredWindows"]:
+        """All but `n` windows, in their order, and those: drawn at random, a function of `seed` alone."""
+        drawn = np.zeros(len(self), bool)
+        drawn[np.random.default_rng([seed, _APART]).choice(len(self), n, replace=False)] = True
+        return self._of(self.rows[~drawn]), self._of(self.rows[drawn])
+
+    def _of(self, rows: NDArray[np.integer]) -> "StoredWindows":
+        return StoredWindows(self.stored, rows, self.maps, self.noise)
 
 
 def _tensor(name: str, value: Any) -> Tensor:

@@ -29,7 +29,9 @@ from nfc_gym.inference.windows import Windows
 
 Array = NDArray[np.float64]
 HELD_OUT = 0.05  # of the windows, by which epochs are compared
-JUDGED = 256  # of these, at most, by which the posterior is judged at the end
+JUDGED = 0.05  # of the windows, by which the posterior is judged at the end: they neither train nor choose
+_JUDGED_MOST = 256  # of them: more would be lost to training
+_JUDGED_LEAST, _JUDGED_SHARE = 20, 5  # below 400 windows: so many, whose spread tells something, but one in five
 _LEVEL = 0.9
 AS_WIDE = 0.9  # of the prior's own 90 % interval: told little or nothing
 _FARTHEST = 2.0  # in size, of an action: a log may command a little more than [-1, 1], raw commands are far beyond
@@ -74,13 +76,20 @@ def say_unfinished(stored: Windows, report: Report) -> None:
         )
 
 
+def judges(windows: int) -> int:
+    """How many of so many windows are kept to judge a posterior by: none of fewer than five."""
+    return min(_JUDGED_MOST, max(round(JUDGED * windows), _JUDGED_LEAST), windows // _JUDGED_SHARE)
+
+
 def train_posterior(
     folder: Path, prior: PriorBox, out: Path, config: NetworkConfig, training: TrainConfig, *, device: str = "auto",
     report: Report = quiet, noise: float = 1.0,
 ) -> Outcome:  # fmt: skip
     """Train a network on a folder of windows into a checkpoint; a run that was stopped goes on.
 
-    Its notes say as `told` what windows held out tell of psi, in nats a parameter over the prior (`gains`).
+    Its notes say as `told` what windows tell of psi that neither trained it nor chose the epoch that is kept, in nats a
+    parameter over the prior (`gains`): mean, standard error, and the number of these windows (`judges`), which
+    `training.seed` draws from all. With fewer than two there is no standard error, with none no mean: they are None.
 
     Args:
       folder: what `nfc-gym simulate` wrote.
@@ -111,21 +120,31 @@ def train_posterior(
     place = place_of(about.state_names)
     sizes = Sizes(about.horizon, len(about.state_names), len(about.action_names), place=place)
     network = Network(config, sizes, prior, training.seed)
-    first, held_out = StoredWindows(stored, maps=config.elevation, noise=noise).split(HELD_OUT)
+    wanted = StoredWindows(stored, maps=config.elevation, noise=noise)
+    rest, judged = wanted.apart(judges(len(stored)), training.seed)
+    first, held_out = rest.split(HELD_OUT)
     state = out.with_name(out.name + ".training")
     state.mkdir(parents=True, exist_ok=True)
     outcome = train(network, first, held_out, training, folder=state, device=device_of(device), report=report)
-    judged = gains(network, next(held_out.batches(JUDGED, 0)))
     notes = {
         "environment": about.environment, "states": list(about.state_names), "windows": len(stored),
         "best": outcome.best, "stopped": outcome.stopped,
         "seconds": outcome.seconds, "held_out": outcome.held_out, "start": outcome.start,
         "noise": [noise * sd for sd in about.state_noise],
-        "told": {"mean": float(judged.mean()), "error": float(judged.std() / np.sqrt(len(judged))),
-                 "windows": len(judged)},
+        "told": _told_by(network, judged),
     }  # fmt: skip
     checkpoint.save(out, network.cpu(), notes=notes)
     return outcome
+
+
+def _told_by(network: Network, judged: StoredWindows) -> dict[str, float | int | None]:
+    """What some windows tell of psi; see `train_posterior`."""
+    n = len(judged)
+    if not n:
+        return {"mean": None, "error": None, "windows": 0}
+    found = gains(network, next(judged.batches(n, 0)))
+    error = float(found.std(ddof=1) / np.sqrt(n)) if n > 1 else None
+    return {"mean": float(found.mean()), "error": error, "windows": n}
 
 
 def read_window(path: Path) -> Window:

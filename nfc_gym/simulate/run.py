@@ -245,11 +245,12 @@ def _write(writer: WindowWriter, made: workers.Made, console: Console | None) ->
 def _say(writer: WindowWriter, console: Console, done: int, seconds: float) -> None:
     finished = writer.manifest.finished.values()
     void = {k: sum(c[k] for c in finished) for k in ("unstable", "ended", "relabelled")}
+    labels = "psi and effects" if writer.manifest.settings["proposal"] is None else "effects"  # proposed psi stay
     said = f"{sum(c['windows'] for c in finished)} windows in {writer.folder}"
     speed = f"; {done} made now, {done / max(seconds, 1e-9):.0f} a second" if done else "; nothing was left to do"
     console.print(said + speed, highlight=False, markup=False, emoji=False)
     console.print(
         f"redrawn: {void['unstable']} that came apart, {void['ended']} whose episode ended within the window; "
-        f"psi drawn anew for {void['relabelled']}",
+        f"{labels} drawn anew for {void['relabelled']}",
         highlight=False,
     )

@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +16,13 @@ from nfc_gym.core import InputError
 from nfc_gym.core.posterior import load_source
 from nfc_gym.inference import jobs
 from nfc_gym.inference.config import NetworkConfig
+from nfc_gym.inference.data import Batch, StoredWindows
+from nfc_gym.inference.gains import gains
+from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import Window, load
 from nfc_gym.inference.progress import Quiet
 from nfc_gym.inference.space import PriorBox
-from nfc_gym.inference.train import TrainConfig
+from nfc_gym.inference.train import Outcome, TrainConfig, train
 from nfc_gym.inference.windows import Windows
 from nfc_gym.simulate import simulate
 from nfc_gym.simulate.machine import Machine
@@ -105,7 +109,7 @@ def test_the_command_trains_and_the_other_tells(windows: Path, motion: Path, tmp
                             "--no-delta-s", "--device", "cpu"])  # fmt: skip
     assert made.exit_code == 0, made.output
     assert "of psi a window tells" in made.output
-    assert "3 windows held out" in made.output
+    assert "12 windows that neither trained nor chose the epoch" in made.output
     found = run.invoke(app, ["infer", str(file), str(motion), "--samples", "50"])
     assert found.exit_code == 0, found.output
     assert "base_mass" in found.output
@@ -264,13 +268,53 @@ def test_options_of_training_that_would_do_nothing_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_single_window_held_out_judges_nothing(tmp_path: Path) -> None:
-    simulate(ENV, 20, tmp_path / "few", jobs=1)
+def test_no_window_that_judges_has_trained_or_chosen(
+    windows: Path, prior: PriorBox, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the labels that each of the three parts asks for; the printed gain is that of the third."""
+    parts: list[np.ndarray] = []
+
+    def seen(*sets: StoredWindows) -> None:
+        parts.extend(np.concatenate([b["psi"].numpy() for b in s.batches(64, None)]) for s in sets)
+
+    def trained(network: Network, first: StoredWindows, held_out: StoredWindows, *args: Any, **how: Any) -> Outcome:
+        seen(first, held_out)
+        return train(network, first, held_out, *args, **how)
+
+    def judged(network: Network, batch: Batch) -> np.ndarray:
+        parts.append(batch["psi"].numpy())
+        return gains(network, batch)
+
+    monkeypatch.setattr(jobs, "train", trained)
+    monkeypatch.setattr(jobs, "gains", judged)
+    for seed in (0, 1):
+        out = tmp_path / f"q{seed}.safetensors"
+        jobs.train_posterior(windows, prior, out, SMALL, TrainConfig(epochs=1, batch=32, seed=seed), device="cpu")
+        told = load(out).notes["told"]
+        assert told["windows"] == len(parts[-1]) == 12
+    assert [len(p) for p in parts] == [46, 2, 12] * 2
+    for each in (parts[:3], parts[3:]):
+        np.testing.assert_array_equal(
+            np.unique(np.concatenate(each), axis=0), np.unique(Windows(windows)[:]["psi"], axis=0)
+        )
+    assert not np.array_equal(parts[2], parts[5])  # drawn by the seed
+
+
+@pytest.mark.parametrize(
+    ("windows", "judging"), [(1, 0), (4, 0), (5, 1), (60, 12), (100, 20), (399, 20), (1000, 50), (10_000, 256)]
+)
+def test_few_windows_are_kept_to_judge_by(windows: int, judging: int) -> None:
+    assert jobs.judges(windows) == judging
+
+
+@pytest.mark.parametrize("windows", [2, 5])
+def test_fewer_than_two_windows_judge_nothing(tmp_path: Path, windows: int) -> None:
+    simulate(ENV, windows, tmp_path / "few", jobs=1)
     out = str(tmp_path / "q.safetensors")
     made = CliRunner().invoke(app, ["train", str(tmp_path / "few"), "--out", out, "--encoder", "none", "--epochs", "1",
                                     "--no-delta-s", "--device", "cpu"])  # fmt: skip
     assert made.exit_code == 0, made.output
-    assert "a single window was held out, too few to judge" in made.output
+    assert "too few windows to keep some by which to judge" in made.output
     assert "standard error" not in made.output
 
 

@@ -1,6 +1,7 @@
 """Whoever makes the shards makes the same; what is finished stays."""
 
 import hashlib
+import io
 import multiprocessing
 import os
 import signal
@@ -8,18 +9,20 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from nfc_gym.core import Fidelity, InputError, NfcError
-from nfc_gym.inference.windows import Windows
+from nfc_gym.inference.windows import Windows, WindowWriter
 from nfc_gym.simulate import simulate
 from nfc_gym.simulate.machine import Machine
-from nfc_gym.simulate.run import _named
+from nfc_gym.simulate.run import _named, _say, manifest_of
 
 JACKAL = "nfc_gym/JackalFlat-v0"
 SET = {"environment": JACKAL, "windows": 22, "per_shard": 4, "seed": 3}
@@ -149,6 +152,17 @@ def test_a_proposal_takes_the_priors_place(tmp_path: Path) -> None:
         simulate(JACKAL, 4, tmp_path / "out", jobs=1, proposal=Fidelity(psi=2 * space.high))
     with pytest.raises(InputError, match=r"has psi of shape .*; want \(16, 17\)"):
         simulate(JACKAL, 4, tmp_path / "out", jobs=1, proposal=Fidelity(psi=np.ones(3)))
+
+
+def test_what_was_drawn_anew_is_said_by_what_says_psi(tmp_path: Path) -> None:
+    """Proposed psi stay in windows whose labels are drawn anew: the effects alone are others."""
+    writer = WindowWriter(tmp_path / "set", manifest_of(JACKAL, 1, 0, 1, {"proposal": None}))
+    for proposal, said in ((None, "psi and effects drawn anew for 3"), ("a1", "; effects drawn anew for 3")):
+        counts = {"windows": 1, "unstable": 0, "ended": 15, "relabelled": 3}
+        writer.manifest = replace(writer.manifest, settings={"proposal": proposal}, finished={0: counts})
+        console = Console(record=True, width=200, file=io.StringIO())
+        _say(writer, console, 1, 1.0)
+        assert said in console.export_text()
 
 
 def test_callables_of_one_name_are_told_by_what_they_answer(tmp_path: Path) -> None:
