@@ -74,6 +74,7 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
         return None, [_finding("logs", str(e).removeprefix("logs: "))]
     found: list[tuple[str, Suspicion]] = []
     read: list[tuple[Source, Log]] = []
+    whole: dict[str, str] = {}
     spoilt = 0
     for source in sources:
         logs, defects, alignment = read_log(mapping, source)
@@ -85,9 +86,9 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
             found.append((source.name, _cut(logs)))
         found += [(log.name, s) for _, log in logs for s in suspicions(mapping, model, log)]
         spoilt, read = spoilt + bool(defects), [*read, *logs]
+        whole |= dict.fromkeys((source.name, *(log.name for _, log in logs)), source.name)
     shifts = {name: c.shift for name, c in mapping.channels.items()}
-    count = len(read) + spoilt
-    findings = gather(_weighed(found, count), count)
+    findings = gather(_weighed(found, len(read) + spoilt), whole)
     findings += [*clock_offsets(model, [log for _, log in read], shifts), *shift_notes(shifts)]
     if spoilt:
         return None, findings

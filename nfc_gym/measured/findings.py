@@ -1,7 +1,7 @@
 """`Finding`: one thing that is wrong or looks wrong, where, and what to do; the same in many logs is one finding."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -48,21 +48,23 @@ def parted(text: str) -> tuple[str, str]:
     return (text, "") if at < 0 else (text[:at], text[at + 2 :])
 
 
-def gather(found: Iterable[tuple[str, Suspicion]], logs: int) -> list[Finding]:
-    """Findings from (log name, suspicion) pairs of `logs` logs; alike ones are told once, in the first log's words."""
+def gather(found: Iterable[tuple[str, Suspicion]], whole: Mapping[str, str]) -> list[Finding]:
+    """Findings from (log name, suspicion) pairs; alike ones are told once, in the first log's words.
+
+    Args:
+      found: the pairs.
+      whole: the recording that each log is of, itself or the one that it was cut from: these are counted.
+    """
+    logs = len(set(whole.values()))
     groups: dict[tuple[Severity, str, str], list[tuple[str, Suspicion]]] = {}
     for log, suspicion in found:
         groups.setdefault((suspicion.severity, suspicion.where, suspicion.kind), []).append((log, suspicion))
     findings = []
     for (severity, where, _), members in groups.items():
-        names = list(dict.fromkeys(log for log, _ in members))
+        count = len({whole[log] for log, _ in members})
         first, suspicion = members[0]
-        text = (
-            f"in {len(names)} of {logs} logs, first {first}: {suspicion.message}"
-            if len(names) > 1
-            else suspicion.message
-        )
-        place = where if len(names) > 1 else f"{first}: {where}"
+        text = f"in {count} of {logs} logs, first {first}: {suspicion.message}" if count > 1 else suspicion.message
+        place = where if count > 1 else f"{first}: {where}"
         findings.append(Finding(severity, place, text, suspicion.advice))
     return in_order(findings)
 

@@ -36,8 +36,20 @@ def test_stretches_between_gaps_are_logs_that_hold_what_was_recorded_then(build:
 def test_check_says_that_logs_were_cut_and_finds_no_fault_in_the_gaps(build: Build) -> None:
     (note,) = check(build(lose, CUT))
     assert (note.severity, note.where) == ("note", "time")
-    assert "in 3 of" in note.message
+    assert "in 3 of 3 logs, first run_0: " in note.message
     assert "cut at its gaps: 2 stretches, 2.98 s in all" in note.message
+
+
+def test_logs_are_counted_whole_though_each_has_several_stretches(build: Build) -> None:
+    """A channel that rests in both stretches of the two logs that have it resting is said of two logs of three."""
+
+    def stuck(table: dict[str, np.ndarray]) -> None:
+        lose(table)
+        if table["q"][0] != columns(0)["q"][0]:
+            table["gy"][:] = 0.25
+
+    (found,) = [f for f in check(build(stuck, CUT)) if f.where == "channels.sensor:gyro"]
+    assert found.message.startswith("in 2 of 3 logs, first run_1/1: ")
 
 
 def test_whole_logs_stay_as_they_are(build: Build) -> None:
