@@ -222,7 +222,8 @@ def opened(out: Path, args: argparse.Namespace) -> tuple[Kept, int]:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", nargs="+", default=["Jackal", "Ant"],
-                        choices=("Jackal", "Ant", "Quadruped", "Humanoid", "Quadcopter"))  # fmt: skip
+                        choices=("Jackal", "Ant", "Quadruped", "Humanoid", "Quadcopter"),
+                        help="default Jackal Ant")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="DIR", help="keeps finished parts: a stopped run goes on")
     parser.add_argument("--nominal", type=count(1), default=10_000, help="windows that false alarms are counted on")
     parser.add_argument(
@@ -251,7 +252,8 @@ def _arguments() -> argparse.Namespace:
         help="begin no new part after that time; the net's training is not cut",
     )
     parser.add_argument("--quick", action="store_true", help="Jackal alone, a few windows: a minute, and says little")
-    parser.add_argument("--json", type=json_file, help="write the rows here")
+    parser.add_argument("--json", type=json_file, metavar="FILE",
+                        help="write the rows here: a list of {name, value, unit, baseline, goal, holds, seeds}")  # fmt: skip
     args = parser.parse_args()
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 10, 10, 2

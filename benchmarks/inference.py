@@ -130,21 +130,27 @@ def latency(table: Table, turns: int, clock: str, device: str) -> None:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="*", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--densities", nargs="+", choices=("score", "mixture", "flow"), default=["score"])
-    parser.add_argument("--base", choices=("linear", "prior", "both"), default="both", help="where densities start")
-    parser.add_argument("--seeds", nargs="+", type=count(0), default=[0, 1, 2])
-    parser.add_argument("--simulations", type=count(1), default=10_000)
-    parser.add_argument("--observations", type=count(1), default=10)
-    parser.add_argument("--samples", type=count(1), default=10_000)
-    parser.add_argument("--epochs", type=count(1), default=TRAINING.epochs)
-    parser.add_argument("--latency", action=argparse.BooleanOptionalAction, default=True)
-    parser.add_argument(
-        "--clock", choices=("wall", "cpu"), default="wall", help="of the latency; cpu on a busy machine"
-    )
+    add = parser.add_argument
+    add("--tasks", nargs="*", choices=TASKS, default=list(TASKS),
+        help="problems whose posterior is known; default all, none asks for the latency alone")  # fmt: skip
+    add("--densities", nargs="+", choices=("score", "mixture", "flow"), default=["score"], help="default score")
+    add("--base", choices=("linear", "prior", "both"), default="both",
+        help="where densities start (default %(default)s)")  # fmt: skip
+    add("--seeds", nargs="+", type=count(0), default=[0, 1, 2],
+        help="of a network and its simulations each; default 0 1 2")  # fmt: skip
+    add("--simulations", type=count(1), default=10_000, help="that a network learns from (default %(default)s)")
+    add("--observations", type=count(1), default=10, help="that it is judged on (default %(default)s)")
+    add("--samples", type=count(1), default=10_000,
+        help="draws an observation, and as many exact ones (default %(default)s)")  # fmt: skip
+    add("--epochs", type=count(1), default=TRAINING.epochs,
+        help="passes over the simulations at most (default %(default)s)")  # fmt: skip
+    add("--latency", action=argparse.BooleanOptionalAction, default=True, help="time a window of a Jackal's size too")
+    add("--clock", choices=("wall", "cpu"), default="wall",
+        help="of the latency; cpu on a busy machine (default %(default)s)")  # fmt: skip
     parser.add_argument("--device", default="cpu", help="of the latency (default cpu)")
     parser.add_argument("--quick", action="store_true", help="one seed, few simulations and observations: a minute")
-    parser.add_argument("--json", type=json_file, help="write the rows here")
+    parser.add_argument("--json", type=json_file, metavar="FILE",
+                        help="write the rows here: a list of {name, value, unit, baseline, goal, holds, seeds}")  # fmt: skip
     args = parser.parse_args()
     use_clock(args.clock)
     if args.quick:

@@ -37,6 +37,7 @@ WINDOWS = {
     "QuadrupedFlat": 60_000, "HumanoidFlat": 60_000, "QuadcopterRough": 60_000, "QuadrupedRough": 40_000,
     "HumanoidRough": 40_000,
 }  # fmt: skip
+WINDOWS_SAID = " ".join(f"{k}={v}" for k, v in WINDOWS.items())
 # Methods that one process trains after the other, since a process takes its time to start; and the stage that they
 # belong to: all environments have their first before any has its second. Further inputs come after all of that, and
 # sbi's peers, which have to be asked for, see the first inputs alone.
@@ -238,30 +239,48 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="folder for everything")
     parser.add_argument("--quick", action="store_true", help="a toy: one cell of the Jackal's, on the processor")
-    parser.add_argument("--windows", nargs="+", default=[f"{k}={v}" for k, v in WINDOWS.items()], metavar="NAME=COUNT")
-    parser.add_argument("--residuals", nargs="*", default=[], metavar="NAME", help="environments with residual heads")
-    parser.add_argument("--residual-windows", type=count(0), default=20_480)
-    methods = [m for group, _ in GROUPS for m in group]
-    parser.add_argument("--methods", nargs="+", choices=methods, default=[m for m in methods if not METHODS[m].peer])
-    parser.add_argument("--inputs", nargs="+", choices=list(INPUTS), default=["summaries", "window"])
-    parser.add_argument("--seeds", nargs="+", type=count(0), default=[0])
-    parser.add_argument("--effects", type=number(0, 1), default=0.0)
-    parser.add_argument("--gpus", nargs="+", default=["0"], help="their numbers, or cpu")
-    parser.add_argument("--per-gpu", type=count(1), default=3, help="processes that train on one GPU at the same time")
-    parser.add_argument("--jobs", type=count(0), default=0, help="processes that simulate; 0 takes all cores")
-    parser.add_argument("--stop", type=number(0), default=0, help="begin nothing new after these seconds")
-    parser.add_argument("--judges", type=count(1), default=2000)
     parser.add_argument(
-        "--peer-judges", type=count(1), default=200, help="of those, for NPSE, whose densities take long"
+        "--windows", nargs="+", default=WINDOWS_SAID.split(), metavar="NAME=COUNT",
+        help=f"environments, in order, and how many windows to train on; default {WINDOWS_SAID}",
+    )  # fmt: skip
+    parser.add_argument(
+        "--residuals", nargs="*", default=[], metavar="NAME", help="environments with residual heads; default none"
     )
-    parser.add_argument("--samples", type=count(1), default=256)
-    parser.add_argument("--budget", type=number(0), default=60, help="seconds of training a cell")
-    parser.add_argument("--epochs", type=count(1), default=200, help="at most")
-    parser.add_argument("--batch", type=count(1), default=1024)
-    parser.add_argument("--rate", type=number(0), default=1e-3)
-    parser.add_argument("--draws", type=count(1), default=8, help="of noise a window and step, of score models")
-    parser.add_argument("--few", type=count(1), default=50, help="windows that are replayed, or whose maps are drawn")
-    parser.add_argument("--ceiling-windows", type=count(1), default=8)
+    parser.add_argument(
+        "--residual-windows", type=count(0), default=20_480,
+        help="windows that the residual heads learn from (default %(default)s)",
+    )  # fmt: skip
+    methods = [m for group, _ in GROUPS for m in group]
+    add = parser.add_argument
+    add("--methods", nargs="+", choices=methods, default=[m for m in methods if not METHODS[m].peer],
+        help="density and encoder of each column; sbi-... are the package sbi's; default all but sbi's")  # fmt: skip
+    add("--inputs", nargs="+", choices=list(INPUTS), default=["summaries", "window"],
+        help="what networks see: the window of motion, beside it physics summaries, with these a linear start, or the "
+             "map; default summaries window")  # fmt: skip
+    add("--seeds", nargs="+", type=count(0), default=[0], help="of networks and training, a cell each; default 0")
+    add("--effects", type=number(0, 1), default=0.0,
+        help="share of the windows with an effect not in the model, 0 to 1 (default %(default)s)")  # fmt: skip
+    add("--gpus", nargs="+", default=["0"], help="their numbers, or cpu; default 0")
+    add("--per-gpu", type=count(1), default=3,
+        help="processes that train on one GPU at the same time (default %(default)s)")  # fmt: skip
+    add("--jobs", type=count(0), default=0, help="processes that simulate; default 0 takes all cores")
+    add("--stop", type=number(0), default=0, metavar="SECONDS",
+        help="begin nothing new after these; default 0 sets no end")  # fmt: skip
+    add("--judges", type=count(1), default=2000,
+        help="windows not trained on, by which all are judged (default %(default)s)")  # fmt: skip
+    add("--peer-judges", type=count(1), default=200,
+        help="of those, for NPSE, whose densities take long (default %(default)s)")  # fmt: skip
+    add("--samples", type=count(1), default=256,
+        help="draws of psi a window, by which it is judged (default %(default)s)")  # fmt: skip
+    add("--budget", type=number(0), default=60, metavar="SECONDS", help="of training a cell (default %(default)s)")
+    add("--epochs", type=count(1), default=200, help="passes over the windows at most (default %(default)s)")
+    add("--batch", type=count(1), default=1024, help="windows a training step (default %(default)s)")
+    add("--rate", type=number(0), default=1e-3, help="largest step size of AdamW (default %(default)s)")
+    add("--draws", type=count(1), default=8,
+        help="of noise a window and training step, of score models (default %(default)s)")  # fmt: skip
+    add("--few", type=count(1), default=50,
+        help="windows that are replayed, or whose maps are drawn (default %(default)s)")  # fmt: skip
+    add("--ceiling-windows", type=count(1), default=8, help="that a ceiling is the mean of (default %(default)s)")
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
     args = parser.parse_args()
     if args.quick:

@@ -150,38 +150,109 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="folder for windows, cells and tables")
     parser.add_argument("--data", type=Path, help="folder for windows and ceilings, where several DIR share them")
-    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
-    parser.add_argument("--terrain", nargs="+", choices=TERRAINS, default=list(TERRAINS))
-    parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS))
-    parser.add_argument("--inputs", nargs="+", choices=list(INPUTS), default=["window", "summaries"])
-    parser.add_argument("--extras", nargs="*", choices=EXTRAS, default=["ceiling"])
-    parser.add_argument("--seeds", nargs="+", type=count(0), default=[0])
-    parser.add_argument("--windows", type=count(1), default=100_000, help="to train on")
+    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS), help="default all")
+    parser.add_argument("--terrain", nargs="+", choices=TERRAINS, default=list(TERRAINS), help="default both")
     parser.add_argument(
-        "--effects", type=number(0, 1), default=0.0, help="share of the windows with an effect not in the model"
-    )
-    parser.add_argument("--residual-windows", type=count(0), default=20_480, help="that the residual heads learn from")
-    parser.add_argument("--judges", type=count(1), default=2000, help="windows not trained on")
+        "--methods", nargs="*", choices=list(METHODS), default=list(METHODS),
+        help="density and encoder of each column; sbi-... are the package sbi's; default all, none trains nothing",
+    )  # fmt: skip
     parser.add_argument(
-        "--peer-judges", type=count(1), default=200, help="of those, for NPSE, whose densities take long"
+        "--inputs", nargs="+", choices=list(INPUTS), default=["window", "summaries"],
+        help="what networks see: the window of motion, beside it physics summaries, with these a linear start, or "
+        "the map; default window summaries",
+    )  # fmt: skip
+    parser.add_argument(
+        "--extras", nargs="*", choices=EXTRAS, default=["ceiling"],
+        help="done after an environment's cells: its ceiling, residual heads with maps or of motion alone, windows "
+        "with a lost axle, sequential rounds, pictures; default ceiling",
+    )  # fmt: skip
+    parser.add_argument(
+        "--seeds", nargs="+", type=count(0), default=[0], help="of networks and training, a cell each; default 0"
     )
-    parser.add_argument("--samples", type=count(1), default=512, help="draws a window")
-    parser.add_argument("--epochs", type=count(1), default=100, help="at most")
-    parser.add_argument("--budget", type=number(0), default=0, help="seconds of training a cell; 0 sets none")
-    parser.add_argument("--stop", type=number(0), default=0, help="begin nothing new after these seconds")
-    parser.add_argument("--batch", type=count(1), default=256)
-    parser.add_argument("--rate", type=number(0), default=5e-4)
-    parser.add_argument("--draws", type=count(1), default=8, help="of noise a window and step, of score models")
+    parser.add_argument(
+        "--windows", type=count(1), default=100_000, help="to train on an environment (default %(default)s)"
+    )
+    parser.add_argument(
+        "--effects",
+        type=number(0, 1),
+        default=0.0,
+        help="share of the windows with an effect not in the model, 0 to 1 (default %(default)s)",
+    )
+    parser.add_argument(
+        "--residual-windows",
+        type=count(0),
+        default=20_480,
+        help="windows that the residual heads learn from (default %(default)s)",
+    )
+    parser.add_argument(
+        "--judges",
+        type=count(1),
+        default=2000,
+        help="windows not trained on, by which all are judged (default %(default)s)",
+    )
+    parser.add_argument(
+        "--peer-judges",
+        type=count(1),
+        default=200,
+        help="of those, for NPSE, whose densities take long (default %(default)s)",
+    )
+    parser.add_argument(
+        "--samples",
+        type=count(1),
+        default=512,
+        help="draws of psi a window, by which it is judged (default %(default)s)",
+    )
+    parser.add_argument(
+        "--epochs", type=count(1), default=100, help="passes over the windows at most (default %(default)s)"
+    )
+    parser.add_argument(
+        "--budget", type=number(0), default=0, metavar="SECONDS", help="of training a cell; default 0 sets none"
+    )
+    parser.add_argument(
+        "--stop",
+        type=number(0),
+        default=0,
+        metavar="SECONDS",
+        help="begin nothing new after these; default 0 sets no end",
+    )
+    parser.add_argument("--batch", type=count(1), default=256, help="windows a training step (default %(default)s)")
+    parser.add_argument("--rate", type=number(0), default=5e-4, help="largest step size of AdamW (default %(default)s)")
+    parser.add_argument(
+        "--draws",
+        type=count(1),
+        default=8,
+        help="of noise a window and training step, of score models (default %(default)s)",
+    )
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
-    parser.add_argument("--jobs", type=count(0), default=0, help="processes of the simulation; 0 takes all cores")
-    parser.add_argument("--device", default="auto", help="cpu, cuda, or auto")
-    parser.add_argument("--ceiling-windows", type=count(1), default=8)
-    parser.add_argument("--ceiling-draws", nargs=2, type=count(1), default=[256, 32], metavar=("CLOUD", "PAIRS"))
-    parser.add_argument("--truths", type=count(1), default=20, help="of the sequential rounds")
-    parser.add_argument("--round", type=count(1), default=10_000, help="simulations a round")
-    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=["on"], help="in which second rounds train")
-    parser.add_argument("--few", type=count(1), default=200, help="windows that are replayed, or whose maps are drawn")
-    parser.add_argument("--axles", type=count(0), default=100, help="windows with a lost axle")
+    parser.add_argument(
+        "--jobs", type=count(0), default=0, help="processes of the simulation; default 0 takes all cores"
+    )
+    parser.add_argument(
+        "--device", default="auto", help="cpu, cuda, or auto, a GPU where there is one (default %(default)s)"
+    )
+    parser.add_argument(
+        "--ceiling-windows", type=count(1), default=8, help="that a ceiling is the mean of (default %(default)s)"
+    )
+    parser.add_argument(
+        "--ceiling-draws", nargs=2, type=count(1), default=[256, 32], metavar=("CLOUD", "PAIRS"),
+        help="of the motors' noise a window: for what it spreads, and a parameter for slopes (default 256 32)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--truths", type=count(1), default=20, help="windows that sequential rounds infer (default %(default)s)"
+    )
+    parser.add_argument(
+        "--round", type=count(1), default=10_000, help="simulations a sequential round (default %(default)s)"
+    )
+    parser.add_argument(
+        "--ways", nargs="+", choices=list(WAYS), default=["on"], help="in which second rounds train (default on)"
+    )
+    parser.add_argument(
+        "--few",
+        type=count(1),
+        default=200,
+        help="windows that are replayed, or whose maps are drawn (default %(default)s)",
+    )
+    parser.add_argument("--axles", type=count(0), default=100, help="windows with a lost axle (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help="a toy: Jackal on flat ground, in a minute")
     args = parser.parse_args()
     if args.out is None and not args.quick:

@@ -58,7 +58,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--quick", action="store_true", help="a toy's head, one tiny trial of the Quadcopter")
-    add("--robots", nargs="+", choices=list(ENVIRONMENTS), default=["quadcopter"])
+    add("--robots", nargs="+", choices=list(ENVIRONMENTS), default=["quadcopter"], help="default quadcopter")
     add("--trials", type=count(0), default=6, help="machines a robot, each with one effect (default 6)")
     add("--nulls", type=count(0), default=0, help="machines a robot without any")
     add("--windows", type=count(1), default=Course().windows, help="that a head is trained on")
@@ -68,7 +68,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--seed", type=count(0), help="repeats a run; default drawn, or the one that --out was begun with")
     add("--stop", type=number(0), default=float("inf"), metavar="SECONDS", help="begin no trial after so long")
     add("--out", type=Path, metavar="DIR", help="keeps windows, heads and finished trials, and results.json")
-    add("--json", type=json_file, metavar="FILE", help="figures {name, value, unit, baseline, goal, holds}")
+    add("--json", type=json_file, metavar="FILE",
+        help="write the rows here: a list of {name, value, unit, baseline, goal, holds, seeds}")  # fmt: skip
     return parser.parse_args(argv)
 
 
@@ -91,10 +92,11 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
             trials.append(_kept(folder / f"{task.name}.json", lambda t=task, h=head, i=i: both(t, h, bool(i % 2))))
             print(said(trials[-1]), flush=True)
         rows += loop_rows(robot, trials)
+    rows = [r | {"seeds": [seed]} for r in rows]
     print(table(rows))
     for path in (folder / "results.json", args.json):
         if path:
-            write_json(path, {"seed": seed, "rows": rows})
+            write_json(path, rows)
     return rows
 
 
@@ -182,9 +184,10 @@ def hit(trial: dict[str, Any]) -> bool:
 def row(
     robot: str, name: str, value: float, unit: str, baseline: float | None = None, goal: float | None = None
 ) -> dict[str, Any]:
-    """A line of the table."""
-    rest = {"baseline": baseline, "goal": goal, "holds": None if goal is None else bool(value >= goal)}
-    return {"name": f"{robot}: {name}", "value": value, "unit": unit} | rest
+    """A line of the table, but for the seeds: as `timing.Row`. A goal is reached by that much or more."""
+    told = None if goal is None else f">= {goal:g}"
+    rest = {"baseline": baseline, "goal": told, "holds": None if goal is None else bool(value >= goal)}
+    return {"name": f"{robot}: {name}", "value": float(value), "unit": unit} | rest
 
 
 def said(t: dict[str, Any]) -> str:
@@ -202,7 +205,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     for r in rows:
         holds = {None: "-", True: "yes", False: "no"}[r["holds"]]
         value = f"{number(r['value'])} {r['unit']}" if r["unit"] != "1" else number(r["value"])
-        lines.append(f"{r['name']} | {value} | {number(r['baseline'])} | {number(r['goal'])} | {holds}")
+        lines.append(f"{r['name']} | {value} | {number(r['baseline'])} | {r['goal'] or '-'} | {holds}")
     return "\n".join(lines)
 
 

@@ -1,9 +1,11 @@
 """What benchmarks share of their command lines, and what they say of arguments that cannot be."""
 
+import argparse
 import importlib
 import json
 import math
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +98,22 @@ def test_a_queue_without_a_folder_prints_its_table(
     assert "the table" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["anomaly", "inference", "posterior_queue", "posterior_table", "structure"])
+def test_every_option_has_a_help_text(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    script, told = importlib.import_module(name), {}
+
+    def asked(parser: argparse.ArgumentParser, *_: object) -> None:
+        told.update({action.option_strings[0]: action.help for action in parser._actions})
+        parser.format_help()  # a default that its text does not take ends here
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", asked)
+    with pytest.raises(KeyboardInterrupt):
+        script.main()
+    assert len(told) > 10
+    assert [option for option, text in told.items() if not text] == []
+
+
 @pytest.mark.parametrize("windows", ["JackalFlat", "JackalFlat=-3", "JackalFlat=many", "Moon=3"])
 def test_a_queue_of_no_windows_is_refused(windows: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import posterior_queue
@@ -186,13 +204,22 @@ def test_worlds_that_a_run_without_find_kept_are_measured_again(
 
 def test_a_structure_run_is_of_one_seed_and_one_course(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import structure
+    import timing
 
     monkeypatch.setattr(structure, "taught", lambda *_: tmp_path / "head")
     monkeypatch.setattr(structure, "judged", lambda *_: {})
-    monkeypatch.setattr(structure, "told_rows", lambda *_: [structure.row("r", "area", 1.0, "1")])
+    monkeypatch.setattr(structure, "told_rows", lambda *_: [structure.row("r", "area", 1, "1", 0.5, 0.95)])
     words = ["--trials", "0", "--windows", "512", "--out", str(tmp_path / "out")]
     assert structure.main([*words, "--seed", "5", "--json", str(tmp_path / "rows.json")]) == 0
-    assert json.loads((tmp_path / "rows.json").read_text())["rows"][0]["name"] == "r: area"
+    (row,) = json.loads((tmp_path / "rows.json").read_text())
+    assert row["name"] == "r: area"
+    table = timing.Table()
+    table.add("r: area", 1.0, "1", baseline=0.5, at_least=0.95, seeds=(5,))
+    assert {k: type(v) for k, v in row.items()} == {
+        k: type(v) for k, v in json.loads(json.dumps(asdict(table.rows[0]))).items()
+    }  # the rows of every script are alike
+    assert row["goal"] == table.rows[0].goal
+    assert row["seeds"] == [5]
     with pytest.raises(InputError, match="was begun with seed 5, not 6"):
         structure.main([*words, "--seed", "6"])
     words[3] = "1024"
