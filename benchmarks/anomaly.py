@@ -252,8 +252,12 @@ def _arguments() -> argparse.Namespace:
         help="begin no new part after that time; the net's training is not cut",
     )
     parser.add_argument("--quick", action="store_true", help="Jackal alone, a few windows: a minute, and says little")
-    parser.add_argument("--json", type=json_file, metavar="FILE",
-                        help="write the rows here: a list of {name, value, unit, baseline, goal, holds, seeds}")  # fmt: skip
+    parser.add_argument(
+        "--json",
+        type=json_file,
+        metavar="FILE",
+        help="write the rows here: a list of {name, value, unit, baseline, goal, holds, seeds}",
+    )
     args = parser.parse_args()
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 10, 10, 2

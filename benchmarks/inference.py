@@ -149,8 +149,12 @@ def main() -> None:
         help="of the latency; cpu on a busy machine (default %(default)s)")  # fmt: skip
     parser.add_argument("--device", default="cpu", help="of the latency (default cpu)")
     parser.add_argument("--quick", action="store_true", help="one seed, few simulations and observations: a minute")
-    parser.add_argument("--json", type=json_file, metavar="FILE",
-                        help="write the rows here: a list of {name, value, unit, baseline, goal, holds, seeds}")  # fmt: skip
+    parser.add_argument(
+        "--json",
+        type=json_file,
+        metavar="FILE",
+        help="write the rows here: a list of {name, value, unit, baseline, goal, holds, seeds}",
+    )
     args = parser.parse_args()
     use_clock(args.clock)
     if args.quick:
