@@ -89,12 +89,18 @@ def bare(spec: mujoco.MjSpec, named: Collection[str] = ()) -> mujoco.MjSpec:
     A robot of the package has two geoms to show for each that touches, and each step would place them all.
 
     Args:
-      spec: the model, with complete inertias.
+      spec: the model, with complete inertias. Where a range finder may see them, or `inertiafromgeom="true"` has
+        inertias from geoms alone, the copy keeps all.
       named: objects that somebody asks for by name; a geom among them that is only looked at keeps all of them.
     """
+    if any(s.type == mujoco.mjtSensor.mjSENS_RANGEFINDER for s in spec.sensors):
+        return spec.copy()  # its ray ends on what is only looked at, too
     out = spec.copy()
     before = {g.name for g in out.geoms}
-    out.discard_visual()
+    try:
+        out.discard_visual()
+    except ValueError:  # inertiafromgeom="true": what is only looked at has mass, and MuJoCo cannot leave it behind
+        return spec.copy()
     gone = before - {g.name for g in out.geoms}
     return spec.copy() if gone & set(named) else out
 

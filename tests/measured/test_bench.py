@@ -135,6 +135,33 @@ def test_a_geom_that_is_asked_for_by_name_stays() -> None:
     assert "base_shell" in [g.name for g in spec.geoms]
 
 
+def _one_arm(compiler: str = "", more: str = "") -> mujoco.MjSpec:
+    """An arm of which one geom is only looked at, over a floor that nothing touches."""
+    shown = 'contype="0" conaffinity="0"'
+    return mujoco.MjSpec.from_string(
+        f'<mujoco><compiler {compiler}/><worldbody><geom name="floor" type="plane" size="1 1 1" {shown}/>'
+        '<body name="arm" pos="0 0 1"><joint name="hinge" axis="0 1 0"/><geom name="tube" size="0.1" pos="0.2 0 0"/>'
+        f'<geom name="shell" size="0.2" {shown}/><site name="eye" pos="0 0 -0.3" zaxis="0 0 -1"/></body></worldbody>'
+        f"{more}</mujoco>"
+    )
+
+
+def test_inertias_that_are_had_from_geoms_alone_keep_the_geoms() -> None:
+    """Gymnasium's reacher says so of geoms that touch nothing: MuJoCo refuses to leave these out."""
+    spec = _one_arm('inertiafromgeom="true"')
+    whole, lean = spec.compile(), bare(spec).compile()
+    np.testing.assert_array_equal(lean.body_inertia, whole.body_inertia)
+    assert bare(_one_arm()).compile().ngeom < whole.ngeom
+
+
+def test_a_range_finder_sees_what_is_only_looked_at() -> None:
+    spec = _one_arm(more='<sensor><rangefinder name="height" site="eye"/></sensor>')
+    model = bare(spec).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.sensordata[0] == pytest.approx(0.7)
+
+
 def test_where_slopes_cannot_follow_segments_are_shorter(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same stretch of the logs, to the last of the horizons that are left; `most` counts the mapping's segments."""
     dataset = require(build())[0]
