@@ -189,6 +189,60 @@ def test_what_was_learned_from_a_posteriors_draws_is_corrected(proposed: Normal)
     assert np.abs(corrected.learned.log_prob(at) - truth.log_prob(at)).max() > 0.2
 
 
+class Normals(Normal):
+    """`Normal` in each of ten parameters."""
+
+    prior = box(10)
+
+    def log_prob(self, x: Fidelity) -> np.ndarray:
+        z = self.prior.to_z(x.psi)
+        return (norm.logpdf(z, self.mean, self.sd) - norm.logpdf(z)).sum(1) - self.prior.log_volume
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        return Fidelity(self.prior.from_z(self.mean + self.sd * rng.normal(size=(n, 10))))
+
+
+class Learned(Normals):
+    """What is learned if half of the windows are draws of `proposed`: in closed form, two normals."""
+
+    def __init__(self, mean: float, sd: float, proposed: Normals) -> None:
+        super().__init__(mean, sd)
+        self.proposed = proposed
+        precision = sd**-2 + proposed.sd**-2 - 1
+        middle = (mean / sd**2 + proposed.mean / proposed.sd**2) / precision
+        self.narrow = Normals(middle, precision**-0.5)  # what `proposed` / prior makes of the posterior, normalised
+        at = Fidelity(self.prior.from_z(np.full((1, 10), middle)))
+        self.gain = (super().log_prob(at) + told(proposed, at.psi) - self.narrow.log_prob(at)).item()
+
+    def log_prob(self, x: Fidelity) -> np.ndarray:
+        tilt = np.logaddexp(0, told(self.proposed, x.psi)) - np.logaddexp(0, self.gain)
+        return super().log_prob(x) + tilt
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        whose = rng.uniform(size=(n, 1)) < np.exp(-np.logaddexp(0, self.gain))
+        return Fidelity(np.where(whose, super().sample(n, rng).psi, self.narrow.sample(n, rng).psi))
+
+
+@pytest.mark.parametrize(("sd", "wider"), [(0.2, 1.1), (0.5, 1.1), (0.2, 1.5)])
+def test_corrected_draws_of_many_parameters_are_as_wide_as_the_posterior(sd: float, wider: float) -> None:
+    """Those of what was learned alone lie in its tails too seldom: chosen among, they were 2 to 7 % too narrow."""
+    truth, proposed = Normals(0.4, sd), Normals(0.4, wider * sd)
+    learned, config = Learned(0.4, sd, proposed), SequentialConfig(samples=2000, oversampling=16)
+    corrected = Corrected(learned, [(proposed, 300)], 300, config, np.random.default_rng(0))
+    z = corrected.prior.to_z(corrected.sample(3000, np.random.default_rng(1)).psi)
+    assert (z.std(0) / sd).mean() == pytest.approx(1, abs=0.02)  # ten spreads, each to 0.013
+    at = truth.sample(300, np.random.default_rng(2))
+    np.testing.assert_allclose(corrected.log_prob(at), truth.log_prob(at), atol=0.05)
+
+
+@pytest.mark.parametrize("oversampling", [1, 3])
+def test_a_single_corrected_draw(oversampling: int) -> None:
+    config = SequentialConfig(samples=200, oversampling=oversampling)
+    proposed = Normal(0.5, 0.3)
+    corrected = Corrected(Tilted(0.6, 0.3, proposed), [(proposed, 300)], 300, config, np.random.default_rng(0))
+    assert corrected.sample(1, np.random.default_rng(1)).psi.shape == (1, 1)
+
+
 def test_draws_of_a_posterior_are_proposed() -> None:
     proposal = Proposed(Normal(0.5, 0.3), SequentialConfig(), np.random.default_rng(0))
     assert kstest(box(1).to_z(proposal.sample(2000, np.random.default_rng(1)))[:, 0], norm(0.5, 0.3).cdf).pvalue > 0.01
