@@ -167,6 +167,7 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
     named = {name for entry in (*declared, *dataset.mapping.known) for name in entry.of}
     moving = bare(spec, named)
     make_room(moving)
+    moving.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)  # a roll-out that starts at any state is awake
     model = compile_model(moving, dataset.mapping.model_file)
     known = actuator_names(model)
     for control in dataset.mapping.controls:
@@ -290,7 +291,7 @@ def _rolled(bench: Bench, logs: Sequence[Log]) -> _Motion | None:
     at = np.arange(1, seg.steps, each)
     qpos, qvel = traj.qpos[0, stable], traj.qvel[0, stable]
     qacc = (qvel[:, at + 1] - qvel[:, at - 1]) / (2 * seg.dt)
-    flat = lambda a: a.reshape(-1, a.shape[-1])  # noqa: E731
+    flat = lambda a: a.reshape(a.shape[0] * a.shape[1], a.shape[2])  # noqa: E731  (nothing may be commanded)
     return _Motion(flat(qpos[:, at]), flat(qvel[:, at]), flat(qacc), flat(seg.ctrl[stable][:, seg.history + at]))
 
 

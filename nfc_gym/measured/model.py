@@ -61,8 +61,8 @@ def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
     """The compiled model.
 
     Raises:
-      InputError: it does not compile, in MuJoCo's own words, or holds a number that is not finite or a name that is
-        no text.
+      InputError: it does not compile, in MuJoCo's own words, holds a number that is not finite or a name that is no
+        text, or has the flag `ipc`.
     """
     try:
         model = spec.compile()
@@ -73,6 +73,8 @@ def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
     except UnicodeDecodeError as e:
         start, end = model.names.rfind(b"\0", 0, e.start) + 1, model.names.find(b"\0", e.start)
         raise InputError(f"model {name}: the name {model.names[start:end]!r} is not UTF-8; save the file so") from None
+    if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_IPC):
+        raise InputError(f"model {name}: the flag 'ipc' keeps a state that no log shows; disable it")
     for owner, before in ((model.opt, "option "), (model, "")):
         for field in dir(owner):
             value = getattr(owner, field) if not field.startswith("_") else None

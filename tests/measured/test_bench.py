@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from nfc_gym import assets
+from nfc_gym.core import InputError
 from nfc_gym.measured.bench import candidates, make_bench, scales
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.model import bare
@@ -133,6 +134,35 @@ def test_a_geom_that_is_asked_for_by_name_stays() -> None:
     assert "base_shell" not in [g.name for g in bare(spec).geoms]
     assert "base_shell" in [g.name for g in bare(spec, {"base_shell"}).geoms]
     assert "base_shell" in [g.name for g in spec.geoms]
+
+
+def test_what_nothing_drives_has_candidates_too(build: Build, machine: str) -> None:
+    """A free pendulum: its logs hold no commands."""
+    servo = 'controls:\n  "ctrl:servo": {column: goal, unit: rad}\n'
+    model = re.sub(r"<actuator>.*</actuator>", "", machine, flags=re.DOTALL)
+    dataset = require(build(None, (servo, ""), model=model))[0]
+    bench = make_bench(dataset, 1)
+    found = scales(bench, dataset.logs)
+    assert found.command.shape == (0,)
+    assert found.force[0] > 0.0
+    assert "coulomb:hinge" in [e.id for e in candidates(bench, dataset.logs)]
+
+
+def test_roll_outs_of_a_model_that_sleeps_are_awake(build: Build, machine: str) -> None:
+    """MuJoCo lets no batch begin anywhere with sleep on; where nothing sleeps the motion is the same, to the bit."""
+    flag = '<option><flag sleep="enable"/></option><worldbody>'
+    residuals = []
+    for model in (machine, machine.replace("<worldbody>", flag)):
+        dataset = require(build(model=model))[0]
+        bench = make_bench(dataset, 1)
+        residuals.append(bench.problem(dataset.logs, 4).residual(bench.plant, bench.plant.null))
+    np.testing.assert_array_equal(*residuals)
+
+
+def test_a_state_that_no_log_shows_is_refused(build: Build, machine: str) -> None:
+    flag = '<option integrator="discrete"><flag ipc="enable"/></option><worldbody>'
+    with pytest.raises(InputError, match="flag 'ipc' keeps a state that no log shows; disable it"):
+        require(build(model=machine.replace("<worldbody>", flag)))
 
 
 def _one_arm(compiler: str = "", more: str = "") -> mujoco.MjSpec:
