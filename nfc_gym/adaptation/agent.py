@@ -5,7 +5,8 @@
 `ppo_agent` and `sac_agent` make one of a policy that `nfc-gym pretrain` wrote.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -14,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ValueOperator
@@ -21,7 +23,7 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from nfc_gym.adaptation.network import Scale, perceptron
 from nfc_gym.adaptation.policy import Policy
-from nfc_gym.adaptation.ppo import ONWARD, Actor, Diverged, OnPolicy, Power, PPOConfig, clipped, summed
+from nfc_gym.adaptation.ppo import ONWARD, Actor, Diverged, OnPolicy, Power, PPOConfig, clipped, require_finite, summed
 from nfc_gym.adaptation.sight import Sight
 from nfc_gym.core.errors import InputError
 
@@ -113,6 +115,7 @@ class OffPolicy:
             raise Diverged(f"the loss is not finite ({float(total.detach()):g})")
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
+        require_finite(nn.utils.get_total_norm([p.grad for p in self.loss.parameters() if p.grad is not None]))
         self.optimiser.step()
         if self.targets is not None:
             self.targets.step()
@@ -144,6 +147,7 @@ class Agent:
         loss = self.loss(actor, size)
         if not isinstance(loss, LossModule):
             raise InputError(f"agent: `loss` must make a TorchRL loss, and made a {type(loss).__name__}")
+        _require_sized(loss, "loss")
         if hasattr(loss.tensor_keys, "advantage"):
             return OnPolicy(loss, self.on_policy)
         return OffPolicy(loss, self.off_policy)
@@ -157,15 +161,20 @@ class Agent:
     def __call__(self, observation: Any) -> NDArray[np.float32]:
         """What it does without exploring, (..., k) in [-1, 1]; observations as of `Sight.flat`."""
         flat = torch.from_numpy(np.ascontiguousarray(self.sight.flat(observation))).to(self.device)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            action = self.actor(TensorDict({"observation": flat}, flat.shape[:-1]))["action"]
-        return action.clamp(-1, 1).cpu().numpy()
+        with _as_deployed(self.actor):
+            action = self._acted(flat.reshape(-1, self.sight.size))["action"]
+        return action.reshape(*flat.shape[:-1], action.shape[-1]).clamp(-1, 1).cpu().numpy()
+
+    def _acted(self, observations: Tensor) -> TensorDictBase:
+        """The actor's step for observations (n, size)."""
+        return self.actor(TensorDict({"observation": observations}, observations.shape[:1]))
 
     def action_size(self) -> int:
         """k, from one call.
 
         Raises:
-          InputError: the actor wants more than `observation`, or its action is no continuous vector.
+          InputError: the actor wants more than `observation`, its action is no continuous vector, or weights that are
+            kept have no size yet.
         """
         more = [repr(k) for k in getattr(self.actor, "in_keys", ()) if k != "observation"]
         if more:
@@ -173,16 +182,43 @@ class Agent:
                 f"agent: the actor wants {', '.join(more)}, and all that it is shown is 'observation': a recurrent "
                 "one, whose memory somebody must keep, will not do"
             )
-        shown = TensorDict({"observation": torch.zeros(self.sight.size, device=self.device)})
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            step = self.actor(shown)
+        with torch.no_grad(), _as_deployed(self.actor):
+            step = self._acted(torch.zeros(1, self.sight.size, device=self.device))
+            discrete = _discrete(self.actor, step)
         action = step["action"]
-        if _discrete(self.actor, step) or not action.is_floating_point() or action.ndim != 1:
+        if discrete or not action.is_floating_point() or action.ndim != 2:
             raise InputError(
                 "agent: actions must be a continuous vector, such as of a TanhNormal; the actor gives "
-                f"{action.dtype} of shape {tuple(action.shape)} by its {_named(self.actor)}"
+                f"{action.dtype} of shape {tuple(action.shape[1:])} by its {_named(self.actor)}"
             )
-        return len(action)
+        _require_sized(self.weights, "weights")
+        return action.shape[1]
+
+
+@contextmanager
+def _as_deployed(actor: Actor) -> Iterator[None]:
+    """An actor that does not explore, in evaluation mode: no dropout, no running statistics that take in what is seen.
+
+    Each of its modules is then put back into the mode in which it was.
+    """
+    modes = [(module, module.training) for module in actor.modules()]
+    actor.eval()
+    try:
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            yield
+    finally:
+        for module, training in modes:
+            module.training = training
+
+
+def _require_sized(module: nn.Module | None, where: str) -> None:
+    """Refuse lazy layers that nothing was shown yet: what has no size can neither be kept nor learn."""
+    lazy = [] if module is None else [n for n, p in module.named_parameters() if is_lazy(p)]
+    if lazy:
+        raise InputError(
+            f"agent: {lazy[0]!r} of its `{where}` has no size yet: call actor and critic once, for instance on zeros "
+            "of the observation's size, or say `in_features`"
+        )
 
 
 def _discrete(actor: Actor, step: TensorDictBase) -> bool:

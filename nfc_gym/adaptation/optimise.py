@@ -46,7 +46,7 @@ def optimise(
         `imagined`, or any other: the true world itself for an oracle; or on a cluster (`RayWorlds`).
       steps: control steps of all simulations together.
       pi_h: see `pi_h_for`.
-      seed: of actions and of the worlds' draws.
+      seed: of actions, of the worlds' draws and of what the agent's loss makes anew, such as critics.
       record: what is written down.
       before: steps that were taken in earlier calls, by which curves are drawn.
       choice: judges the agent's weights on the way; the agent has the last ones until it takes the best.
@@ -61,10 +61,10 @@ def optimise(
         worlds = VectorSight(worlds, agent.sight)
     size = int(worlds.single_action_space.shape[0])  # type: ignore[index]
     actor = agent.actor if pi_h is None else widened(agent.actor, pi_h)
+    torch.manual_seed(mixed(seed, 0))  # of critics that a loss makes anew, too
     learner = agent.learner(actor, size)
     kept = [(m, copy.deepcopy(m.state_dict())) for m in (learner.loss, actor)]
     record, episodes, done, judged = record or Record(None, None), Episodes(), 0, 0
-    torch.manual_seed(mixed(seed, 0))
     if isinstance(worlds, RayWorlds):
         worlds.restarted = episodes.forget
     try:

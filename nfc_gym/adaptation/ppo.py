@@ -70,6 +70,12 @@ def summed(losses: TensorDictBase) -> Tensor:
     return torch.stack([v.mean() for k, v in losses.items() if str(k).startswith("loss_")]).sum()
 
 
+def require_finite(norm: Tensor) -> None:
+    """Raises `Diverged` where the norm () of a gradient is not finite, as of a finite loss it may be."""
+    if not norm.isfinite():
+        raise Diverged(f"the gradient is not finite (its norm is {float(norm):g})")
+
+
 class Power(nn.Module):
     """Running mean square of rewards."""
 
@@ -143,7 +149,7 @@ class OnPolicy:
           not tell.
 
         Raises:
-          Diverged: a loss is not finite, or the policy ran away.
+          Diverged: a loss or its gradient is not finite, or the policy ran away.
         """
         steps = self._prepared(batch)
         buffer = self._filled(steps)
@@ -205,6 +211,6 @@ class OnPolicy:
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
         for group in self.optimiser.param_groups:
-            nn.utils.clip_grad_norm_(group["params"], self.config.norm)
+            require_finite(nn.utils.clip_grad_norm_(group["params"], self.config.norm))
         self.optimiser.step()
         return loss, critic, divergence, clipped

@@ -15,7 +15,15 @@ from rich.console import Console
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.distributions import Categorical
-from torchrl.modules import NormalParamExtractor, OneHotCategorical, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import (
+    MLP,
+    BatchRenorm1d,
+    NormalParamExtractor,
+    OneHotCategorical,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
 from torchrl.objectives import ClipPPOLoss
 
 from nfc_gym import InputError
@@ -25,6 +33,7 @@ from nfc_gym.adaptation.beliefs import Fixed
 from nfc_gym.adaptation.choice import Choice
 from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.network import ActorCritic
+from nfc_gym.adaptation.optimise import optimise
 from nfc_gym.adaptation.policy import Policy
 from nfc_gym.adaptation.sight import Sight
 from nfc_gym.adaptation.trajectory import Trajectory, execute
@@ -294,6 +303,51 @@ def test_an_agent_of_a_script_that_knows_nothing_of_us() -> None:
     assert any((before[k] != v).any() for k, v in net.state_dict().items())
 
 
+def scripted(inner: nn.Module) -> Agent:
+    """An agent of a script with a layer of its own."""
+    net = nn.Sequential(nn.Linear(17, 8), inner, nn.Linear(8, 4), NormalParamExtractor())
+    body = TensorDictModule(net, ["observation"], ["loc", "scale"])
+    actor = ProbabilisticActor(
+        body, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True
+    )  # fmt: skip
+    critic = ValueOperator(nn.Linear(17, 1), in_keys=["observation"])
+    return Agent(actor, lambda a, size: ClipPPOLoss(a, critic, entropy_bonus=False), Sight.of(world()))
+
+
+@pytest.mark.parametrize("inner", [nn.Dropout(0.5), nn.BatchNorm1d(8), BatchRenorm1d(8)])
+def test_what_is_executed_is_not_explored_and_leaves_no_trace_in_the_actor(inner: nn.Module) -> None:
+    agent = scripted(inner)
+    before, seen = state(agent.actor), np.ones((3, 17), np.float32)
+    np.testing.assert_array_equal(agent(seen), agent(seen))
+    assert agent(seen[0]).shape == (2,)
+    adapt(agent, world(), belief(), Alarm(None), config=CONFIG, threads=1)
+    assert same(state(agent.actor), before)
+    assert inner.training, "as it was: learning goes on in it"
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_layers_without_a_size_are_named(kept: bool) -> None:
+    """TorchRL's `MLP` is lazy unless it is told what comes in."""
+    critic = ValueOperator(MLP(out_features=1, num_cells=[8]), in_keys=["observation"])
+    agent = scripted(nn.Tanh())
+    agent.loss = lambda a, size: ClipPPOLoss(a, critic)
+    agent.weights = nn.ModuleList([agent.actor, critic]) if kept else None
+    with pytest.raises(InputError, match=f"weight' of its `{'weights' if kept else 'loss'}` has no size yet: call"):
+        adapt(agent, world(), belief(), Alarm(20), config=CONFIG, threads=1)
+
+
+def test_policy_opt_of_one_seed_is_the_same_whatever_was_drawn_before(jackal: Path) -> None:
+    """With critics that the loss makes anew, too."""
+    found = []
+    for drawn in (0, 1):
+        torch.manual_seed(drawn)
+        policy = load_policy(jackal)
+        envs = gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=4, context=["psi"], autoreset_mode="Disabled", nthread=1)
+        optimise(sac_agent(policy, OffPolicyConfig(batch=64, updates=2, critic_first=2)), envs, 64, seed=3)
+        found.append(state(policy.network))
+    assert same(*found)
+
+
 @pytest.mark.parametrize("judged", [0, 2])
 def test_a_loss_that_comes_apart_leaves_the_policy_as_it_was(jackal: Path, judged: int) -> None:
     policy = load_policy(jackal)
@@ -388,8 +442,6 @@ def test_what_does_not_fit_is_named(jackal: Path, tmp_path: Path) -> None:
 
 
 def test_policy_opt_takes_any_vector_environment(jackal: Path) -> None:
-    from nfc_gym.adaptation.optimise import optimise
-
     agent = ppo_agent(load_policy(jackal))
     before = copy.deepcopy(agent.actor.state_dict())
     envs = gym.make_vec("nfc_gym/JackalFlat-v0", num_envs=4, context=["psi"], autoreset_mode="Disabled", nthread=1)

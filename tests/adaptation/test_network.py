@@ -1,12 +1,16 @@
 """The scale of observations, the advantage of knowing one's distribution, and losses that come apart."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import A2CLoss
+from torchrl.modules import ValueOperator
+from torchrl.objectives import A2CLoss, ClipPPOLoss, SACLoss
 
+from nfc_gym.adaptation.agent import Action, OffPolicy, OffPolicyConfig
 from nfc_gym.adaptation.network import ActorCritic, Scale, Sizes
 from nfc_gym.adaptation.ppo import Diverged, OnPolicy, Power, PPOConfig, clipped
 
@@ -98,6 +102,42 @@ def test_a_loss_that_is_not_finite_changes_nothing() -> None:
     with pytest.raises(Diverged, match="not finite"):
         learner.learn(steps)
     assert all(torch.equal(v, before[k]) for k, v in network.state_dict().items())
+
+
+class Steep(ClipPPOLoss):
+    """Finite, with a gradient that is not: the root of 0."""
+
+    def forward(self, tensordict: Any) -> Any:
+        out = super().forward(tensordict)
+        first = next(iter(self.actor_network.parameters()))
+        return out.set("loss_objective", out["loss_objective"] + (0 * first).sum().abs().sqrt())
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing() -> None:
+    """Else the last update of all would leave weights that are not finite, and nothing would say so."""
+    network = ActorCritic(Sizes(3, 2, 2, (16,)))
+    learner = OnPolicy(Steep(network.actor, network.critic, functional=False), PPOConfig())
+    before = {k: v.clone() for k, v in network.state_dict().items()}
+    with pytest.raises(Diverged, match="the gradient is not finite"):
+        learner.learn(acted(network, batch()))
+    assert all(torch.equal(v, before[k]) for k, v in network.state_dict().items())
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing_off_policy_either() -> None:
+    network = ActorCritic(Sizes(3, 2, 2, (16,)))
+    value = ValueOperator(Action(network.scale, 2, (16,)), in_keys=["observation", "action"])
+
+    class SteepSAC(SACLoss):
+        def forward(self, tensordict: Any) -> Any:
+            out = super().forward(tensordict)
+            first = next(p for p in self.actor_network_params.parameters() if p.requires_grad)
+            return out.set("loss_actor", out["loss_actor"] + (0 * first).sum().abs().sqrt())
+
+    learner = OffPolicy(SteepSAC(network.actor, value, target_entropy=-2.0), OffPolicyConfig(batch=16, critic_first=0))
+    before = {k: v.clone() for k, v in network.gaussian.state_dict().items()}
+    with pytest.raises(Diverged, match="the gradient is not finite"):
+        learner.learn(acted(network, batch()))
+    assert all(torch.equal(v, before[k]) for k, v in network.gaussian.state_dict().items())
 
 
 def test_a_policy_that_runs_away_is_stopped() -> None:
