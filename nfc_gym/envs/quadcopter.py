@@ -15,8 +15,9 @@ from nfc_gym.physics.state import components, root
 
 REACH = 0.35  # m, from the chassis' centre to a propeller's tip, with room
 NEAREST, FARTHEST = 3.0, 8.0  # m to a goal over ground: within the map of 25.5 m
-LOW, HIGH = 1.0, 2.5  # m above the ground of starts and goals: below the tallest obstacles (4 m)
-ABOVE = 0.6  # m that a goal lies above what stands there: a rotor's reach and as much again
+TIP = 0.28  # m, from the chassis' centre to a propeller's tip
+LOW, HIGH = 1.0, 2.5  # m of starts and goals above a map's level middle, 0: below the tallest obstacles (4 m)
+ABOVE = 0.6  # m that a start or goal lies above what stands there: a rotor's reach and as much again
 START = 0.5  # m, half the side of the square that episodes start in: 1 m around the middle is free
 STRAY = 8.0  # m from the straight way between start and goal: lost
 TILTED = float(np.cos(2.5))  # z of the up axis at 2.5 rad, upside down
@@ -38,6 +39,13 @@ class Now(NamedTuple):
     goal: Array  # (*B, 3) m, world
     offset: Array  # (*B, 3) m, from the craft to the goal, world
     distance: Array  # (*B,) m
+
+
+def _top(ground: Ground, x: Array, y: Array, reach: float) -> Array:
+    """(*B,) m, of what stands within a craft's reach of a place."""
+    around = np.pi / 4 * np.arange(9)
+    ring = reach * np.array((np.cos(around), np.sin(around))).T * (np.arange(9) < 8)[:, None]
+    return ground(np.array((x, y)).T[..., None, :] + ring).max(-1)
 
 
 class Quadcopter(Robot):
@@ -63,21 +71,18 @@ class Quadcopter(Robot):
         z, high = LOW + (HIGH - LOW) * z, LOW + (HIGH - LOW) * high
         qpos = np.empty((*u.shape[:-1], len(self.home)))
         qpos[...] = self.home
-        qpos[..., :3] = start = np.array((x, y, z)).T
         qpos[..., 3:7] = turned(self.home[3:7], heading)
         if self.task == "figure8":
             way = np.arange(32) / 32
             columns = [part[..., None] for part in (x, y, heading)]
             z = np.maximum(z, ground(np.stack(figure_eight(way, LOOP, *columns), -1)).max(-1) + ABOVE)
-            qpos[..., 2] = z
-            place = np.array((x, y, z, heading)).T
-            return Start(qpos, {"clock": np.zeros(u.shape[:-1]), "place": place})
+            qpos[..., :3] = np.array((x, y, z)).T
+            return Start(qpos, {"clock": np.zeros(u.shape[:-1]), "place": np.array((x, y, z, heading)).T})
+        z = np.maximum(z, _top(ground, x, y, TIP) + ABOVE)
+        qpos[..., :3] = start = np.array((x, y, z)).T
         far, bearing = NEAREST + (FARTHEST - NEAREST) * far, 2 * np.pi * bearing
-        spot = np.array((x + far * np.cos(bearing), y + far * np.sin(bearing))).T
-        around = np.pi / 4 * np.arange(9)
-        ring = REACH * np.array((np.cos(around), np.sin(around))).T * (np.arange(9) < 8)[:, None]
-        top = ground(spot[..., None, :] + ring).max(-1)
-        goal = np.concatenate((spot, np.maximum(high, top + ABOVE)[..., None]), -1)
+        x, y = x + far * np.cos(bearing), y + far * np.sin(bearing)
+        goal = np.array((x, y, np.maximum(high, _top(ground, x, y, REACH) + ABOVE))).T
         return Start(qpos, {"goal": goal, "start": start})
 
     def actuate(self, action: Array, view: View) -> Array:

@@ -166,6 +166,21 @@ def test_obstacles_are_flown_into_and_goals_lie_above_them() -> None:
     assert env.step(np.zeros(4))[2]
 
 
+@pytest.mark.parametrize("task", quadcopter.Quadcopter.tasks)
+def test_a_quadcopter_starts_above_ground_that_is_raised(task: str) -> None:
+    """Above any map that is given, and above a residual beneath the start that is not seen."""
+    env = made("QuadcopterRough", task=task)
+    hill = np.zeros((256, 256))
+    hill[118:138, 118:138] = 3.0  # m, 2 m wide, in the middle
+    grounds = {"heightfield": np.full((256, 256), 3.0), "terrain_residual": hill}
+    for name, ground in grounds.items():
+        for seed in range(4):
+            env.reset(seed=seed, options={name: ground})
+            x, y, z = env.unwrapped.data.qpos[:3]
+            assert z >= env.unwrapped._ground(np.array((x, y))) + quadcopter.ABOVE - 1e-9
+            assert not any(env.step(np.zeros(4))[2] for _ in range(20)), (name, seed)
+
+
 def test_the_quadcopter_follows_a_figure_eight() -> None:
     env = made("QuadcopterFlat", task="figure8")
     _, info = env.reset(seed=0)
