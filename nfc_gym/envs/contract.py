@@ -173,7 +173,8 @@ def psi_of(space: ParameterSpace, values: Any, shape: tuple[int, ...], name: str
                 raise InputError(f"{name} has no parameter {key!r}; there are: {', '.join(space.names)}")
             own = numbers(value, f"{name}[{key!r}]")
             if own.shape not in ((), shape):
-                raise InputError(f"{name}[{key!r}] has shape {own.shape}, want () or {shape}")
+                want = f"() or {shape}" if shape else "()"
+                raise InputError(f"{name}[{key!r}] has shape {own.shape}, want {want}")
             psi[..., space.names.index(key)] = own
     else:
         psi = numbers(values, name)
@@ -204,9 +205,9 @@ def as_numbers(action: Any) -> Array:
     """
     try:
         given = np.asarray(action)
-        if given.dtype.kind not in "USc":
+        if given.dtype.kind in "fiubO":
             return np.array(given, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pass
     raise InputError(f"action is {action!r}, want numbers in [-1, 1]")
 

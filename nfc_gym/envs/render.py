@@ -103,19 +103,36 @@ class Pictures:
     Args:
       model: the scene.
       width, height: of the picture in pixels.
+
+    Raises:
+      InputError: a picture larger than the graphics library draws.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         self._size = (height, width, 3)
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
         self._gl = _context(width, height)
         self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        self._context = self._buffer(model, width, height)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=2000)
         self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
         self._shown = _Shown(model)
+
+    def _buffer(self, model: mujoco.MjModel, width: int, height: int) -> mujoco.MjrContext:
+        """What is drawn into, as large as the picture; the model says how large."""
+        sizes, before = model.vis.global_, (model.vis.global_.offwidth, model.vis.global_.offheight)
+        sizes.offwidth, sizes.offheight = max(before[0], width), max(before[1], height)
+        try:
+            return mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        except mujoco.FatalError as error:
+            sizes.offwidth, sizes.offheight = before
+            self._gl.free()
+            if "framebuffer" not in str(error):
+                raise
+            raise InputError(
+                f"width {width} and height {height}: no picture of that size can be drawn here ({error}); want "
+                "a smaller one"
+            ) from None
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> NDArray[np.uint8]:
         """(height, width, 3) picture of a simulation of the scene."""

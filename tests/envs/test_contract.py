@@ -192,12 +192,22 @@ def test_input_errors_are_value_errors() -> None:
     assert issubclass(InputError, ValueError)
 
 
-@pytest.mark.parametrize("action", [["a", "b"], {}, [1j, 0], [[1], [1, 2]]])
+@pytest.mark.parametrize(
+    "action", [["a", "b"], {}, [1j, 0], [[1], [1, 2]], [10**400, 0], np.zeros(2, "timedelta64[s]")]
+)
 def test_actions_that_are_no_numbers_are_told(action: Any) -> None:
     for env in (made("nfc_gym/JackalFlat-v0").unwrapped, gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=1)):
         env.reset(seed=0)
         with pytest.raises(InputError, match=r"action is .*, want numbers"):
             env.step(action)
+
+
+def test_a_value_of_the_wrong_shape_names_the_shapes_that_fit() -> None:
+    message = r"psi\['base_mass'\] has shape \(3,\), want \(\)"
+    with pytest.raises(InputError, match=message + "$"):
+        made("nfc_gym/JackalFlat-v0").reset(options={"psi": {"base_mass": [20.0, 20.0, 20.0]}})
+    with pytest.raises(InputError, match=message + r" or \(2,\)$"):
+        gymnasium.make_vec("nfc_gym/JackalFlat-v0", num_envs=2).reset(options={"psi": {"base_mass": [20.0] * 3}})
 
 
 @pytest.mark.parametrize("wrong", ["20", True, [20.0, "x"]])

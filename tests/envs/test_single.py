@@ -197,6 +197,17 @@ def test_a_changed_heightfield_is_seen(pictured: gymnasium.Env) -> None:
     np.testing.assert_array_equal(pictured.render(), before)
 
 
+def test_a_picture_too_large_to_draw_is_told(pictured: gymnasium.Env) -> None:
+    env = made(ROUGH, render_mode="rgb_array", width=300_000, height=200_000)
+    env.reset(seed=0)
+    before = (env.unwrapped.model.vis.global_.offwidth, env.unwrapped.model.vis.global_.offheight)
+    with pytest.raises(InputError, match="width 300000 and height 200000: no picture of that size"):
+        env.render()
+    assert (env.unwrapped.model.vis.global_.offwidth, env.unwrapped.model.vis.global_.offheight) == before
+    env.close()
+    assert pictured.render().shape == (120, 160, 3)
+
+
 def test_a_changed_camera_is_seen(pictured: gymnasium.Env) -> None:
     pictured.reset(seed=0)
     before = pictured.render()
