@@ -14,6 +14,18 @@ PARTS = ("psi", "delta_s", "delta_e")
 _TRAILING = {"psi": 1, "delta_s": 1, "delta_e": 2}
 
 
+def _numbers(part: str, value: Any) -> Array:
+    """A part as an array; text, flags and complex numbers raise `InputError`."""
+    try:
+        given = np.asarray(value)
+        if given.dtype.kind in "fiuO":
+            return given.astype(float, copy=False)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    text = repr(value)
+    raise InputError(f"fidelity: {part} is {text if len(text) <= 80 else text[:77] + '...'}, want an array of numbers")
+
+
 @dataclass(frozen=True)
 class Fidelity:
     """One sample (psi, delta_s, delta_e), or a batch of them with one leading axis; None is "says nothing of it".
@@ -24,7 +36,8 @@ class Fidelity:
       delta_e: (rows, cols) or (n, rows, cols) residual terrain in m, truth minus perceived.
 
     Raises:
-      InputError: a part has another number of axes, is not finite, or the parts' leading axes differ.
+      InputError: a part is no array of numbers, has another number of axes, is not finite, or the parts' leading axes
+        differ.
     """
 
     psi: Array | None = None
@@ -37,7 +50,7 @@ class Fidelity:
             value = getattr(self, part)
             if value is None:
                 continue
-            value = np.asarray(value, float)
+            value = _numbers(part, value)
             object.__setattr__(self, part, value)
             extra = value.ndim - _TRAILING[part]
             if extra not in (0, 1):

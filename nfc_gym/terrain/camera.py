@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 
 Array = NDArray[np.float64]
+# The most that an image may be asked for: samples as far as `far`, and patches one by one, are worked out for each.
+FARTHEST = 100.0  # m, four times the side of a map
+MOST_BLOTCHES = 1000.0  # patches of 0.12 rad x 0.3 m on average: over 1.6 rad and 9 m, more than all there is
 
 
 def _finite(value: Any, count: int) -> bool:
@@ -76,14 +79,16 @@ class DepthCamera:
                 raise InputError(f"{each.name} {value!r}: want {want}")
         if not all(0 < angle < np.pi for angle in self.fov):
             raise InputError(f"fov {self.fov!r}: want two angles between 0 and pi [rad]")
-        if not 0 <= self.near < self.far < np.inf:
-            raise InputError(f"near {self.near!r} and far {self.far!r}: want 0 <= near < far [m]")
+        if not 0 <= self.near < self.far <= FARTHEST:
+            raise InputError(f"near {self.near!r} and far {self.far!r}: want 0 <= near < far <= {FARTHEST:g} [m]")
         for name in ("columns", "baseline", "rate", "window"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(f"{name} {getattr(self, name)!r}: want a number above 0")
         for name in ("subpixel", "blotches", "drift", "yaw_drift", "tilt"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name} {getattr(self, name)!r}: want 0 or more")
+        if self.blotches > MOST_BLOTCHES:
+            raise InputError(f"blotches {self.blotches!r}: want {MOST_BLOTCHES:g} or less")
         for name in ("dropout", "flying"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} {getattr(self, name)!r}: want a share from 0 to 1")

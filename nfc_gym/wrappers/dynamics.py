@@ -130,12 +130,25 @@ def noise_root(covariance: ArrayLike | None, size: int) -> Array:
     return vectors[:, keep] * np.sqrt(values[keep])
 
 
-def box_key(space: gym.Space, key: str | None, size: int) -> str | None:
+def box_key(space: gym.Space, key: str | None, size: int, observed: bool) -> str | None:
     """The key of a Dict observation that entries of delta_s perturb, None for a plain Box.
 
+    Args:
+      space: of an observation.
+      key: that which was asked for; None is the first that fits.
+      size: of delta_s.
+      observed: whether any entry of it perturbs what is observed.
+
     Raises:
-      InputError: the key does not exist or is not as wide as delta_s.
+      InputError: the key does not exist, or entries that are observed find none as wide as delta_s.
     """
+    if not observed:
+        there = list(space.keys()) if isinstance(space, spaces.Dict) else []
+        if key is not None and key not in there:
+            raise InputError(
+                f"ResidualDynamics: the observation has no key {key!r}; it has: {', '.join(there) or 'none'}"
+            )
+        return None
     if isinstance(space, spaces.Dict):
         boxes = [k for k, s in space.items() if s.shape == (size,)]
         key = key or next(iter(boxes), None)
@@ -197,7 +210,7 @@ class ResidualDynamics(_Observing, EnvWrapper):
         self.draws, bound, root = prepare(env, sim, source, mode, covariance, components)
         sim.attach("ResidualDynamics", after=mode == "state", substeps=False)
         self.sim = sim
-        self.key = box_key(env.observation_space, key, bound.size) if bound.observed.size else None
+        self.key = box_key(env.observation_space, key, bound.size, bool(bound.observed.size))
         self.injection = Injection(sim, bound, mode, root)
 
     @property
@@ -239,7 +252,7 @@ class VectorResidualDynamics(_Observing, VectorEnvWrapper):
         super().__init__(env, source=source, mode=mode, covariance=covariance, components=components, key=key)
         sim = batch_simulation_of(env, "ResidualDynamics")
         self.draws, bound, root = prepare(env, sim, source, mode, covariance, components)
-        self.key = box_key(env.single_observation_space, key, bound.size) if bound.observed.size else None
+        self.key = box_key(env.single_observation_space, key, bound.size, bool(bound.observed.size))
         sim.attach("ResidualDynamics", after=mode == "state", substeps=False)
         self.injection = Injection(sim, bound, mode, root)
         self._before = self.injection.delta  # (n, s) what acted last in episodes that same-step autoreset ends
@@ -294,6 +307,14 @@ def checked_mode(mode: str) -> None:
 
 
 def component_names(env: Any, names: Sequence[str] | None, size: int) -> Sequence[str] | None:
-    """Names of delta_s's entries: those given, else the environment's own where there are as many."""
+    """Names of delta_s's entries: those given, else the environment's own where there are as many.
+
+    Raises:
+      InputError: what is given is no list of names.
+    """
+    if names is not None and (isinstance(names, str) or not isinstance(names, Sequence)):
+        raise InputError(
+            f"ResidualDynamics: components is {names!r}; want a list of {size} names, one an entry of delta_s"
+        )
     own = getattr(env.unwrapped, "proprio_components", None)
     return own if names is None and own is not None and len(own) == size else names

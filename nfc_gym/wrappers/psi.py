@@ -1,6 +1,6 @@
 """`RandomizePsi`: physical coefficients that are drawn anew for each episode."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from numbers import Real
 from typing import Any
@@ -47,8 +47,8 @@ class Prior:
             self._named(distribution)
         elif isinstance(distribution, Real):
             fraction = float(distribution)
-            if not 0 < fraction <= 1:
-                raise InputError(f"RandomizePsi: a fraction of the prior lies in (0, 1], got {fraction:g}")
+            if isinstance(distribution, bool) or not 0 < fraction <= 1:
+                raise InputError(f"RandomizePsi: a fraction of the prior lies in (0, 1], got {distribution!r}")
             self.low = space.nominal - fraction * (space.nominal - space.low)
             self.high = space.nominal + fraction * (space.high - space.nominal)
             self.low, self.high = (np.where(space.free, b, space.nominal) for b in (self.low, self.high))
@@ -94,6 +94,11 @@ def space_of(env: Any, model: mujoco.MjModel, space: Space | None, names: Sequen
     if isinstance(space, ParameterSpace):
         return space
     each = [space] if isinstance(space, str) else space
+    if isinstance(each, Mapping) or not isinstance(each, Iterable):
+        raise InputError(
+            f"RandomizePsi: space is {space!r}; want a ParameterSpace, a list of parameters, or names of bodies whose "
+            f"masses vary: {_bodies(model)}"
+        )
     return ParameterSpace(model, [_mass(model, p) if isinstance(p, str) else _parameter(p) for p in each])
 
 

@@ -5,7 +5,6 @@ A folder with `model.xml`, `mapping.yaml` and one Parquet file an episode, its c
 """
 
 import os
-import pathlib
 from typing import Any
 
 import gymnasium as gym
@@ -17,7 +16,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.order import beneath, kind
-from nfc_gym.wrappers.record_folder import LogFolder
+from nfc_gym.wrappers.record_folder import LogFolder, folder_of
 from nfc_gym.wrappers.record_tape import Tape
 from nfc_gym.wrappers.simulation import Simulation, simulation_of
 
@@ -40,7 +39,7 @@ class _Recording:
     def _wire(self, path: Path, model_file: Path | None) -> None:
         sim = self.sim
         for inner in beneath(self.env):
-            if isinstance(inner, _Recording) and inner.log.folder.resolve() == pathlib.Path(path).resolve():
+            if isinstance(inner, _Recording) and inner.log.folder.resolve() == folder_of(path).resolve():
                 name = kind(self)
                 raise InputError(f"{name} around {name}: both record into {os.fspath(path)}; give each its own folder")
         self.log = LogFolder(self.env, sim, path, None if model_file is None else os.fspath(model_file))

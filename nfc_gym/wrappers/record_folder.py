@@ -24,6 +24,13 @@ _ATTITUDE = 1e-4  # rad
 _SAMPLES = 8  # in a compared stretch, where control is slow: as many as 0.4 s at 20 Hz
 
 
+def folder_of(path: Any) -> Path:
+    """A folder's path; what names none raises `InputError`."""
+    if not isinstance(path, str | os.PathLike) or not os.fspath(path) or isinstance(os.fspath(path), bytes):
+        raise InputError(f"RecordLog: path is {path!r}, want the name of a folder")
+    return Path(path)
+
+
 class LogFolder:
     """Where the logs of one model go.
 
@@ -44,7 +51,7 @@ class LogFolder:
         missing = [name for name in _NEEDED if find_spec(name) is None]
         if missing:
             raise MissingExtra(f"RecordLog needs {', '.join(missing)}: pip install 'nfc_gym[measured]'")
-        self.env, self.sim, self.folder, self.model_file = env, sim, Path(path), model_file
+        self.env, self.sim, self.folder, self.model_file = env, sim, folder_of(path), model_file
         self.columns = columns(sim.nominal)
         self.controls = [f"ctrl:{name}" for name in names(sim.nominal).actuators]
         if self.folder.exists() and not self.folder.is_dir():

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.whole import require_whole
+from nfc_gym.physics.parameters import numbers
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
 from nfc_gym.wrappers.rows import Rows, with_last
 
@@ -63,9 +64,12 @@ class Channel:
     def _wide(self, key: str, space: spaces.Box, name: str) -> NDArray[np.float64]:
         given = getattr(self.fault, name)
         try:
-            value = np.asarray(given, float)
-        except (TypeError, ValueError):
+            value = numbers(given, name)
+        except InputError:
             value = np.array(np.nan)
+        if space.dtype is not None and space.dtype.kind == "f":
+            with np.errstate(over="ignore"):  # what the signal's own type cannot hold would come out as infinite
+                value = np.where(np.isfinite(value.astype(space.dtype)), value, np.nan)
         if (
             value.shape not in ((), space.shape)
             or not np.isfinite(value).all()
@@ -73,7 +77,8 @@ class Channel:
         ):
             sign = "" if name == "bias" else ", none below 0"
             raise InputError(
-                f"PerturbSignals: {key}: {name} is a finite number or {space.shape} of them{sign}, got {given!r}"
+                f"PerturbSignals: {key}: {name} is a finite number or {space.shape} of them{sign}, as {space.dtype} "
+                f"holds them, got {given!r}"
             )
         return value
 
@@ -100,7 +105,7 @@ class Channel:
         """What comes out of the last value (*shape) of a row's episode, while that of the next is about to go in."""
         value = np.asarray(value)
         if self.fault.delay:
-            value = np.asarray(self.past[1][row])  # the oldest, once this one were appended
+            value = np.asarray(self.past[len(self.past) == self.past.maxlen][row])  # the oldest, were this one appended
         return self._faulty(value, self.total[row], rng)
 
     def _faulty(self, values: NDArray, bias: NDArray, rng: np.random.Generator) -> NDArray:
@@ -117,9 +122,7 @@ class Channel:
             mask = _rows(self.fresh, values)
             self.past = deque((np.where(mask, values, old) for old in self.past), maxlen=self.past.maxlen)
         self.fresh = None
-        if not self.past:
-            self.past.extend([values.copy()] * self.past.maxlen)  # type: ignore[operator]
-        if again is None:
+        if again is None or not self.past:
             self.past.append(values.copy())
         return self.past[0]
 

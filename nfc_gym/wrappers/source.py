@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.posterior import Sampler, load_source
+from nfc_gym.physics.parameters import numbers
 
 Array = NDArray[np.float64]
 Source = Sampler | ArrayLike | str | os.PathLike[str]
@@ -67,11 +68,13 @@ def sampler_of(source: Any, part: str, who: str) -> Sampler:
     if isinstance(source, Sampler) and not isinstance(source, np.ndarray):
         return source
     try:
-        array = np.asarray(source, float)
-    except (TypeError, ValueError):
+        array = numbers(source, part)
+    except InputError:
+        array = np.array(np.nan)
+    if not array.ndim:  # nothing that has one number alone is a sample
         raise InputError(
             f"{who}: a source is a posterior with sample(n, rng), an array of numbers or a path, got {source!r}"
-        ) from None
+        )
     if array.ndim > 1 and not len(array):
         raise InputError(f"{who}: the source holds no sample, {array.shape}; want one of {part} or more")
     return Fidelity(**{part: array})

@@ -37,6 +37,9 @@ def test_what_is_no_fidelity_is_refused() -> None:
         Fidelity(psi=np.zeros((2, 3)), delta_s=np.zeros((4, 5)))
     with pytest.raises(InputError, match=r"delta_e must have 2 or 3 axes"):
         Fidelity(delta_e=np.zeros(4))
+    for wrong in ("heavy", [[1.0], [1.0, 2.0]], np.ones(2, complex), [True, False]):
+        with pytest.raises(InputError, match=r"psi is .*, want an array of numbers"):
+            Fidelity(psi=wrong)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="nan"):
         Fidelity(psi=np.array([1.0, np.nan]))
 

@@ -273,6 +273,8 @@ def test_a_reset_forgets_everything() -> None:
         ({"pitch": "30"}, "pitch '30': want a finite number"),
         ({"fov": 1.0}, "fov 1.0: want 2 finite numbers"),
         ({"position": [[0], [1, 2], 3]}, "want 3 finite numbers"),
+        ({"far": 1e9}, r"near 0.28 and far 1000000000.0: want 0 <= near < far <= 100 \[m\]"),
+        ({"blotches": 1e9}, "blotches 1000000000.0: want 1000 or less"),
     ],
 )
 def test_impossible_cameras_are_refused(kwargs: dict, message: str) -> None:

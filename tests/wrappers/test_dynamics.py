@@ -169,6 +169,10 @@ def test_bad_input_is_refused_by_name(tmp_path) -> None:
         ResidualDynamics(FakeEnv(), tmp_path / "posterior.pt")
     with pytest.raises(InputError, match="no such file"):
         ResidualDynamics(FakeEnv(), tmp_path / "posterior.npz")
+    with pytest.raises(InputError, match=r"components is 5; want a list of 1 names"):
+        ResidualDynamics(FakeEnv(), np.zeros(1), components=5)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="the observation has no key 'wind'; it has: none"):
+        ResidualDynamics(FakeEnv(), np.zeros(7), key="wind")
     with pytest.raises(InputError, match="VectorResidualDynamics"):
         ResidualDynamics(gym.make_vec("Ant-v5", 1), np.zeros(14))  # type: ignore[arg-type]
 

@@ -142,6 +142,11 @@ def test_spec_and_pickle(tmp_path: Path) -> None:
         (np.array([np.nan]), ["cube"], "nan"),
         ("psi.npz", ["cube"], "no such file"),
         ([[object()]], ["cube"], "posterior"),
+        (None, ["cube"], r"posterior with sample\(n, rng\), an array of numbers or a path, got None"),
+        (np.ones(1, complex), ["cube"], "an array of numbers or a path, got array"),
+        (True, ["cube"], r"lies in \(0, 1\], got True"),
+        (1.0, 5, "space is 5; want a ParameterSpace, .* whose masses vary: cube, pole"),
+        (1.0, {"cube": 1}, "space is {'cube': 1}; want a ParameterSpace"),
     ],
 )
 def test_bad_input_is_refused_by_name(distribution, space, message: str) -> None:

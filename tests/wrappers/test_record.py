@@ -339,6 +339,9 @@ def test_bad_input_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
         RecordLog(FakeEnv(), tmp_path, gym.make("Ant-v5").unwrapped.fullpath).reset()
     with pytest.raises(InputError, match="terrain_pool=1"):
         VectorRecordLog(gym.make_vec("nfc_gym/JackalRough-v0", num_envs=2, terrain_pool=2), tmp_path)
+    for wrong in (None, 5, "", b"logs"):
+        with pytest.raises(InputError, match=f"path is {wrong!r}, want the name of a folder"):
+            RecordLog(FakeEnv(), wrong)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="VectorRecordLog"):
         RecordLog(gym.make_vec("Ant-v5", 1), tmp_path)  # type: ignore[arg-type]
     with monkeypatch.context() as patch:

@@ -119,6 +119,13 @@ def test_rows_of_a_vector_environment_forget_on_their_own(mode) -> None:
     np.testing.assert_array_equal(np.array(shown).T, expected)
 
 
+def test_a_delay_longer_than_any_episode_keeps_no_more_than_was_seen() -> None:
+    env = PerturbSignals(Counting(), {"count": {"delay": 10**12}})
+    shown = [env.reset()[0]["count"][0]] + [env.step(np.zeros(1))[0]["count"][0] for _ in range(5)]
+    assert shown == [0.0] * 6
+    assert len(env.channels["count"].past) == 6
+
+
 @pytest.mark.parametrize(
     ("noise", "message"),
     [
@@ -129,6 +136,9 @@ def test_rows_of_a_vector_environment_forget_on_their_own(mode) -> None:
         ({"action": {"delay": 0.5}}, "delay"),
         ({"action": {"delay": "a"}}, "delay, in control steps, is 'a', want a whole number"),
         ({"action": {"sd": "a"}}, "sd is a finite number or .* got 'a'"),
+        ({"action": {"sd": True}}, "sd is a finite number or .* got True"),
+        ({"action": {"bias": "0.1"}}, "bias is a finite number or .* got '0.1'"),
+        ({"action": {"bias": 1e39}}, "bias is a finite number .* as float32 holds them, got 1e\\+39"),
         ({"action": 5}, "action is 5; want a fault as a mapping, such as"),
         (None, "noise is None; want signal -> fault, such as"),
     ],
