@@ -45,7 +45,7 @@ class Parameter:
     Attributes:
       name: unique in its space.
       field: an `MjModel` field, with a component in brackets where it has several (`geom_friction[0]`), an option
-        (`opt.gravity[2]`), or one of the compound fields in `COMPOUND`.
+        (`opt.gravity[2]`, `opt.density`), or one of the compound fields in `COMPOUND`.
       of: the named objects that take the value, all the same.
       unit: of the value.
       low, high: the prior's bounds.
@@ -102,6 +102,7 @@ _CELLS: dict[str, tuple[tuple[str, int | None], ...]] = {
     "servo_kp": (("actuator_gainprm", 0), ("actuator_biasprm", 1)),
     "geom_restitution": (("geom_solref", 0), ("geom_solref", 1)),
 }
+_MEDIUM = ("opt.density", "opt.viscosity")  # options that are plain numbers: all that MuJoCo knows of air or water
 _READ = {"servo_kv": ("actuator_gainprm", 0), "servo_kp": ("actuator_gainprm", 0)}
 _WIDE = 100  # characters of a `repr` on one line
 _ANY, _AT_LEAST_0 = (-np.inf, np.inf), (0.0, np.inf)
@@ -112,7 +113,7 @@ _POSSIBLE = {
     **dict.fromkeys(
         (
             "geom_friction", "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
-            "tendon_stiffness", "tendon_damping", "tendon_frictionloss", "servo_kp", "servo_kv",
+            "tendon_stiffness", "tendon_damping", "tendon_frictionloss", "servo_kp", "servo_kv", *_MEDIUM,
         ),
         _AT_LEAST_0,
     ),
@@ -142,13 +143,19 @@ class _Bound:
 def resolve(model: mujoco.MjModel, field: str, of: Sequence[str]) -> _Bound:
     """Resolve a field and its objects' names against a model; raises `InputError` naming what does not exist."""
     name, component = split_field(field)
+    if name in _MEDIUM:
+        if component is not None:
+            raise InputError(f"field {field!r}: {name} is one number and has no components: leave the brackets out")
+        return _Bound(name, None, None)
     if name.startswith("opt."):
         owner, key = model.opt, name[4:]
     else:
         owner, key = model, COMPOUND.get(name, (name,))[0]
     array = getattr(owner, key, None)
     if not isinstance(array, np.ndarray):
-        raise InputError(f"field {field!r} is not an array field of MjModel (or one of {', '.join(COMPOUND)})")
+        raise InputError(
+            f"field {field!r} is not an array field of MjModel (or one of {', '.join((*COMPOUND, *_MEDIUM))})"
+        )
     if array.dtype.kind == "i":
         raise InputError(f"field {field!r} holds whole numbers, by which the model is built: they cannot be written")
     if name.startswith("opt."):
@@ -169,7 +176,9 @@ def resolve(model: mujoco.MjModel, field: str, of: Sequence[str]) -> _Bound:
 def write_field(fields: ModelFields, bound: _Bound, value: Array) -> None:
     """Write `value` (...,) to every row of a resolved field, over the fields' own batch shape."""
     value = np.asarray(value, float)
-    if bound.rows is None:
+    if bound.rows is None and bound.component is None:
+        fields[bound.name][...] = value
+    elif bound.rows is None:
         fields[bound.name][..., bound.component] = value
     elif bound.name in COMPOUND:
         COMPOUND[bound.name][1](fields, bound.rows, np.broadcast_to(value[..., None], (*value.shape, len(bound.rows))))
@@ -289,7 +298,7 @@ class ParameterSpace:
     @staticmethod
     def _values(model: mujoco.MjModel, bound: _Bound) -> Array:
         name, component = _READ.get(bound.name, (bound.name, bound.component))
-        array = getattr(model.opt, name[4:])[None] if name.startswith("opt.") else getattr(model, name)
+        array = np.asarray(getattr(model.opt, name[4:]))[None] if name.startswith("opt.") else getattr(model, name)
         rows = array if bound.rows is None else array[bound.rows]
         return rows if component is None else rows[:, component]
 

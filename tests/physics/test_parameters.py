@@ -1,5 +1,7 @@
 """psi: writing it into one model and a batch, always from nominal; reading, normalising, refusing."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -58,6 +60,22 @@ def test_values_arrive_where_they_should() -> None:
     assert (model.actuator_gainprm[1, 0], model.actuator_biasprm[1, 1]) == (40.0, -40.0)
     assert model.actuator_biasprm[1, 2] == MODEL.actuator_biasprm[1, 2]
     assert model.opt.gravity[2] == -9.0
+
+
+def test_the_medium_is_a_parameter_of_one_model_and_of_each_of_a_batch() -> None:
+    medium = [Parameter(n, f"opt.{n}", (), unit, 0.0, 2000.0) for n, unit in (("density", "kg/m^3"), ("viscosity", ""))]
+    space, model = ParameterSpace(MODEL, medium), copy.copy(MODEL)
+    np.testing.assert_array_equal(space.nominal, [MODEL.opt.density, MODEL.opt.viscosity])
+    fields = ModelFields(model)
+    space.write(fields, [998.0, 0.001])
+    fields.commit()
+    assert (model.opt.density, model.opt.viscosity) == (998.0, 0.001)
+    batch = Batch(MODEL, 2, 1)
+    space.write(ModelFields(batch), [[998.0, 0.001], [1.2, 0.0]])
+    np.testing.assert_array_equal(batch.expand("opt.density"), [998.0, 1.2])
+    np.testing.assert_array_equal(batch.expand("opt.viscosity"), [0.001, 0.0])
+    with pytest.raises(InputError, match=r"'density' is -1 kg/m\^3, want 0 or more"):
+        space.require_possible([-1.0, 0.0])
 
 
 def test_mass_moves_inertia_and_derived_constants() -> None:
@@ -220,6 +238,8 @@ def test_values_beyond_the_prior_are_allowed() -> None:
         ("geom_friction[7]", ("foot_l",), "component 7"),
         ("opt.gravity", (), "name one of its 3 components, for instance opt.gravity\\[0\\]"),
         ("opt.gravity[7]", (), "name one of its 3 components"),
+        ("opt.density[0]", (), "opt.density is one number and has no components: leave the brackets out"),
+        ("opt.timestep", (), "not an array field"),
         ("body_weight", ("base",), "not an array field"),
         ("body_mass", (), "at least one"),
     ],
