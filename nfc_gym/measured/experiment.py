@@ -114,7 +114,7 @@ class Stage:
         hold = lambda v: np.full((count, len(at)), float(np.median(v)))  # noqa: E731
         known = {}
         for key, values in log.known.items():
-            field, _, of = key.rpartition(":")
+            field, _, of = key.partition(":")
             known[(field, tuple(of.split("+")) if of else ())] = hold(values)
         exogenous = {k: np.tile(at, (count, 1)) if k == TIME else hold(v) for k, v in log.exogenous.items()}
         return Segments(

@@ -79,7 +79,7 @@ def track(
         ctrl[: len(log), a], ctrl[len(log) :, a] = values, values[-1]
     known = {}
     for key, values in log.known.items():
-        name, _, of = key.rpartition(":")
+        name, _, of = key.partition(":")
         known[(name, tuple(of.split("+")) if of else ())] = values[rows]
     columns, masks, noise = [], [], []
     for name in channels:

@@ -247,7 +247,7 @@ def lay(
         ctrl[:, :, a] = lane(lambda log, k=key: log.controls[k], partial(commanded, dt=layout.dt, linear=key in linear))
     known = {}
     for key in logs[0].known:
-        name, _, of = key.rpartition(":")
+        name, _, of = key.partition(":")
         known[(name, tuple(of.split("+")) if of else ())] = lane(lambda log, k=key: log.known[k], held)
     past = _Backwards(model, tuple(logs), tuple(states), where, layout, laws, linear)
     servo = []

@@ -297,7 +297,12 @@ class RolloutProblem(Problem):
         return repeat(seg, count, starts, np.concatenate([seg.qvel] * count) + dv)
 
     def _carried(self, plant: Plant, x: Array, base: Array) -> Array:
-        """(n, S, m) change of the residual for one standard deviation of each of n start coordinates."""
+        """(2 n, S, m) what noise of each of n start coordinates does to the residual, along a line and beside it.
+
+        With f at the start and one standard deviation to either side, a coordinate's part of the residual is
+        f' z + f'' z^2 / 2 with z ~ N(0, 1), whose variance is f'^2 + f''^2 / 2. Near a dead centre the noise decides
+        which way a crank turns, and the second term says that this segment tells nothing.
+        """
         model, seg = self._kit.model, self.segments
         directions = [(kind, d) for kind in (0, 1) for d in range(model.nv) if (self._start_sd[kind][:, d] > 0).any()]
         if not directions:
@@ -305,11 +310,14 @@ class RolloutProblem(Problem):
         starts_q, starts_v = [], []
         for kind, d in directions:
             step = np.zeros((len(self), model.nv))
-            step[:, d] = self._start_sd[kind][:, d]
-            starts_q.append(integrate(model, seg.qpos, step) if kind == 0 else seg.qpos)
-            starts_v.append(seg.qvel + step if kind == 1 else seg.qvel)
-        n = len(directions)
-        return self._again(plant, x, repeat(seg, n, np.concatenate(starts_q), np.concatenate(starts_v)), n) - base
+            for sign in (1, -1):
+                step[:, d] = sign * self._start_sd[kind][:, d]
+                starts_q.append(integrate(model, seg.qpos, step) if kind == 0 else seg.qpos)
+                starts_v.append(seg.qvel + step if kind == 1 else seg.qvel)
+        n = 2 * len(directions)
+        found = self._again(plant, x, repeat(seg, n, np.concatenate(starts_q), np.concatenate(starts_v)), n) - base
+        up, down = found[::2], found[1::2]
+        return np.concatenate([(up - down) / 2, (up + down) / np.sqrt(2)])
 
     def _again(self, plant: Plant, x: Array, segments: Segments, copies: int, finer: int = 1) -> Array:
         """(copies, S, m) residual of copies of the segments with other starts, at a step so many times finer.

@@ -15,6 +15,8 @@ class Local:
     Attributes:
       value, slope, curvature: (T, k), in the unit, unit/s and unit/s^2.
       value_gain, slope_gain: (T,) standard deviation of value and slope for unit noise on the samples.
+      misfit: (T,) by how much the samples are off the polynomial, root mean square over the columns, as an estimate of
+        the noise without bias; 0 where the polynomial has as many coefficients as there are samples.
     """
 
     value: Array
@@ -22,6 +24,7 @@ class Local:
     curvature: Array
     value_gain: Array
     slope_gain: Array
+    misfit: Array
 
 
 def local_polynomial(time: Array, values: Array, at: Array, points: int = 7, degree: int = 3) -> Local:
@@ -47,7 +50,9 @@ def local_polynomial(time: Array, values: Array, at: Array, points: int = 7, deg
     rows = [fitted[:, i] if i <= degree else np.zeros_like(fitted[:, 0]) for i in range(3)]
     gain = np.linalg.norm(solve, axis=-1)
     slope_gain = gain[:, 1] / span if degree >= 1 else np.zeros(len(at))
-    return Local(rows[0], rows[1] / span[:, None], 2 * rows[2] / span[:, None] ** 2, gain[:, 0], slope_gain)
+    off = np.square(values[window] - basis @ fitted).mean(-1).sum(-1) / max(points - degree - 1, 1)
+    bend = 2 * rows[2] / span[:, None] ** 2
+    return Local(rows[0], rows[1] / span[:, None], bend, gain[:, 0], slope_gain, np.sqrt(off))
 
 
 def fresh_samples(time: Array, values: Array, rate: float | None) -> NDArray[np.intp]:

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 # Standard deviations of the declared noise by which a channel's fit is off what was measured, from which on the motion
 # is one that a polynomial does not follow, as a wheel's speed that is another after each command.
 _FAR = 5.0
+_BENT = 5  # degree of the polynomials that slopes are taken from there
 _FEWEST = 8  # rows of a channel from which its course is told without those that are masked
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
@@ -72,6 +73,9 @@ def _smooth(log: Log, channel: Channel, values: Array, points: int, raw: bool) -
     off = float(np.sqrt(np.square(wide[index] - fit.value[index]).mean()))
     if not raw and (channel.noise is None or off <= _FAR * channel.noise):
         return fit
+    if not raw and channel.noise:  # slopes of a curve that bends more; what it is off still, they are off too
+        fit = local_polynomial(log.time[index], wide[index], log.time, points, _BENT)
+        fit = replace(fit, slope_gain=fit.slope_gain * np.maximum(1.0, fit.misfit / channel.noise))
     value, gain = fit.value.copy(), fit.value_gain.copy()
     value[index] = wide[index]
     if not raw:

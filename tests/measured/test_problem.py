@@ -12,7 +12,7 @@ from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.metric import metric
-from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.segments import Layout, Segments
 from nfc_gym.measured.shooting import RolloutProblem, finer, interpolate
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import FAMILIES, build
@@ -129,6 +129,20 @@ def test_covariance_holds_the_noise_of_the_start(plant: Plant) -> None:
     found = errors.var(0)
     assert (found > 1.05 * sensor)[:, :3].mean() > 0.9
     assert np.mean(found / sigma) == pytest.approx(1, abs=0.1)
+
+
+def test_what_bends_with_the_start_is_noise_too(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of f = 3 z + 2 z^2 the variance is 17 for z ~ N(0, 1); a step to one side would say 25, to the other 1."""
+    problem, x = rollouts(plant, logs=1), np.array([DAMPING])
+
+    def bent(plant: Plant, x: np.ndarray, segments: Segments, copies: int) -> np.ndarray:
+        off = segments.qpos - np.concatenate([problem.segments.qpos] * copies)
+        z = off.reshape(copies, len(problem), 1) / problem._start_sd[0]
+        return np.repeat(3 * z + 2 * z**2, len(problem.columns), -1)
+
+    monkeypatch.setattr(problem, "_again", bent)
+    carried = problem._carried(plant, x, np.zeros((len(problem), len(problem.columns))))
+    np.testing.assert_allclose(np.square(carried).sum(0), 17.0, rtol=1e-9)
 
 
 def test_rollouts_of_clean_logs_start_where_the_machine_was(plant: Plant) -> None:

@@ -49,6 +49,7 @@ def test_noise_gain_is_what_a_monte_carlo_finds(points: int) -> None:
     np.testing.assert_allclose(fit.value_gain, fit.value.std(1), rtol=0.03)
     np.testing.assert_allclose(fit.slope_gain, fit.slope.std(1), rtol=0.03)
     assert fit.value_gain[0] > fit.value_gain[3]
+    np.testing.assert_allclose(fit.misfit, 1.0, rtol=0.03)
 
 
 def test_short_signals_lower_the_degree() -> None:

@@ -166,3 +166,19 @@ def test_a_motion_that_no_polynomial_follows_is_taken_as_it_is_measured() -> Non
     np.testing.assert_allclose(states.qvel_sd[:, 6], 1e-4)
     for noise in (None, 0.5):
         assert np.abs(estimate_states(MODEL, _stepping(noise)[0]).qvel[:, 6] - speed).max() > 0.3
+
+
+def test_the_speed_of_a_motion_that_no_cubic_follows_is_known_as_badly_as_the_curve_fits() -> None:
+    """A crank that turns ten radians a second and swings about that six times as fast, measured by its angle alone."""
+    rng, time = np.random.default_rng(1), DT * np.arange(ROWS)
+    angle, speed = 10 * time + 0.5 * np.sin(60 * time), 10 + 30 * np.cos(60 * time)
+
+    def errors(noise: float | None) -> tuple[Array, Array]:
+        channel = Channel(angle + 5e-4 * rng.normal(size=ROWS), "rad", noise)
+        states = estimate_states(MODEL, Log("turns", time, {}, {J + "pos": channel}))
+        return states.qvel[:, 6] - speed, states.qvel_sd[:, 6]
+
+    error, sd = errors(5e-4)
+    cubics, _ = errors(None)
+    assert np.sqrt(np.mean(error**2)) < 0.35 * np.sqrt(np.mean(cubics**2))
+    assert np.mean(np.abs(error) < 3 * sd) > 0.9
