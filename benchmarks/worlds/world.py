@@ -189,6 +189,8 @@ class SingleWorld(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See `gymnasium.Env`."""
         super().reset(seed=seed)
+        if seed is not None:  # its estimates too are then the same, whatever was run before: a mission may be resumed
+            self._noise = self._world.rng(f"estimate {seed}")
         observation, info = self.many.reset(seed=seed, options=options)
         return first(observation), first(info)
 

@@ -221,7 +221,7 @@ class _Run:
         """N simulations of the belief; with pi_h each episode's psi and phi are mean + beta L pi_h."""
         config = self.config
         make = self._imagined(belief if self.cluster is None else portable(belief), hallucinate=config.hallucinate)
-        worlds = spread(make, config.worlds, self.threads, mixed(config.seed, self.t) % 2**31, self.cluster)
+        worlds = spread(make, config.worlds, self.threads, mixed(config.seed, self.t, 4) % 2**31, self.cluster)
         fresh = pi_h_for(self.agent, worlds, mixed(config.seed, self.t, 1))
         if fresh is None or self.pi_h is None or self.pi_h.log_std.shape != fresh.log_std.shape:
             self.pi_h = fresh

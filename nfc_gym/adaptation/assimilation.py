@@ -108,15 +108,22 @@ class Assimilation:
     # ---- `Inference` ----------------------------------------------------------------------------------------------
 
     def infer(self, trajectory: Trajectory) -> Assimilated:
-        """The belief given the whole trajectory.
+        """The belief given the whole trajectory and those that are remembered.
+
+        Where all of them are too short to be cut into segments, as of a robot that fell at once, it is psi's prior.
 
         Raises:
-          InputError: it is shorter than a segment, of another robot, tells no state to start from, or on rough ground
-            neither it nor `ground` says what is underfoot.
+          InputError: it is of another robot, tells no state to start from, or on rough ground neither it nor `ground`
+            says what is underfoot.
         """
+        self._require_own(trajectory)
+        told = [t for t in (*self.remembered, trajectory) if len(t) >= 2 * SHORT]
+        if not told:
+            size = len(self.machine.space)
+            return Assimilated(self.box, np.zeros(size), np.eye(size))
         mujoco.set_mju_user_warning(lambda message: None)  # draws that come apart are left out, not talked about
         most = SEGMENTS // max(1, len(self.remembered))
-        parts = [*(self.segments(earlier, most) for earlier in self.remembered), self.segments(trajectory)]
+        parts = [self.segments(t, SEGMENTS if t is trajectory else most) for t in told]
         rng, seen = np.random.default_rng(self.seed), self.machine.told
         scale = self.machine.noise[seen]
         d = len(self.machine.space) + len(self.structure)
@@ -158,15 +165,14 @@ class Assimilation:
     # ---- inside ---------------------------------------------------------------------------------------------------
 
     def segments(self, trajectory: Trajectory, most: int = SEGMENTS) -> Segments:
-        """Parts of a trajectory, evenly spread."""
+        """Parts of a trajectory, evenly spread, `most` at most.
+
+        Raises:
+          InputError: it is of another robot, has fewer than two parts, or on rough ground there is no map for it.
+        """
         span = SPAN if len(trajectory) >= 2 * SPAN else SHORT
         count = len(trajectory) // span
-        kind = self.machine.kind
-        if trajectory.states.shape[1:] != (kind.proprio_size,) or trajectory.actions.shape[1:] != (kind.action_size,):
-            raise InputError(
-                f"assimilation: states {trajectory.states.shape} and actions {trajectory.actions.shape} are not of "
-                f"{self.environment}: want widths {kind.proprio_size} and {kind.action_size}"
-            )
+        self._require_own(trajectory)
         if count < 2:
             raise InputError(f"assimilation: {len(trajectory)} control steps; want at least {2 * SHORT}")
         at = span * np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
@@ -178,6 +184,15 @@ class Assimilation:
         earlier = given[np.maximum(at[:, None] + np.arange(-EARLIER, 0), 0)]
         last, maps = trajectory.states[at + span], self._grounds(trajectory)
         return Segments(starts, first, trajectory.states[at + 1], last, actions, earlier, maps, hidden)
+
+    def _require_own(self, trajectory: Trajectory) -> None:
+        """Raises `InputError` where a trajectory is of another robot."""
+        kind = self.machine.kind
+        if trajectory.states.shape[1:] != (kind.proprio_size,) or trajectory.actions.shape[1:] != (kind.action_size,):
+            raise InputError(
+                f"assimilation: states {trajectory.states.shape} and actions {trajectory.actions.shape} are not of "
+                f"{self.environment}: want widths {kind.proprio_size} and {kind.action_size}"
+            )
 
     def _grounds(self, trajectory: Trajectory) -> list[Heightfield]:
         """See `Segments.maps`: the likeliest is the first."""

@@ -281,15 +281,22 @@ class _Run:
             raise InputError(f"{world}: its task is {robot.task!r}, the policy's {wanted!r}: say task={wanted!r} there")
 
     def _recall(self, adapted: FineTuning) -> None:
-        """What was judged before an interruption; a world that is a function is judged in anew."""
+        """What was judged before an interruption; a world that is a function is judged in anew.
+
+        Raises:
+          InputError: the file of it is damaged.
+        """
         told = [self.of, asdict(self.config), self.episodes, adapted.curve]
         self._key = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
         file = self.folder / KEPT
         if file.is_file():
-            kept = json.loads(file.read_text(encoding="utf-8"))
-            if kept["of"] == self._key:
-                scores = kept["scores"].items()
-                self.scores = {k: from_plain(s) for k, s in scores if not k.endswith(f"| {TRUE} {_FUNCTION}")}
+            try:
+                kept = json.loads(file.read_text(encoding="utf-8"))
+                of, scores = kept["of"], {k: from_plain(s) for k, s in kept["scores"].items()}
+            except (ValueError, KeyError, TypeError, AttributeError) as e:
+                raise InputError(f"{file}: damaged, or none of this command's ({e}): remove it to judge anew") from None
+            if of == self._key:
+                self.scores = {k: s for k, s in scores.items() if not k.endswith(f"| {TRUE} {_FUNCTION}")}
 
     def say(self, report: Mapping[str, Any]) -> None:
         """The outcome, in a few lines."""

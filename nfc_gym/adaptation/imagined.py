@@ -12,6 +12,7 @@ from nfc_gym.adaptation.worlds import VectorStaggered, vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import PARTS, Fidelity
 from nfc_gym.core.posterior import Sampler
+from nfc_gym.inference.random import mixed
 from nfc_gym.wrappers import (
     VectorApplyEffects,
     VectorHallucinate,
@@ -78,6 +79,7 @@ class _Again:
 # What a belief may have besides the parts of a fidelity: `effects(n, rng)`, and standard deviations of what is sensed.
 EFFECTS, NOISE = "effects", "noise"
 ALL = (*PARTS, EFFECTS, NOISE)
+_EFFECTS = 1  # stream of random numbers: what a simulation lacks is not to go with when its first episode ends
 
 
 def require_parts(wanted: Sequence[str]) -> None:
@@ -122,7 +124,7 @@ def imagined(
       beta: see `Hallucinate`.
       episode: control steps.
       threads: of the physics.
-      seed: of the first episodes' ends.
+      seed: of the first episodes' ends, and of the sizes of effects, which have draws of their own.
       sight: what is seen of them.
       settings: of the environment.
       staggered: first episodes end at different times, as learning wants it; to judge a policy takes whole ones.
@@ -133,7 +135,7 @@ def imagined(
     if "delta_e" in found and envs.unwrapped.rough:  # type: ignore[attr-defined]
         envs = VectorResidualTerrain(envs, Parts(belief, ("delta_e",)))
     moving = tuple(p for p in found if p in ("psi", "delta_s"))
-    acting = getattr(belief, EFFECTS)(n, np.random.default_rng(seed)) if EFFECTS in found else []
+    acting = getattr(belief, EFFECTS)(n, np.random.default_rng(mixed(seed, _EFFECTS))) if EFFECTS in found else []
     if acting:  # each simulation has sizes of its own
         values = [v for _, v in acting]
         envs = VectorApplyEffects(envs, [(e, v.mean(0)) for e, v in acting], values=values)

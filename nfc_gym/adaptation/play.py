@@ -15,7 +15,8 @@ from rich.progress import Progress
 
 from nfc_gym.adaptation.policy import Policy, load_policy
 from nfc_gym.core.errors import InputError, MissingExtra
-from nfc_gym.core.files import require_writable
+from nfc_gym.core.files import replacing, require_writable
+from nfc_gym.core.whole import require_whole
 from nfc_gym.simulate.machine import full_id
 
 VIDEOS, PICTURES = (".mp4", ".avi"), (".png", ".jpg", ".jpeg")
@@ -47,26 +48,18 @@ def play(
         written there.
       MissingExtra: nothing can be rendered here.
     """
+    require_whole("play: episodes", episodes, 1)
+    require_whole("play: seed", seed, 0)
     name, path = full_id(environment), None if out is None else Path(out)
-    if path is not None and path.suffix.lower() not in VIDEOS + PICTURES:
-        raise InputError(f"{path}: want a video ({', '.join(VIDEOS)}) or a picture ({', '.join(PICTURES)})")
     if path is not None:
-        require_writable(path.absolute().parent)
-        if path.is_dir():
-            raise InputError(f"{path} is a folder: name the file to write in it")
+        _require_place(path)
     loaded = load_policy(name if policy is None else policy)
-    look: dict[str, Any] = {} if path is None else {"render_mode": "rgb_array", "width": _SIZE[0], "height": _SIZE[1]}
-    context = ["psi", "elevation"] if loaded.sight.cells else ["psi"]
-    env = gymnasium.make(name, context=context, **look, **loaded.settings(name))
-    loaded.require(env)
-    console = console or Console()
-    found: list[dict[str, Any]] = []
-    steps = env.spec.max_episode_steps if env.spec else None
+    env = _shown(name, loaded, path is not None)
     films = path is not None and path.suffix.lower() in VIDEOS
     every = EVERY_VIDEO if films else EVERY_SHEET
+    console, frames, found = console or Console(), list[Frame](), list[dict[str, Any]]()
     with ExitStack() as stack:
         stack.callback(env.close)
-        frames: list[Frame] = []
         keep: Callable[[Frame], Any] | None = None if path is None else frames.append
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -74,18 +67,42 @@ def play(
             keep = stack.enter_context(film(path))
         bar = stack.enter_context(Progress(*Progress.get_default_columns(), console=console, transient=True))
         for k in range(episodes):
-            task = bar.add_task(f"episode {k}", total=steps)
-            shown = keep if k == 0 or films else None
-            score = episode(env, loaded, seed + k, every, shown, partial(bar.advance, task))
+            task = bar.add_task(f"episode {k}", total=env.spec.max_episode_steps if env.spec else None)
+            score = episode(
+                env, loaded, seed + k, every, keep if k == 0 or films else None, partial(bar.advance, task)
+            )  # fmt: skip
             bar.remove_task(task)
             found.append(score)
             console.print(f"episode {k}: " + ", ".join(f"{key} {value:.4g}" for key, value in score.items()))
-    if path is not None and not films:
-        sheet(path, frames)
     if path is not None:
-        count = sum(-(-score["length"] // every) for score in (found if films else found[:1]))
-        console.print(f"{path}: {count} frames", markup=False, emoji=False)
+        if not films:
+            sheet(path, frames)
+        count = sum(-(-score["length"] // every) for score in found)
+        shown = f"{count} frames" if films else "a dozen moments of episode 0"
+        console.print(f"{path}: {shown}", markup=False, emoji=False)
     return found
+
+
+def _require_place(path: Path) -> None:
+    """Raises `InputError` where a video or a picture cannot be written."""
+    if path.suffix.lower() not in VIDEOS + PICTURES:
+        raise InputError(f"{path}: want a video ({', '.join(VIDEOS)}) or a picture ({', '.join(PICTURES)})")
+    require_writable(path.absolute().parent)
+    if path.is_dir():
+        raise InputError(f"{path} is a folder: name the file to write in it")
+
+
+def _shown(name: str, policy: Policy, pictures: bool) -> gymnasium.Env:
+    """The environment on the policy's task, with the context that it looks at, that renders where `pictures` are taken.
+
+    Raises:
+      InputError: the policy does not fit it.
+    """
+    look: dict[str, Any] = {"render_mode": "rgb_array", "width": _SIZE[0], "height": _SIZE[1]} if pictures else {}
+    context = ["psi", "elevation"] if policy.sight.cells else ["psi"]
+    env = gymnasium.make(name, context=context, **look, **policy.settings(name))
+    policy.require(env)
+    return env
 
 
 def episode(
@@ -137,9 +154,20 @@ def film(path: Path) -> Iterator[Callable[[Frame], Any]]:
 
 
 def sheet(path: Path, frames: list[Frame]) -> None:
-    """A dozen moments, evenly spread, from left to right and from top to bottom."""
+    """Write a dozen moments, evenly spread, from left to right and from top to bottom.
+
+    Args:
+      path: of the picture; what was there stays until the whole of it is.
+      frames: one or more, each (height, width, 3) RGB.
+
+    Raises:
+      InputError: no picture of this kind can be made here.
+    """
     rows, columns = _SHEET
     chosen = [frames[round(k)] for k in np.linspace(0, len(frames) - 1, rows * columns)]
     whole = np.concatenate([np.concatenate(chosen[r * columns : (r + 1) * columns], 1) for r in range(rows)], 0)
-    if not cv2.imwrite(str(path), cv2.cvtColor(whole, cv2.COLOR_RGB2BGR)):
-        raise InputError(f"{path}: cannot be written")
+    made, picture = cv2.imencode(path.suffix.lower(), cv2.cvtColor(whole, cv2.COLOR_RGB2BGR))
+    if not made:
+        raise InputError(f"{path}: no picture of this kind can be made here; try .png")
+    with replacing(path) as part:
+        part.write_bytes(picture.tobytes())

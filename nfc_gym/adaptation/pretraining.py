@@ -7,12 +7,14 @@ in psi explains.
 """
 
 import math
+import shlex
 import sys
 import time
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from nfc_gym.adaptation.network import ActorCritic, Sizes, hidden_of
 from nfc_gym.adaptation.policy import Policy, check_suffix, load_policy, taught
 from nfc_gym.adaptation.ppo import ONWARD, Diverged, OnPolicy, PPOConfig, clipped
 from nfc_gym.adaptation.record import Episodes, Record, in_words
+from nfc_gym.adaptation.settings import require_number
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.threads import limit_threads
 from nfc_gym.adaptation.weights import of_weights
@@ -35,6 +38,7 @@ from nfc_gym.adaptation.worlds import robot_of, training_env, vector_env
 from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError, NfcError
 from nfc_gym.core.files import require_writable
+from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.jobs import device_of
 from nfc_gym.inference.random import mixed
 from nfc_gym.simulate.machine import full_id
@@ -105,10 +109,11 @@ class Training:
     task: str | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.spread < 1:
-            raise InputError(
-                f"--spread {self.spread:g}: psi is drawn strictly inside the prior, want a share in [0, 1)"
-            )
+        for name, least in (("seed", 0), ("envs", 1), ("horizon", 0)):
+            object.__setattr__(self, name, require_whole(f"pretrain: {name}", getattr(self, name), least))
+        if not isinstance(self.spread, Real) or not 0 <= self.spread < 1:
+            raise InputError(f"--spread {self.spread}: psi is drawn strictly inside the prior, want a share in [0, 1)")
+        object.__setattr__(self, "spread", float(self.spread))
         hidden_of(self.net)
         if self.horizon == 0:
             object.__setattr__(self, "horizon", min(max(_TOGETHER // self.envs, 16), 64))
@@ -167,6 +172,9 @@ def pretrain(
     check_suffix(path)
     kinds.require_kind(path, kinds.POLICY)
     require_writable(path.absolute().parent)
+    require_whole("pretrain: steps", steps, 1)
+    if seconds is not None:
+        require_number("pretrain: seconds", seconds, 0)
     training = Training(
         environment=full_id(environment), seed=seed, envs=envs, horizon=horizon, net=net, spread=spread, task=task
     )
@@ -328,7 +336,7 @@ class Run:
             "training": asdict(self.training), "ppo": asdict(self.recipe.ppo), "episode": self.recipe.episode,
             "started_from": self.started, "steps": self.steps, "seconds": round(self.elapsed, 1), "nominal": score,
             "device": self.device.type,
-            "command": " ".join(["nfc-gym", *sys.argv[1:]]) if sys.argv[0].endswith("nfc-gym") else None,
+            "command": shlex.join(["nfc-gym", *sys.argv[1:]]) if sys.argv[0].endswith("nfc-gym") else None,
         } | ({"diverged": diverged} if diverged else {})  # fmt: skip
         self.policy.save(path)
         self.record.say(f"{path}: in the nominal world {in_words(score)}; {self.elapsed:.0f} s of training")

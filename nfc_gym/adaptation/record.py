@@ -2,6 +2,7 @@
 
 import logging
 from collections import deque
+from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -70,23 +71,32 @@ class Record:
     """Scalars by step into CSV files, into TensorBoard where that is installed, and on one line of the terminal.
 
     Args:
-      folder: of the files; None writes none.
+      folder: of the files, made with the first values: what is refused before them leaves nothing. None writes none.
       console: None says nothing.
     """
 
     def __init__(self, folder: Path | None, console: Console | None) -> None:
         logging.getLogger("torchrl").setLevel(logging.WARNING)  # the size of each buffer is no news
-        self.console = console
-        self._loggers: list[Logger] = []
-        if folder is not None:
-            self._loggers.append(CSVLogger("csv", log_dir=str(folder)))
-            if find_spec("tensorboard") is not None:
-                self._loggers.append(TensorboardLogger("tensorboard", log_dir=str(folder)))
-            else:
-                self.say("no TensorBoard here, the curves go into CSV files alone: pip install tensorboard")
+        self.folder, self.console = folder, console
+
+    @cached_property
+    def _loggers(self) -> list[Logger]:
+        if self.folder is None:
+            return []
+        kept: list[Logger] = [CSVLogger("csv", log_dir=str(self.folder))]
+        if find_spec("tensorboard") is not None:
+            kept.append(TensorboardLogger("tensorboard", log_dir=str(self.folder)))
+        else:
+            self.say("no TensorBoard here, the curves go into CSV files alone: pip install tensorboard")
+        return kept
 
     def scalars(self, step: int, values: dict[str, float]) -> None:
-        """Write values down."""
+        """Write values down.
+
+        Args:
+          step: at which they are, on the axis of the curves.
+          values: by name; a name with `/` in it goes into a folder.
+        """
         for logger in self._loggers:
             for name, value in values.items():
                 logger.log_scalar(name, value, step=step)

@@ -513,3 +513,24 @@ def test_actors_that_want_more_than_an_observation_are_refused_by_name() -> None
     agent = Agent(recurrent, lambda *_: None, Sight.of(world()))  # type: ignore[arg-type,return-value]
     with pytest.raises(InputError, match=r"the actor wants 'h', 'is_init', .*recurrent"):
         adapt(agent, world(), belief(), Alarm(None))
+
+
+def test_what_is_imagined_has_other_draws_than_what_is_executed(jackal: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+
+    class Asked(Exception):
+        pass
+
+    def asked(*_: Any, seed: int, **__: Any) -> Any:
+        seeds.append(seed)
+        raise Asked
+
+    class Told(gym.Wrapper):
+        def reset(self, *, seed: int | None = None, **how: Any) -> Any:
+            seeds.append(-1 if seed is None else seed)
+            return self.env.reset(seed=seed, **how)
+
+    monkeypatch.setattr("nfc_gym.adaptation.algorithm.imagined", asked)
+    with pytest.raises(Asked):
+        adapt(ppo_agent(load_policy(jackal)), Told(world()), belief(), Alarm(5), config=CONFIG, threads=1)
+    assert len(set(seeds)) == len(seeds) == 2

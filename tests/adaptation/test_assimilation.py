@@ -81,8 +81,10 @@ def test_a_heavy_rover_with_a_lost_axle_is_found_out() -> None:
 def test_a_trajectory_of_another_robot_is_refused() -> None:
     with pytest.raises(InputError, match="not of nfc_gym/AntFlat-v0"):
         Assimilation("nfc_gym/AntFlat-v0").infer(driven({}, 20))
+    with pytest.raises(InputError, match="not of nfc_gym/AntFlat-v0"):
+        Assimilation("nfc_gym/AntFlat-v0").infer(driven({}, 5))
     with pytest.raises(InputError, match="at least 10"):
-        Assimilation("nfc_gym/JackalFlat-v0").infer(driven({}, 7))
+        Assimilation("nfc_gym/JackalFlat-v0").segments(driven({}, 7))
     with pytest.raises(InputError, match="is a plane and has no `ground`"):
         Assimilation("nfc_gym/JackalFlat-v0", ground=Heightfield(np.zeros((256, 256))))
     with pytest.raises(InputError, match="map_error is -1"):
@@ -101,3 +103,22 @@ def test_however_far_beyond_the_prior_all_that_is_believed_is_possible(place: st
     assert (q.box.high > space.high).any()
     z = np.random.default_rng(0).standard_normal((200, len(space))) * 4
     space.require_possible(q.box.psi(z))
+
+
+def test_of_a_robot_that_fell_at_once_the_prior_is_believed() -> None:
+    infers = Assimilation("JackalFlat", delta_s=False, effects=False)
+    fell = driven({}, 6)
+    belief = infers.infer(fell)
+    space = infers.machine.space
+    drawn = belief.sample(4000, np.random.default_rng(0)).psi
+    assert drawn is not None
+    np.testing.assert_allclose(drawn.mean(0), (space.low + space.high) / 2, atol=0.02 * (space.high - space.low).max())
+    assert belief.effects(3, np.random.default_rng(0)) == []
+    assert belief.noise is None
+
+
+def test_what_is_too_short_to_be_replayed_changes_no_belief() -> None:
+    infers = Assimilation("JackalFlat", delta_s=False, effects=False)
+    whole, fell = driven({"base_mass": 25.0}), driven({}, 6)
+    want = infers.infer(whole)
+    np.testing.assert_array_equal(infers.updated(fell, want).infer(whole).mean, want.mean)

@@ -293,3 +293,11 @@ def test_the_best_point_is_kept(result: Path) -> None:
     tuning = object.__new__(FineTuning)
     tuning.curve = [{"return": {"mean": m}} for m in (1.0, 3.0, 2.0)]
     assert tuning.kept == 1
+
+
+@pytest.mark.parametrize("text", ["{broken", "[]", '{"of": "x", "scores": {"a": 3}}'])
+def test_a_damaged_file_of_what_was_judged_is_named(tmp_path: Path, result: Path, jackal: Path, text: str) -> None:
+    handed(result, tmp_path / "out", jackal, steps=512)
+    (tmp_path / "out" / "judged.json").write_text(text)
+    with pytest.raises(InputError, match=r"judged\.json: damaged, or none of this command's .*remove it to judge anew"):
+        handed(result, tmp_path / "out", jackal, steps=512)

@@ -82,3 +82,18 @@ def test_parts_that_will_never_be_spoken_of_are_refused_at_once(
     with pytest.raises(InputError, match=told):
         require_spoken(posterior(), wanted)
     require_spoken(posterior(), (*wanted, "psi"))
+
+
+def test_sizes_of_effects_are_drawn_apart_from_when_first_episodes_end() -> None:
+    drawn: list[np.ndarray] = []
+
+    def effects(n: int, rng: np.random.Generator) -> list[Any]:
+        drawn.append(rng.integers(1, 51, n))
+        return []
+
+    belief: Any = SimpleNamespace(sample=Valley().sample, effects=effects)
+    made: Any = imagined(ID, belief, 8, hallucinate=False, parts=("psi", "effects"), beta=1.0, episode=50, threads=1,
+                         seed=5)  # fmt: skip
+    made.reset(seed=0)
+    assert (drawn[0] != made.env._left).any()
+    made.close()

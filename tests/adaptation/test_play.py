@@ -32,6 +32,23 @@ def test_a_sheet_shows_a_dozen_moments_in_their_order(tmp_path: Path) -> None:
     assert (np.diff(tiles.astype(int)) > 0).all()
 
 
+def test_a_sheet_that_cannot_be_made_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "sheet.png").write_text("before")
+    monkeypatch.setattr(Path, "write_bytes", lambda *_: (_ for _ in ()).throw(OSError("the disk is full")))
+    with pytest.raises(OSError, match="the disk is full"):
+        sheet(tmp_path / "sheet.png", [np.zeros((6, 8, 3), np.uint8)])
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["before"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [({"episodes": 0}, "episodes is 0, want a whole number, 1 or more"), ({"seed": -1}, "seed is -1, want a whole")],
+)
+def test_episodes_that_cannot_be_are_named(jackal: Path, wrong: dict[str, int], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        play.play("JackalFlat", jackal, **wrong)
+
+
 def test_a_video_plays_in_real_time(tmp_path: Path) -> None:
     with film(tmp_path / "v.mp4") as keep:
         for k in range(50):

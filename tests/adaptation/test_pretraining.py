@@ -246,3 +246,28 @@ def test_what_was_measured_of_other_weights_is_not_said_of_these(tmp_path: Path)
     assert other["before"]["nominal"] == same["nominal"]
     assert other["before"]["weights"] == same["weights"] != other["weights"]
     assert other["training"] == same["training"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"steps": 0}, "steps is 0, want a whole number, 1 or more"),
+        ({"steps": 1.5}, "steps is 1.5, want a whole number"),
+        ({"envs": 0}, "envs is 0, want a whole number, 1 or more"),
+        ({"seed": -1}, "seed is -1, want a whole number, 0 or more"),
+        ({"horizon": -1}, "horizon is -1, want a whole number, 0 or more"),
+        ({"threads": -1}, "threads is -1, want a whole number, 0 or more"),
+        ({"seconds": float("nan")}, "seconds is nan; want a number, 0 or more"),
+        ({"spread": "a"}, "--spread a: psi is drawn strictly inside the prior"),
+    ],
+)
+def test_numbers_that_cannot_be_are_named(tmp_path: Path, wrong: dict, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        pretrain("JackalFlat", tmp_path / "p.safetensors", **({"steps": 100, **SMALL} | wrong))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_is_refused_leaves_nothing(tmp_path: Path, jackal: Path) -> None:
+    with pytest.raises(InputError, match="start: a policy of nfc_gym/JackalFlat-v0"):
+        pretrain("AntFlat", tmp_path / "p.safetensors", steps=100, start=jackal, **SMALL)
+    assert not list(tmp_path.iterdir())

@@ -182,6 +182,23 @@ def test_a_world_that_there_is_not_is_refused(place: str, scenario: str, said: s
         World(place, scenario, 0)
 
 
+def test_estimates_of_an_episode_are_the_same_whatever_was_run_before() -> None:
+    """A mission that is resumed sees what one without an interruption sees."""
+    from worlds.world import World
+
+    found = []
+    for before in (0, 2):
+        world = World("JackalFlat", "axle", 0).single(context=["psi"])
+        for k in range(before):
+            world.reset(seed=k)
+            assert world.data.qpos.size
+        world.reset(seed=7)
+        found.append(np.concatenate([world.data.qpos, world.data.qvel]))
+    np.testing.assert_array_equal(*found)
+    world.reset(seed=8)
+    assert (world.data.qpos[:3] != found[0][:3]).any()
+
+
 def test_a_state_is_estimated_in_the_terms_of_the_model_that_is_known() -> None:
     from worlds.machines import ROBOTS
     from worlds.world import World
