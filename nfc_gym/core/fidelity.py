@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import real_array
 
 Array = NDArray[np.float64]
 PARTS = ("psi", "delta_s", "delta_e")
@@ -16,12 +17,9 @@ _TRAILING = {"psi": 1, "delta_s": 1, "delta_e": 2}
 
 def _numbers(part: str, value: Any) -> Array:
     """A part as an array; text, flags and complex numbers raise `InputError`."""
-    try:
-        given = np.asarray(value)
-        if given.dtype.kind in "fiuO":
-            return given.astype(float, copy=False)
-    except (TypeError, ValueError, OverflowError):
-        pass
+    given = real_array(value)
+    if given is not None:
+        return given
     text = repr(value)
     raise InputError(f"fidelity: {part} is {text if len(text) <= 80 else text[:77] + '...'}, want an array of numbers")
 

@@ -5,7 +5,7 @@ of the base. Between grid points it is bilinear (what a mapping node that resamp
 the collision surface of `Heightfield.height` by at most a quarter of a cell's twist. Beyond the edge it repeats that.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import real_array
 from nfc_gym.terrain.heightfield import Heightfield
 
 SIZE = 128  # cells a side
@@ -91,7 +92,9 @@ class Cells:
 
 def _checked(xyz: ArrayLike, yaw: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Positions (..., 3) and headings (...)."""
-    base, heading = np.asarray(xyz, np.float64), np.asarray(yaw, np.float64)
+    base, heading = real_array(xyz), real_array(yaw)
+    if base is None or heading is None:
+        raise InputError(f"xyz is {xyz!r} and yaw {yaw!r}; want arrays of numbers")
     if base.shape != (*heading.shape, 3):
         raise InputError(f"xyz has shape {base.shape} and yaw {heading.shape}; want (..., 3) and (...)")
     if not (np.isfinite(base).all() and np.isfinite(heading).all()):
@@ -104,6 +107,8 @@ def _look(
 ) -> None:
     """Write maps (count, rows, columns), whose cells `grid` (3, 3) takes to (j, i) of the elevation map."""
     count = heading.size
+    if not isinstance(heightfield, Heightfield | Iterable):
+        raise InputError(f"heightfield is {heightfield!r}; want a Heightfield, or a sequence of them")
     fields = [heightfield] * count if isinstance(heightfield, Heightfield) else list(heightfield)
     if len(fields) != count:
         raise InputError(f"{len(fields)} heightfields for {count} robots; want one for all or one each")

@@ -1,8 +1,12 @@
 """Terrains by name: one map, a field of obstacles, or a pool of maps."""
 
+from numbers import Integral
+from typing import Any
+
 import numpy as np
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import is_number, real_array
 from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield
 from nfc_gym.terrain.kinds import BLEND, SINGLE, TILE, Array, Grid
 from nfc_gym.terrain.towers import towers
@@ -62,8 +66,16 @@ def obstacles(
       difficulty, seed, shape, resolution, spawn, scale: as for `make`; the free start has radius `spawn`.
       goal: world x and y [m] around which a disc of radius `spawn` stays free.
       corridor: width of the free passage from the middle to the goal [m]; 0 is none.
+
+    Raises:
+      InputError: an argument outside the above, or a corridor without a goal.
     """
     rng, grid = _prepare(difficulty, seed, shape, resolution, spawn, scale)
+    place = real_array((0.0, 0.0) if goal is None else goal)
+    if place is None or place.shape != (2,) or not np.isfinite(place).all():
+        raise InputError(f"goal {goal!r}: want the world x and y in metres")
+    if not is_number(corridor) or corridor < 0:
+        raise InputError(f"corridor {corridor!r}: want a width in metres, 0 or more")
     return Heightfield(towers(rng, grid, difficulty, goal, corridor), resolution)
 
 
@@ -84,11 +96,16 @@ def pool(
       seed: non-negative.
       difficulty: of all, or (from, to) to spread it evenly over the pool.
       kind, shape, resolution, spawn, scale: as for `make`.
+
+    Raises:
+      InputError: an argument outside the above.
     """
-    if size < 1:
+    if isinstance(size, bool) or not isinstance(size, Integral) or size < 1:
         raise InputError(f"size {size!r}: a pool has at least one map")
-    low, high = difficulty if isinstance(difficulty, tuple | list) else (difficulty, difficulty)
-    levels = np.linspace(low, high, size)
+    ends = difficulty if isinstance(difficulty, tuple | list) else (difficulty, difficulty)
+    if len(ends) != 2 or not all(is_number(end) and 0 <= end <= 1 for end in ends):
+        raise InputError(f"difficulty {difficulty!r}: want a number from 0 (flat) to 1, or two of them")
+    levels = np.linspace(*ends, size)
     seeds = [int(np.random.SeedSequence([_seed(seed), k]).generate_state(1)[0]) for k in range(size)]
     return [
         make(kind, float(level), each, shape, resolution, spawn, scale)
@@ -99,20 +116,24 @@ def pool(
 def _prepare(
     difficulty: float, seed: int, shape: tuple[int, int], resolution: float, spawn: float, scale: float
 ) -> tuple[np.random.Generator, Grid]:
-    if not 0 <= difficulty <= 1:
+    if not is_number(difficulty) or not 0 <= difficulty <= 1:
         raise InputError(f"difficulty {difficulty!r}: want a number from 0 (flat) to 1")
-    if len(shape) != 2 or min(shape) < 2:
+    if not _pair(shape) or not all(is_number(n) and n == int(n) and n >= 2 for n in shape):
         raise InputError(f"shape {shape!r}: want (nrow, ncol), both at least 2")
     for name, value in (("resolution", resolution), ("scale", scale)):
-        if not (np.isfinite(value) and value > 0):
+        if not is_number(value) or value <= 0:
             raise InputError(f"{name} {value!r}: want a number above 0")
-    if not (np.isfinite(spawn) and spawn >= 0):
+    if not is_number(spawn) or spawn < 0:
         raise InputError(f"spawn {spawn!r}: want a radius in metres, 0 or more")
     return np.random.default_rng(_seed(seed)), Grid((int(shape[0]), int(shape[1])), resolution, spawn, scale)
 
 
+def _pair(value: Any) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2
+
+
 def _seed(seed: int) -> int:
-    if not isinstance(seed, int | np.integer) or seed < 0:
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError(f"seed {seed!r}: want an integer, 0 or more")
     return int(seed)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import is_number, real_array
 
 Array = NDArray[np.float64]
 
@@ -37,17 +38,22 @@ class Heightfield:
     def __init__(
         self, heights: ArrayLike, resolution: float = RESOLUTION, origin: tuple[float, float] | None = None
     ) -> None:
-        grid = np.array(heights, np.float32, order="C")
+        given = real_array(heights)
+        if given is None:
+            text = repr(heights)
+            raise InputError(f"heights are {text if len(text) <= 80 else text[:77] + '...'}; want an array of numbers")
+        grid = np.array(given, np.float32, order="C")
         if grid.ndim != 2 or min(grid.shape) < 2:
             raise InputError(f"heights have shape {grid.shape}; want (nrow, ncol), both at least 2")
         if not np.isfinite(grid).all():
             row, col = np.argwhere(~np.isfinite(grid))[0]
             raise InputError(f"heights[{row}, {col}] is {grid[row, col]}; want finite heights in metres")
-        if not (np.isfinite(resolution) and resolution > 0):
+        if not is_number(resolution) or resolution <= 0:
             raise InputError(f"resolution {resolution!r}: want metres a cell, above 0")
         if origin is None:
             origin = (-0.5 * (grid.shape[1] - 1) * resolution, -0.5 * (grid.shape[0] - 1) * resolution)
-        if len(origin) != 2 or not np.isfinite(origin).all():
+        place = real_array(origin)
+        if place is None or place.shape != (2,) or not np.isfinite(place).all():
             raise InputError(f"origin {origin!r}: want the world x and y of heights[0, 0] in metres")
         grid.flags.writeable = False
         object.__setattr__(self, "heights", grid)
@@ -78,11 +84,14 @@ class Heightfield:
 
         Returns:
           (...) [m].
+
+        Raises:
+          InputError: what is given are no points, or not finite.
         """
-        return surface(self.heights, xy, self.resolution, self.origin)[0]
+        return surface(self.heights, _points(xy), self.resolution, self.origin)[0]
 
     def height_at(self, x: float, y: float) -> float:
-        """`height` of one point, to the same bits, in a tenth of the time."""
+        """`height` of one point, two finite numbers, to the same bits, in a tenth of the time."""
         nrow, ncol = self.heights.shape
         right = min(max((x - self.origin[0]) / self.resolution, 0.0), ncol - 1.0)
         up = min(max((y - self.origin[1]) / self.resolution, 0.0), nrow - 1.0)
@@ -103,10 +112,23 @@ class Heightfield:
 
         Returns:
           (..., 3) unit vectors.
+
+        Raises:
+          InputError: what is given are no points, or not finite.
         """
-        _, slope_x, slope_y = surface(self.heights, xy, self.resolution, self.origin)
+        _, slope_x, slope_y = surface(self.heights, _points(xy), self.resolution, self.origin)
         normal = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)], axis=-1)
         return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def _points(xy: ArrayLike) -> Array:
+    """(..., 2) points; what is none raises `InputError`."""
+    points = real_array(xy)
+    if points is None or points.shape[-1:] != (2,) or not np.isfinite(points).all():
+        text = repr(xy)
+        shown = text if len(text) <= 80 else f"{text[:77]}..."
+        raise InputError(f"xy is {shown}; want finite world points (..., 2) in metres")
+    return points
 
 
 def surface(

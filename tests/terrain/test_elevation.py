@@ -96,6 +96,10 @@ def test_what_does_not_fit_is_refused() -> None:
         elevation(heightfield, (0, 0), 0.0)
     with pytest.raises(InputError, match="finite"):
         elevation(heightfield, (0, np.nan, 0), 0.0)
+    with pytest.raises(InputError, match=r"xyz is 'abc' and yaw 0\.0; want arrays of numbers"):
+        elevation(heightfield, "abc", 0.0)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="heightfield is None; want a Heightfield"):
+        elevation(None, (0, 0, 0), 0.0)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="1 heightfields for 2 robots"):
         elevation([heightfield], np.zeros((2, 3)), np.zeros(2))
     with pytest.raises(InputError, match="out is float64"):

@@ -130,6 +130,13 @@ def test_goal_and_corridor_stay_free() -> None:
         (("hills", 0.5, 0), "'hills'.*rough, slopes"),
         (("rough", 1.5, 0), "difficulty 1.5"),
         (("rough", float("nan"), 0), "difficulty nan"),
+        (("rough", "hard", 0), "difficulty 'hard': want a number from 0"),
+        (("rough", True, 0), "difficulty True: want a number from 0"),
+        (("rough", 0.5, True), "seed True"),
+        (("rough", 0.5, 0, 9), r"shape 9: want \(nrow, ncol\)"),
+        (("rough", 0.5, 0, (9.5, 9)), r"shape \(9.5, 9\): want \(nrow, ncol\)"),
+        (("rough", 0.5, 0, (9, 9), "fine"), "resolution 'fine': want a number above 0"),
+        (("rough", 0.5, 0, (9, 9), 0.1, "wide"), "spawn 'wide': want a radius"),
         (("rough", 0.5, -1), "seed -1"),
         (("rough", 0.5, 0.5), "seed 0.5"),
         (("rough", 0.5, 0, (1, 9)), r"shape \(1, 9\)"),
@@ -146,6 +153,16 @@ def test_arguments_out_of_range_are_refused(arguments: tuple, message: str) -> N
 def test_other_refusals() -> None:
     with pytest.raises(InputError, match="size 0"):
         pool(0, 0, 0.5)
+    with pytest.raises(InputError, match="size 'all'"):
+        pool("all", 0, 0.5)  # type: ignore[arg-type]
+    for wrong in ("hard", (0.1, 2.0), (0.1, 0.2, 0.3)):
+        with pytest.raises(InputError, match=r"difficulty .*: want a number from 0 \(flat\) to 1, or two of them"):
+            pool(2, 0, wrong)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"corridor -1.0: want a width"):
+        obstacles(0.5, 0, goal=(5.0, 0.0), corridor=-1.0)
+    for wrong in ("east", (1.0,), (np.nan, 0.0), 5):
+        with pytest.raises(InputError, match=r"goal .*: want the world x and y"):
+            obstacles(0.5, 0, goal=wrong)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="corridor"):
         obstacles(0.5, 0, corridor=1.0)
 

@@ -125,6 +125,14 @@ def test_a_pool_serves_one_geom() -> None:
         np.testing.assert_allclose(rays(model, xy)[:, 0], heightfield.height(xy), atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("xy", [(np.nan, 0.0), 5, "ab", np.zeros(3), [[0.0, 0.0], [np.inf, 0.0]]])
+def test_what_is_no_point_is_refused(xy: object) -> None:
+    heightfield = make("rough", 0.5, 0, shape=(16, 16))
+    for ask in (heightfield.height, heightfield.normal):
+        with pytest.raises(InputError, match=r"xy is .*; want finite world points \(\.\.\., 2\)"):
+            ask(xy)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("heights", "resolution", "origin", "message"),
     [
@@ -132,6 +140,11 @@ def test_a_pool_serves_one_geom() -> None:
         (np.zeros((1, 5)), 0.1, None, "at least 2"),
         ([[0, np.nan], [0, 0]], 0.1, None, r"heights\[0, 1\] is nan"),
         (np.zeros((2, 2)), 0.0, None, "resolution 0.0"),
+        (np.zeros((2, 2)), "fine", None, "resolution 'fine'"),
+        ("flat", 0.1, None, "heights are 'flat'; want an array of numbers"),
+        ([[1, 2], [3]], 0.1, None, r"heights are \[\[1, 2\], \[3\]\]; want"),
+        (np.zeros((2, 2), complex), 0.1, None, "(?s)heights are array.*; want an array of numbers"),
+        (np.zeros((2, 2)), 0.1, 5, "origin 5: want the world x and y"),
         (np.zeros((2, 2)), 0.1, (0, np.inf), "origin"),
     ],
 )
