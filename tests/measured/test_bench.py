@@ -148,6 +148,21 @@ def test_what_nothing_drives_has_candidates_too(build: Build, machine: str) -> N
     assert "coulomb:hinge" in [e.id for e in candidates(bench, dataset.logs)]
 
 
+def test_names_with_colons_are_measured_and_known(build: Build, machine: str) -> None:
+    """`robot0:hinge`, as gymnasium-robotics names them: everything is sized and led as under another name."""
+    residuals = []
+    for name in ("hinge", "robot0:hinge"):
+        bob = name.replace("hinge", "bob")
+        model = machine.replace('"hinge"', f'"{name}"').replace('"bob"', f'"{bob}"')
+        known = f'known:\n  - {{field: dof_damping, of: "{name}", column: worn}}\nchannels:'
+        edits = [("joint:hinge", f"joint:{name}"), ("[bob]", f'["{bob}"]'), ("channels:", known)]
+        dataset = require(build(lambda table: table.update(worn=0.01 + 0.001 * table["t"]), *edits, model=model))[0]
+        bench = make_bench(dataset, 1)
+        assert f"sensor_bias:joint:{name}:pos" in [e.id for e in candidates(bench, dataset.logs)]
+        residuals.append(bench.problem(dataset.logs, 4).residual(bench.plant, bench.plant.null))
+    np.testing.assert_array_equal(*residuals)
+
+
 def test_roll_outs_of_a_model_that_sleeps_are_awake(build: Build, machine: str) -> None:
     """MuJoCo lets no batch begin anywhere with sleep on; where nothing sleeps the motion is the same, to the bit."""
     flag = '<option><flag sleep="enable"/></option><worldbody>'

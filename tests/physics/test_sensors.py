@@ -7,7 +7,7 @@ from machines import make
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.saved import from_row
-from nfc_gym.physics.effects.sensors import true_state, unit_of
+from nfc_gym.physics.effects.sensors import Place, resolve_channel, true_state, unit_of
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate_back, vector_to_quat
 
 MODEL = mujoco.MjModel.from_xml_string("""
@@ -34,6 +34,20 @@ def test_bias_and_gain_are_affine() -> None:
     effect, theta = _bound("sensor_bias", "sensor:gyro", {"x": 0.1, "y": 0.2, "z": 0.3})
     three = RNG.normal(size=(4, 20, 3))
     np.testing.assert_allclose(effect.sense("sensor:gyro", three, theta, DT), three + np.array([0.1, 0.2, 0.3]))
+
+
+def test_names_may_hold_colons() -> None:
+    """As of gymnasium-robotics' Fetch, `robot0:torso_lift_joint`."""
+    model = mujoco.MjModel.from_xml_string("""
+<mujoco><worldbody><body name="r:base"><freejoint/><geom size=".1"/><site name="imu"/></body>
+<body><joint name="r:lift" type="slide"/><geom size=".1"/></body></worldbody>
+<sensor><gyro name="r:gyro" site="imu"/></sensor>
+<actuator><motor name="r:motor" joint="r:lift"/></actuator></mujoco>""")
+    assert resolve_channel(model, "joint:r:lift:vel") == Place("joint", "vel", 1, 7, 6)
+    assert resolve_channel(model, "body:r:base:angvel@body") == Place("body", "angvel@body", 3, 0, 0)
+    assert resolve_channel(model, "sensor:r:gyro").dim == 3
+    assert resolve_channel(model, "force:r:motor").dim == 1
+    assert unit_of(model, "joint:r:lift:vel") == "m/s"
 
 
 @pytest.mark.parametrize(

@@ -39,10 +39,18 @@ class Place:
     v: int | None = None
 
 
+def _apart(channel: str) -> tuple[str, str, str]:
+    """Kind, object and quantity of a channel; names may hold colons (`joint:robot0:knee:pos`)."""
+    kind, _, rest = channel.partition(":")
+    if kind not in ("joint", "body") or ":" not in rest:
+        return kind, rest, ""
+    name, _, quantity = rest.rpartition(":")
+    return kind, name, quantity
+
+
 def resolve_channel(model: mujoco.MjModel, channel: str) -> Place:
     """Width and place in the state of a channel; an unknown object raises `InputError`."""
-    kind, _, rest = channel.partition(":")
-    name, _, quantity = rest.partition(":")
+    kind, name, quantity = _apart(channel)
     if kind == "joint":
         joint = object_id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
         return Place(kind, quantity, 1, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
@@ -66,7 +74,7 @@ def unit_of(model: mujoco.MjModel, channel: str) -> str:
     at = resolve_channel(model, channel)
     quantity = at.quantity.partition("@")[0]
     if at.kind == "joint":
-        joint = object_id(model, mujoco.mjtObj.mjOBJ_JOINT, channel.split(":")[1])
+        joint = object_id(model, mujoco.mjtObj.mjOBJ_JOINT, _apart(channel)[1])
         slides = int(model.jnt_type[joint]) == _SLIDE
         return (_OF_SLIDE if slides else _OF_HINGE).get(quantity, "1")
     return _OF_BODY.get(quantity, "1") if at.kind == "body" else "1"
