@@ -56,6 +56,10 @@ def test_jackals_actions_are_forward_speed_and_yaw_rate() -> None:
     for _ in range(100):
         obs, *_ = env.step([0.0, 0.5])
     assert obs["proprio"][9] > 0.8, "turns left; skid steering gives less than the 2 rad/s of wheels that grip"
+    for turn, rate in ((0.5, 1.2), (1.0, 2.6)):  # what docs/environments.md says of a turn on the spot
+        env.reset(seed=0)
+        rates = [env.step([0.0, turn])[0]["proprio"][9] for _ in range(150)]
+        assert np.mean(rates[50:]) == pytest.approx(rate, abs=0.05)
 
 
 def test_a_jackal_that_tips_or_leaves_the_map_ends() -> None:
