@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import require_share
 from nfc_gym.inference.random import mixed
 
 Batch = dict[str, Tensor]
@@ -103,8 +104,8 @@ class TensorWindows:
         return states + self.noise.to(states) * drawn
 
     def split(self, share: float) -> tuple["TensorWindows", "TensorWindows"]:
-        """The first windows, and the last `share` of them: to train on and to hold out."""
-        cut = len(self) - max(1, round(share * len(self)))
+        """The first windows, and the last `share` of them: to train on and to hold out; errors as of `cut_at`."""
+        cut = cut_at(len(self), share)
         first, last = ({k: t[part] for k, t in self.tensors.items()} for part in (slice(cut), slice(cut, None)))
         return self._like(first), self._like(last)
 
@@ -164,8 +165,8 @@ class StoredWindows:
             yield {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
 
     def split(self, share: float) -> tuple["StoredWindows", "StoredWindows"]:
-        """The first windows, and the last `share` of them: to train on and to hold out."""
-        cut = len(self) - max(1, round(share * len(self)))
+        """The first windows, and the last `share` of them: to train on and to hold out; errors as of `cut_at`."""
+        cut = cut_at(len(self), share)
         return self._of(self.rows[:cut]), self._of(self.rows[cut:])
 
     def apart(self, n: int, seed: int) -> tuple["StoredWindows", "StoredWindows"]:
@@ -178,9 +179,29 @@ class StoredWindows:
         return StoredWindows(self.stored, rows, self.maps, self.noise)
 
 
+def cut_at(windows: int, share: float) -> int:
+    """How many windows are left to train on where a share of them is held out, one at least.
+
+    Raises:
+      InputError: the share is none, or leaves no window.
+    """
+    require_share("windows: the share held out", share)
+    left = windows - max(1, round(share * windows))
+    if left < 1:
+        raise InputError(
+            f"windows: of {windows} a share of {share:g} is held out, one at least: none is left to train on"
+        )
+    return left
+
+
 def _tensor(name: str, value: Any) -> Tensor:
     """A batch's entry as networks take it; one that is so already stays the same tensor."""
-    tensor = torch.as_tensor(value)
+    try:
+        if isinstance(value, np.ndarray):  # torch takes none that run backwards, or have another machine's byte order
+            value = np.ascontiguousarray(value, value.dtype.newbyteorder("="))
+        tensor = torch.as_tensor(value)
+    except (TypeError, ValueError) as e:
+        raise InputError(f"windows: {name} must be an array of numbers ({e})") from None
     return tensor.float() if name in _AXES and name != "family" else tensor
 
 

@@ -58,9 +58,10 @@ def checked(scorer: WindowScore, states: Any, actions: Any) -> tuple[Array, Arra
 class WindowDetector:
     """Keeps the last H transitions of each episode, and scores them.
 
-    Until H transitions are there the score is 0. With `every` above 1 windows are scored each so many transitions and
-    the score stands in between: what costs a replay need not be paid at 50 Hz. The threshold's false-positive rate is
-    that of a scored window; successive windows overlap and alarm together.
+    Until H transitions are there the score is 0, or minus infinity where the threshold is not above 0, as that of log
+    odds may be: a window that is not there alarms nobody. With `every` above 1 windows are scored each so many
+    transitions and the score stands in between: what costs a replay need not be paid at 50 Hz. The threshold's
+    false-positive rate is that of a scored window; successive windows overlap and alarm together.
 
     Args:
       scorer: of windows.
@@ -107,6 +108,10 @@ class WindowDetector:
         if suffices is not None:
             suffices()
 
+    @property
+    def _unseen(self) -> float:
+        return 0.0 if self.threshold is None or self.threshold > 0 else -np.inf
+
     def _empty(self) -> None:
         self._states: Array | None = None
 
@@ -115,7 +120,7 @@ class WindowDetector:
         if rows is None or self._states is None:
             self._empty()
         else:
-            self._count[rows], self._score[rows] = 0, 0.0
+            self._count[rows], self._score[rows] = 0, self._unseen
 
     def update(self, obs: Any, action: Any, next_obs: Any) -> Any:
         """See `wrappers.anomaly.Detector`; observations are `proprio`, or dicts that hold it.
@@ -149,7 +154,7 @@ class WindowDetector:
         n = len(act)
         if self._states is None or len(self._states) != n:
             self._states, self._actions = np.zeros((n, h + 1, s)), np.zeros((n, h, a))
-            self._count, self._score = np.zeros(n, np.intp), np.zeros(n)
+            self._count, self._score = np.zeros(n, np.intp), np.full(n, self._unseen)
         self._states[:, :-1] = self._states[:, 1:]
         self._actions[:, :-1] = self._actions[:, 1:]
         # At an episode's first transition the state before it was not seen yet.

@@ -261,7 +261,7 @@ def _say_unlike(posterior: NeuralPosterior, window: Window, report: Report) -> N
 
     It is not refused: a policy drives robots where excitation does not, and what a network makes of it may be right.
     """
-    states = np.asarray(window.states, float)[-posterior.network.sizes.horizon - 1 :]
+    states = np.asarray(window.states, float).copy()[-posterior.network.sizes.horizon - 1 :]
     off = posterior.network.unlike(torch.as_tensor(states, dtype=torch.float32)).cpu().numpy()
     if off.max() > SEEN:
         i = int(off.argmax())

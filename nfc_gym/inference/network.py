@@ -142,6 +142,13 @@ class Network(Learner):
                 raise InputError(f"windows: the network needs {name!r}; the set has: {', '.join(batch)}")
         if self.config.delta_s and batch["delta_s"].shape[1] != want.states:
             raise InputError(f"windows: delta_s has {batch['delta_s'].shape[1]} entries, states have {want.states}")
+        if self.structure is not None:
+            known, odd = len(self.config.families), batch["family"]
+            if len(odd := odd[(odd < 0) | (odd >= known)]):
+                raise InputError(
+                    f"windows: family {int(odd[0])}, and the network has {known}, 0 to {known - 1}: "
+                    f"{', '.join(self.config.families)}"
+                )
         for name in ("map", "delta_e") if self.config.elevation else ():
             if name in batch and batch[name].shape[1:] != (CELLS, CELLS):
                 raise InputError(f"windows: {name} has shape {tuple(batch[name].shape)}, want (n, {CELLS}, {CELLS})")

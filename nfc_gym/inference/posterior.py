@@ -39,6 +39,14 @@ class Window:
     elevation: ArrayLike | None = None
 
 
+def _numbers(name: str, value: ArrayLike) -> Array:
+    """An array of its own: torch takes none that are read-only, or that run backwards."""
+    try:
+        return np.asarray(value, float).copy(order="C")
+    except (TypeError, ValueError) as e:
+        raise InputError(f"window: {name} must be an array of numbers ({e})") from None
+
+
 class NeuralPosterior:
     """What a network believes about psi (and delta_s) before and after it sees a window.
 
@@ -85,7 +93,7 @@ class NeuralPosterior:
 
     def _checked(self, window: Window) -> tuple[Array, Array, Array | None]:
         size = self.network.sizes
-        states, actions = np.asarray(window.states, float), np.asarray(window.actions, float)
+        states, actions = _numbers("states", window.states), _numbers("actions", window.actions)
         for name, x, width in (("states", states, size.states), ("actions", actions, size.actions)):
             if x.ndim != 2 or x.shape[1] != width:
                 raise InputError(
@@ -106,7 +114,7 @@ class NeuralPosterior:
         if self.network.config.elevation:
             if window.elevation is None:
                 raise InputError("window: this network was trained with an elevation map; give `elevation`")
-            elevation = np.asarray(window.elevation, float)
+            elevation = _numbers("elevation", window.elevation)
             if elevation.shape != (128, 128):
                 raise InputError(f"window: elevation must have shape (128, 128), got {elevation.shape}")
         for name, x in (("states", states), ("actions", actions), ("elevation", elevation)):
@@ -180,6 +188,8 @@ class NeuralPosterior:
             want = self.network.sizes.states
             raise InputError(f"log_prob: delta_s must end in {want} values, got shape {x.delta_s.shape}")
         psi = np.atleast_2d(x.psi)
+        if not len(psi):
+            return np.zeros(0)
         z, free = self.prior.to_z(psi), np.array(self.prior.free)
         u = self.prior.u_of(psi)[:, free]
         # density in u is that in z over N(z; 0, I)
@@ -187,7 +197,7 @@ class NeuralPosterior:
         points = [torch.as_tensor(z, dtype=torch.float32, device=kept.mean.device)]
         if x.delta_s is not None:
             scale, varies = self.network.delta_scale, self.network.varies
-            given = torch.as_tensor(np.atleast_2d(x.delta_s), dtype=torch.float32, device=kept.mean.device)
+            given = torch.as_tensor(np.array(x.delta_s, ndmin=2), dtype=torch.float32, device=kept.mean.device)
             delta = self.network.faced(given, kept.facing)  # at right angles: densities are the same
             points.append(torch.where(varies, scale(delta), 0.0))
             # a constant entry is N(0, 1) noise to the network, taken out at 0 again

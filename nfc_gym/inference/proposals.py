@@ -25,6 +25,7 @@ TRUNCATED, POSTERIOR = PROPOSALS = ("truncated", "posterior")
 QUANTILE = 5e-4  # of the posterior's density, below which nothing is proposed
 SLACK = 1.0  # nats
 _WIDER = 1.5  # than draws of a posterior, candidates for what lies around them
+_OWN = 0.25  # of such candidates: draws of the posterior itself
 _TRIED, _ENOUGH = 100_000, 100  # draws of the prior by which its share inside is told, and how many must be inside
 _LEAST = 1e-4  # probit, of a normal's standard deviations: draws may all be equal
 _NARROWS = 0.05  # nats of posterior entropy that a round must win, or the rounds end
@@ -38,7 +39,8 @@ class SequentialConfig:
       rounds: at most.
       simulations: a round.
       quantile: of the posterior's density, below which truncated proposals have nothing.
-      samples: posterior draws that set the threshold and the bounding box, or the normaliser of a corrected posterior.
+      samples: posterior draws that set the threshold, and candidates that set the bounding box and the share kept; or
+        those that set the normaliser of a corrected posterior.
       oversampling: candidates for each draw that importance resampling chooses from.
       narrows: nats of entropy that a round must take from the posterior for another to follow.
       held_out: share of each round that is held out.
@@ -73,9 +75,11 @@ class SequentialConfig:
 class TruncatedPrior:
     """The uniform prior, where a posterior's density exceeds a quantile of its own draws' densities.
 
-    Plain rejection from the prior accepts one in e^gain: never, in 37 dimensions. Rejection inside the bounding box of
-    the posterior's draws is exact and used where it accepts enough; elsewhere posterior draws above the threshold are
-    resampled with weights prior / posterior.
+    Plain rejection from the prior accepts one in e^gain: never, in 37 dimensions. Rejection inside a bounding box of
+    what lies there is exact and used where it accepts enough; elsewhere candidates above the threshold are
+    resampled by weight. Three in four are of a normal through the posterior's draws, and wider: nearly all of a
+    region's volume lies near its edge, where draws of the posterior hardly ever do. The others are such draws, for
+    posteriors that are no normal.
 
     Args:
       posterior: given a window.
@@ -84,7 +88,7 @@ class TruncatedPrior:
 
     Attributes:
       threshold: log density, relative to the prior, that a proposal exceeds.
-      kept: share of the prior's volume above it, estimated from posterior draws.
+      kept: share of the prior's volume above it, estimated from such candidates.
     """
 
     def __init__(self, posterior: NeuralPosterior, config: SequentialConfig, rng: np.random.Generator) -> None:
@@ -92,11 +96,12 @@ class TruncatedPrior:
         psi = drawn(posterior, config.samples, rng)
         gain = told(posterior, psi)
         self.threshold = float(np.quantile(gain, config.quantile))
-        u = posterior.prior.u_of(psi)
+        self.normal = _Normal(posterior.prior.to_z(psi))
+        tried, log_weight = self._candidates(config.samples, rng)
+        self.kept = float(min(1.0, np.exp(log_weight).mean()))
+        u = posterior.prior.u_of(np.concatenate([psi, tried[np.isfinite(log_weight)]]))
         margin = (u.max(0) - u.min(0)) / config.samples  # a bounding box of draws is a little too small
         self.low, self.high = np.clip(u.min(0) - margin, 0, 1), np.clip(u.max(0) + margin, 0, 1)
-        inside = gain > self.threshold
-        self.kept = float(min(1.0, np.exp(-gain[inside]).sum() / config.samples))
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """(n, d) psi, physical units."""
@@ -119,9 +124,35 @@ class TruncatedPrior:
         return np.concatenate(found)[:n]
 
     def _resampled(self, n: int, rng: np.random.Generator) -> Array:
-        psi = drawn(self.posterior, n * self.config.oversampling, rng)
+        psi, log_weight = self._candidates(n * self.config.oversampling, rng)
+        return psi[chosen(log_weight, n, rng)]
+
+    def _candidates(self, n: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """(n, d) psi, and (n,) the log weights that make them the prior above the threshold."""
+        prior, own = self.posterior.prior, max(1, round(_OWN * n))
+        wide = prior.from_z(self.normal.sample(n - own, rng, _WIDER))
+        psi = np.concatenate([drawn(self.posterior, own, rng), wide])
         gain = told(self.posterior, psi)
-        return psi[chosen(np.where(gain > self.threshold, -gain, -np.inf), n, rng)]
+        normal = self.normal.gain(prior.to_z(psi), _WIDER)
+        mixed = np.logaddexp(gain + np.log(own / n), normal + np.log1p(-own / n)) if own < n else gain
+        return psi, np.where(gain > self.threshold, -mixed, -np.inf)
+
+
+class _Normal:
+    """A normal through points z (n, size), in the coordinates in which the prior is N(0, I)."""
+
+    def __init__(self, z: Array) -> None:
+        self.middle = z.mean(0)
+        self.root = np.linalg.cholesky(np.atleast_2d(np.cov(z.T)) + _LEAST**2 * np.eye(z.shape[1]))
+
+    def gain(self, z: Array, wider: float = 1.0) -> Array:
+        """(n,) its log density over the prior's at z (n, size), with standard deviations `wider` times its own."""
+        white = solve_triangular(wider * self.root, (z - self.middle).T, lower=True)
+        return 0.5 * (z * z).sum(1) - 0.5 * (white * white).sum(0) - np.log(wider * self.root.diagonal()).sum()
+
+    def sample(self, n: int, rng: np.random.Generator, wider: float = 1.0) -> Array:
+        """(n, size) draws, with standard deviations `wider` times its own."""
+        return self.middle + wider * rng.standard_normal((n, len(self.middle))) @ self.root.T
 
 
 class Around:
@@ -146,17 +177,15 @@ class Around:
     def __init__(self, posterior: "Believed", config: SequentialConfig, rng: np.random.Generator) -> None:
         self.prior, self.oversampling = posterior.prior, config.oversampling
         z = self.prior.to_z(drawn(posterior, config.samples, rng))
-        self.middle = z.mean(0)
-        self.root = np.linalg.cholesky(np.atleast_2d(np.cov(z.T)) + _LEAST**2 * np.eye(z.shape[1]))
+        self.normal, self.size = _Normal(z), z.shape[1]
         self.threshold = float(np.quantile(self.gain(z), config.quantile)) - SLACK
-        inside = float((self.gain(rng.standard_normal((_TRIED, len(self.middle)))) > self.threshold).mean())
+        inside = float((self.gain(rng.standard_normal((_TRIED, self.size))) > self.threshold).mean())
         self.rejects = inside * _TRIED >= _ENOUGH
         self.kept = inside if self.rejects else float(np.exp(self._candidates(_TRIED, rng)[1]).mean())
 
     def gain(self, z: Array) -> Array:
         """(n,) log density of the normal over the prior's at z (n, size)."""
-        white = solve_triangular(self.root, (z - self.middle).T, lower=True)
-        return 0.5 * (z * z).sum(1) - 0.5 * (white * white).sum(0) - np.log(self.root.diagonal()).sum()
+        return self.normal.gain(z)
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """(n, d) psi, physical units."""
@@ -165,16 +194,14 @@ class Around:
             return self.prior.from_z(z[chosen(log_weight, n, rng)])
         found: list[Array] = []
         while (missing := n - sum(map(len, found))) > 0:
-            z = rng.standard_normal((min(_TRIED, 1 + int(1.2 * missing / self.kept)), len(self.middle)))
+            z = rng.standard_normal((min(_TRIED, 1 + int(1.2 * missing / self.kept)), self.size))
             found.append(z[self.gain(z) > self.threshold])
         return self.prior.from_z(np.concatenate(found)[:n])
 
     def _candidates(self, n: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """(n, size) from a wider normal, and (n,) the log weights that make them the prior above the threshold."""
-        white = rng.standard_normal((n, len(self.middle)))
-        z = self.middle + _WIDER * white @ self.root.T
-        density = -0.5 * (white * white).sum(1) - np.log(_WIDER * self.root.diagonal()).sum()
-        return z, np.where(self.gain(z) > self.threshold, -0.5 * (z * z).sum(1) - density, -np.inf)
+        z = self.normal.sample(n, rng, _WIDER)
+        return z, np.where(self.gain(z) > self.threshold, -self.normal.gain(z, _WIDER), -np.inf)
 
 
 class Corrected:

@@ -111,3 +111,18 @@ def test_under_the_wrapper() -> None:
     told = [env.step(np.array([a]))[4] for a in (0.5, 0.5, 0.5, 1.0)]
     assert [float(i["anomaly_score"]) for i in told] == pytest.approx([0, 0, 3, 4])
     assert [bool(i["anomaly"]) for i in told] == [False, False, False, True]
+
+
+def test_what_has_not_been_seen_alarms_nobody() -> None:
+    """Log odds of healthy windows are below 0, and so may be the threshold."""
+    env = MonitorAnomaly(Line(), WindowDetector(Farthest(), Threshold(-2.0, 0.01, 300, 0.0, 0.02)))
+    for _ in range(2):  # begun anew too
+        env.reset(seed=0)
+        told = [env.step(np.array([a]))[4] for a in (-1.0, -1.0, -1.0, 1.5)]
+        assert [bool(i["anomaly"]) for i in told] == [False, False, False, True]
+    detector = WindowDetector(Farthest(), Threshold(-2.0, 0.01, 300, 0.0, 0.02))
+    for _ in range(3):
+        detector.update(np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((2, 2)))
+    detector.reset(np.array([True, False]))
+    score = detector.update(np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((2, 2)))
+    assert (score >= detector.threshold).tolist() == [False, True]

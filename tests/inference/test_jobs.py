@@ -186,6 +186,14 @@ def test_commands_beyond_what_the_machine_takes_are_seen_as_it_took_them(posteri
     np.testing.assert_array_equal(raw, cut)
 
 
+def test_arrays_that_run_backwards_are_inferred_from_as_others_are(posterior: Path, motion: Path) -> None:
+    with np.load(motion) as one:
+        states, actions = one["states"].astype(float), one["actions"].astype(float)
+    other = Window(*(x[::-1].copy()[::-1] for x in (states, actions)))
+    found, wanted = (jobs.infer(posterior, w, samples=10)[0].psi for w in (other, Window(states, actions)))
+    np.testing.assert_array_equal(found, wanted)
+
+
 def test_motion_that_no_window_of_the_training_set_was_like_is_said(
     windows: Path, prior: PriorBox, motion: Path, tmp_path: Path
 ) -> None:

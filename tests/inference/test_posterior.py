@@ -231,6 +231,32 @@ def test_what_no_density_or_draw_can_be_asked_is_refused() -> None:
         posterior.given(Window(states, window.actions))
 
 
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_arrays_of_any_layout_are_the_same_window() -> None:
+    posterior, window = cart()
+    states, actions = np.array(window.states, float), np.array(window.actions, float)
+    fixed = states.copy()
+    fixed.flags.writeable = False
+    wanted = posterior.given(Window(states, actions)).sample(4, rng())
+    for other in (states[::-1].copy()[::-1], np.asfortranarray(states), fixed, states.astype(">f8"), states.tolist()):
+        found = posterior.given(Window(other, actions[::-1].copy()[::-1])).sample(4, rng())
+        np.testing.assert_array_equal(found.psi, wanted.psi)
+    given = posterior.given(window)
+    turned = Fidelity(wanted.psi[::-1], wanted.delta_s[::-1])
+    np.testing.assert_allclose(given.log_prob(turned), given.log_prob(wanted)[::-1], rtol=1e-5)
+    for odd in ([["a", "b"]] * 11, [[1, 2], [3]]):
+        with pytest.raises(InputError, match="window: states must be an array of numbers"):
+            posterior.given(Window(odd, actions))
+
+
+@pytest.mark.parametrize("density", ["score", "mixture", "flow"])
+def test_no_points_have_no_densities(density: str) -> None:
+    windows = motion_windows(64)
+    posterior = NeuralPosterior(network(windows, density=density))
+    window = Window(windows.tensors["states"][0], windows.tensors["actions"][0])
+    assert posterior.given(window).log_prob(Fidelity(np.zeros((0, 2)))).shape == (0,)
+
+
 def test_a_robots_psi_is_drawn_from_a_file(tmp_path: Path) -> None:
     with gymnasium.make("nfc_gym/JackalFlat-v0", context=["psi"]) as env:
         prior = PriorBox.of(env.unwrapped.psi_space, "jackal")

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from problems import box, gaussian, linear_windows, motion_windows, network
@@ -270,6 +271,31 @@ class Stored:
         order = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed % 2**60)).numpy()]
         for i in range(0, len(order), size):
             yield {n: self.arrays[n][order[i : i + size]] for n in names}
+
+
+def test_windows_in_any_layout_are_the_same() -> None:
+    plain = {k: t.numpy() for k, t in motion_windows(8).tensors.items()}
+    for made in (lambda x: x[::-1].copy()[::-1], lambda x: x.astype(x.dtype.newbyteorder(">"))):
+        found = TensorWindows({k: made(x) for k, x in plain.items()})
+        for name, x in plain.items():
+            np.testing.assert_array_equal(found.tensors[name].numpy(), x)
+    with pytest.raises(InputError, match="windows: psi must be an array of numbers"):
+        TensorWindows({**plain, "psi": [["a", "b"]] * 8})
+
+
+@pytest.mark.parametrize("share", [1.0, 2.0, -0.5, float("nan")])
+def test_a_share_that_leaves_nothing_is_refused(share: float) -> None:
+    with pytest.raises(InputError, match=r"the share held out|none is left to train on"):
+        motion_windows(8).split(share)
+
+
+@pytest.mark.parametrize("family", [-1, 2])
+def test_a_family_that_the_network_has_not_is_refused(family: int) -> None:
+    windows = motion_windows(32)
+    net = network(windows, families=("none", "push"), density="mixture")
+    tensors = {**windows.tensors, "family": torch.full((32,), family)}
+    with pytest.raises(InputError, match=f"family {family}, and the network has 2, 0 to 1: none, push"):
+        train(net, *TensorWindows(tensors).split(0.1), TrainConfig(epochs=1))
 
 
 def test_stored_maps_are_read_where_they_are_asked_for() -> None:
