@@ -17,6 +17,7 @@ from nfc_gym.measured.findings import Finding
 from nfc_gym.physics.fields import names_of
 
 MOST = 5.0  # times its inertia that damping may be in a step: at ten times a skid is off by a fifth (test_stiffness.py)
+HELD = 1e5  # times: such a joint was not damped to move slowly but held fast (1e10 and more in Gymnasium's Fetch)
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -53,16 +54,26 @@ def stiff_joints(model: mujoco.MjModel, step: float) -> list[Stiff]:
 
 
 def stiffness_findings(model: mujoco.MjModel, step: float) -> Iterator[Finding]:
-    """What to say of them: one warning, with the stiffest."""
+    """What to say of them: a warning of those that are led, with the stiffest, and one of those that damping holds."""
     found = stiff_joints(model, step)
-    if not found:
+    held = [s for s in found if s.settles * HELD < step]
+    led = [s for s in found if s not in held]
+    if held:
+        yield Finding(
+            "warning",
+            "model",
+            f"{_list([s.joint for s in held])}: damping holds it as if it were welded, and MuJoCo solves contacts as "
+            "if it were free",
+            "take the joint out of the model: without one a body is fixed to its parent",
+        )
+    if not led:
         return
-    worst = min(found, key=lambda s: s.settles)
+    worst = min(led, key=lambda s: s.settles)
     unit = "kg" if worst.slides else "kg m^2"
     yield Finding(
         "warning",
         "model",
-        f"{_list([s.joint for s in found])} would settle in as little as {worst.settles:.2g} s by damping and servo "
+        f"{_list([s.joint for s in led])} would settle in as little as {worst.settles:.2g} s by damping and servo "
         f"alone, against a step of {step:g} s: grip and slip there hang on the step",
         f"shorten segments.timestep to {worst.settles:.1g}, or make such joints heavier: an armature of "
         f"{worst.armature:.2g} {unit} changes nothing where their speeds are led anyway",

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -56,6 +57,17 @@ def errors(path: Path) -> list[str]:
 
 def test_a_sound_data_set_has_no_findings(build: Build) -> None:
     assert check(build()) == []
+
+
+def test_what_comes_apart_is_not_told_by_mujoco(
+    build: Build, machine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Its warnings, one for each roll-out, would bury the findings, and go into a file in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    mujoco.set_mju_user_warning(None)
+    check(build(model=machine.replace('kp="10"', 'kp="1e7"')))
+    assert "WARNING" not in "".join(capfd.readouterr())
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
 @pytest.mark.parametrize(

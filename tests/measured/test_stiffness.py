@@ -76,3 +76,17 @@ def test_a_finding_names_the_joint_and_says_what_would_do() -> None:
     assert all(word in finding.message for word in ("'axle'", "0.0001 s", f"{STEP:g} s"))
     assert "segments.timestep to 0.0001" in finding.advice
     assert stiff_joints(cart(0, 10), 0.0001) == []
+
+
+def test_a_joint_that_damping_holds_is_to_be_taken_out() -> None:
+    """No step and no armature would do for it: Gymnasium's Fetch holds the slides of its base at 1e11 N s/m."""
+    model = mujoco.MjModel.from_xml_string(
+        CART.format(armature=0, kv=10, step=STEP).replace('"ahead"', '"ahead" damping="1e11"')
+    )
+    model.geom_contype[1] = 1  # what rides on it touches too
+    led, held = sorted(stiffness_findings(model, STEP), key=lambda f: "holds" in f.message)
+    assert "'axle'" in led.message
+    assert "'ahead'" not in led.message
+    assert "'ahead'" in held.message
+    assert "take the joint out" in held.advice
+    assert "timestep" not in held.advice
