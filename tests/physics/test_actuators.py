@@ -383,6 +383,23 @@ def test_a_limit_is_not_looked_for_where_nothing_pushes() -> None:
 
 
 @pytest.mark.parametrize(
+    ("actuator", "said"),
+    [
+        ('<position name="push" joint="rail" kp="30"/>', "force limited to 4.000 ± 0.039 N."),
+        ('<position name="push" joint="hinge" kp="30"/>', "torque limited to 4.000 ± 0.039 N m."),
+    ],
+)
+def test_a_limit_has_a_unit_and_an_interval(actuator: str, said: str) -> None:
+    """4 is one over 0.25, and 1.96 x 0.02 = 0.00125 x 1.96 / 0.25^2."""
+    hinge = '<body><joint name="hinge" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body></worldbody>'
+    model = mujoco.MjModel.from_xml_string(_with(actuator).replace("</worldbody>", hinge))
+    one = np.ones(model.nv)
+    (effect,) = propose(model, Scales(one, one, one[:1], one[:1], 0.01), only=("saturation",), generic=False)
+    assert effect.say(np.array([0.25]), np.array([0.00125])) == f"Saturation below the model's limits at push: {said}"
+    assert effect.say(np.array([0.25])) == effect.say(np.array([0.25]), np.array([np.nan]))
+
+
+@pytest.mark.parametrize(
     ("family", "parameters"),
     [
         ("offset", {"offset": 0.3}),

@@ -10,11 +10,12 @@ import numpy as np
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
-from nfc_gym.physics.effects.drive import ENDLESS, actuator_places, command_unit, is_position, plain
+from nfc_gym.physics.effects.drive import ENDLESS, actuator_places, command_unit, is_position, moves_length, plain
 from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, index, limited
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized, with_units
 from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, shift_range
+from nfc_gym.physics.effects.words import together, with_spread
 from nfc_gym.physics.fields import ModelFields
 
 _NONE, _AFFINE = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -188,7 +189,10 @@ class Saturation(_OnCommand):
     def say(self, theta: Array, sd: Array | None = None) -> str:
         if not self.on_force:
             return super().say(theta, sd)
-        return f"{self.summary} at {' and '.join(self.where)}: force limited to {1 / max(theta[0], 1e-12):.3g}."
+        inverse, unit = max(float(theta[0]), 1 / ENDLESS), self.params[0].unit.removeprefix("1/(").removesuffix(")")
+        size = with_spread(1 / inverse, None if sd is None else sd[0] / inverse**2)
+        what, unit = ("torque" if unit == "N m" else "force"), (f" {unit}" if unit != "1" else "")
+        return f"{self.summary} at {together(self.where)}: {what} limited to {size}{unit}."
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
@@ -203,7 +207,8 @@ class Saturation(_OnCommand):
                 continue  # no limit bites on what pushes nothing
             # The scale is a root mean square: forces reach two or three times as high, where a limit begins to bite.
             change = {"probes": (0.4 / force, 0.7 / force, 1.2 / force), "high": 20 / force, "resolution": 2e-3 / force}
-            out.append(cls(where, sized(cls.ON_FORCE, inverse_limit=change)))
+            unit = {True: "1/(N)", False: "1/(N m)", None: "1"}[moves_length(model, known.index(where[0]))]
+            out.append(cls(where, with_units(sized(cls.ON_FORCE, inverse_limit=change), {"inverse_limit": unit})))
         return out
 
 

@@ -62,7 +62,7 @@ def command_unit(model: mujoco.MjModel, actuator: int) -> str:
 
 def _input_unit(model: mujoco.MjModel, actuator: int) -> str:
     """Unit of what an actuator's gain multiplies."""
-    slides = _slides(model, actuator)
+    slides = moves_length(model, actuator)
     if slides is None:
         return "1"
     if _holds(model, actuator):
@@ -77,7 +77,7 @@ def _input_unit(model: mujoco.MjModel, actuator: int) -> str:
     return "1"
 
 
-def _slides(model: mujoco.MjModel, actuator: int) -> bool | None:
+def moves_length(model: mujoco.MjModel, actuator: int) -> bool | None:
     """Whether what an actuator moves is a length, in m; else it is an angle, or None: neither alone."""
     kind, arm = int(model.actuator_trntype[actuator]), arm_of(model, actuator)
     if arm is not None:
