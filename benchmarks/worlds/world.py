@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from nfc_gym.core.errors import InputError, MissingExtra
 from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.vector import RobotVectorEnv
+from nfc_gym.measured.hidden import Array
 from nfc_gym.wrappers import VectorPerceiveTerrain, VectorPerturbSignals
 
 from .acting import Acting
@@ -198,6 +199,11 @@ class SingleWorld(gymnasium.Env):
         """See `gymnasium.Env`."""
         observation, reward, ended, truncated, info = self.many.step(np.asarray(action)[None])
         return first(observation), float(reward[0]), bool(ended[0]), bool(truncated[0]), first(info)
+
+    @property
+    def psi(self) -> Array:
+        """(d,) what is believed: nominal, or what `reset(options={"psi": ...})` says."""
+        return self.many.unwrapped.psi[0].copy()
 
     @property
     def data(self) -> Estimate:

@@ -182,6 +182,17 @@ def test_a_world_that_there_is_not_is_refused(place: str, scenario: str, said: s
         World(place, scenario, 0)
 
 
+def test_psi_of_a_single_world_is_what_is_believed() -> None:
+    from worlds.world import World
+
+    world = World("JackalFlat", "psi+effect", 0).single(context=["psi"])
+    nominal = world.unwrapped.psi_space.nominal
+    world.reset(seed=0)
+    np.testing.assert_array_equal(world.unwrapped.psi, nominal)
+    world.reset(seed=0, options={"psi": 1.01 * nominal})
+    np.testing.assert_allclose(world.unwrapped.psi, 1.01 * nominal)
+
+
 def test_estimates_of_an_episode_are_the_same_whatever_was_run_before() -> None:
     """A mission that is resumed sees what one without an interruption sees."""
     from worlds.world import World
