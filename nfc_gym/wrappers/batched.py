@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.wrappers.hooks import Hooks
-from nfc_gym.wrappers.simulation import ATTRIBUTE, Simulation
+from nfc_gym.wrappers.simulation_base import ATTRIBUTE, Simulation
 
 Array = NDArray[np.float64]
 _HOOKS = ("control_hooks", "substep_hooks", "after_hooks", "reset_hooks", "edit_hooks")

@@ -21,7 +21,8 @@ from nfc_gym.physics.state import Inertia, move
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.rows import with_last
-from nfc_gym.wrappers.simulation import Simulation, simulation_of
+from nfc_gym.wrappers.simulation import simulation_of
+from nfc_gym.wrappers.simulation_base import Simulation
 from nfc_gym.wrappers.source import Draws, Source
 
 Array = NDArray[np.float64]

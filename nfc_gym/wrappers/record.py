@@ -18,7 +18,8 @@ from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.order import beneath, kind
 from nfc_gym.wrappers.record_folder import LogFolder, folder_of
 from nfc_gym.wrappers.record_tape import Tape
-from nfc_gym.wrappers.simulation import Simulation, simulation_of
+from nfc_gym.wrappers.simulation import simulation_of
+from nfc_gym.wrappers.simulation_base import Simulation
 
 Path = str | os.PathLike[str]
 
