@@ -7,6 +7,7 @@ from machines import make, plant_of, run
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured.export import corrected
+from nfc_gym.physics.effects import propose
 from nfc_gym.physics.effects.air import hull
 from nfc_gym.physics.effects.base import Scales
 from nfc_gym.physics.effects.load import Wind
@@ -90,6 +91,36 @@ def test_planar_base_feels_drag_at_its_centre_of_mass() -> None:
     np.testing.assert_allclose(v[-1, 1::-1] + 0.1 * spin * turned, 0, atol=2e-3)
     straight = run(SLED, effect, theta, 300, qvel=[0.0, 1.0, 0.0]).qvel[0, 0]
     assert straight[-1, 1] == pytest.approx(np.exp(-2.0 / MASS * 0.3), rel=2e-3)
+
+
+RAIL = """
+<mujoco><worldbody><body name="trolley"><joint name="rail" type="slide" axis="1 0 0"/>{turn}<geom size=".1"/>
+  <body name="gimbal"><joint name="sway" axis="0 1 0"/><geom size=".01"/>
+    <body name="load" pos="0 0 -1"><joint name="hoist" type="slide" axis="0 0 1"/><geom size=".1"/></body></body></body>
+</worldbody></mujoco>"""
+
+
+def _where(model: mujoco.MjModel, family: str) -> set[str]:
+    """Bodies at which a family is proposed."""
+    one = np.ones(model.nv)
+    scales = Scales(one, one, one[:0], one[:0], 0.01, exogenous={"exo:time": 5.0})
+    proposed = propose(model, scales, only=(family,), generic=False)
+    return {n for e in proposed for n in e.where} - {model.joint(j).name for j in range(model.njnt)}
+
+
+@pytest.mark.parametrize("family", ["drag_linear", "drag_quadratic", "wind", "gust", "external_force"])
+def test_air_acts_on_what_swings_from_rails_and_on_no_limb_of_a_base_that_turns(family: str) -> None:
+    """A push on a crane's load is nothing that one on the trolley and a torque on its joints could be."""
+    for turn, found in (("", {"trolley", "load"}), ('<joint name="yaw" axis="0 0 1"/>', {"trolley"})):
+        assert _where(mujoco.MjModel.from_xml_string(RAIL.format(turn=turn)), family) == found
+
+
+def test_an_arm_beside_a_base_may_be_pushed_at_its_end() -> None:
+    arm = """<body name="upper"><joint name="shoulder"/><geom size=".1"/>
+    <body name="fore" pos="1 0 0"><joint name="elbow"/><geom size=".1"/></body></body></worldbody>"""
+    model = mujoco.MjModel.from_xml_string(RAIL.format(turn="").replace("</worldbody>", arm))
+    assert _where(model, "external_force") == {"trolley", "load", "fore"}
+    assert _where(model, "wind") == {"trolley", "load"}
 
 
 def test_a_body_that_moves_with_the_wind_feels_nothing() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
 from nfc_gym.physics.effects.param import Param
-from nfc_gym.physics.effects.places import base_bodies, body_ids, sized
+from nfc_gym.physics.effects.places import base_bodies, body_ids, exposed_bodies, sized
 from nfc_gym.physics.state import components, cross_parts, joined, root, rotate_back_parts, rotate_parts
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -107,12 +107,12 @@ def _total(a: Parts, b: Parts) -> Parts:
 
 
 def translating(model: mujoco.MjModel) -> list[str]:
-    """Bodies that air can act on with effect: bases that move through the world."""
+    """Bodies that rotors can carry: bases that move through the world."""
     return base_bodies(model)
 
 
 def body_scales(model: mujoco.MjModel, scales: Scales, body: int) -> tuple[float, float]:
-    """(force in N, speed in m/s) typical of a base: weight and measured force, and the speed of its translations."""
+    """(force in N, speed in m/s) typical of a body: weight and measured force, and the speed of what translates it."""
     dofs: list[int] = []
     b = body
     while b > 0:
@@ -151,7 +151,7 @@ class DragLinear(Effect):
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         out: list[Effect] = []
-        names = translating(model)
+        names = exposed_bodies(model)
         for name, b in zip(names, body_ids(model, names), strict=True):
             force, speed = body_scales(model, scales, int(b))
             unit = force / speed**cls.power

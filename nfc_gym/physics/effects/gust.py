@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
+from nfc_gym.physics.effects.air import BodyMotion, body_scales
 from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Forces, Scales
 from nfc_gym.physics.effects.param import Param
-from nfc_gym.physics.effects.places import body_ids, sized
+from nfc_gym.physics.effects.places import body_ids, exposed_bodies, sized
 
 _STARTS, _LENGTHS = (0.05, 0.25, 0.45, 0.65, 0.85), (0.1, 0.4)  # probed, as shares of a log
 
@@ -61,7 +61,7 @@ class Gust(Effect):
         end = max(2 * float(scales.exogenous[TIME]), 1e-2)  # the median of time lies half-way through a log
         start = {"probes": tuple(s * end for s in _STARTS), "low": -end, "high": end}
         length = {"probes": tuple(s * end for s in _LENGTHS), "low": 0.01 * end, "high": 4 * end}
-        names = translating(model)
+        names = exposed_bodies(model)
         for name, b in zip(names, body_ids(model, names), strict=True):
             force = body_scales(model, scales, int(b))[0]
             push = {"probes": (0.1 * force,), "low": -3 * force, "high": 3 * force, "resolution": 2e-3 * force}

@@ -8,16 +8,16 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
+from nfc_gym.physics.effects.air import BodyMotion, body_scales
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
 from nfc_gym.physics.effects.lookup import index, joint_dofs
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import (
     body_ids,
+    exposed_bodies,
     force_unit,
     joint_places,
     joint_scales,
-    moving_bodies,
     sized,
     with_joint_units,
     with_units,
@@ -58,7 +58,7 @@ class ExternalForce(Effect):
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         out: list[Effect] = []
-        bodies = translating(model) or _ends(model)
+        bodies = exposed_bodies(model, arms=True)
         for name, b in zip(bodies, body_ids(model, bodies), strict=True):
             force = body_scales(model, scales, int(b))[0]
             size = {"probes": (0.05 * force,), "low": -2 * force, "high": 2 * force, "resolution": 1e-3 * force}
@@ -70,14 +70,6 @@ class ExternalForce(Effect):
             size = {"probes": (0.1 * force,), "low": -3 * force, "high": 3 * force, "resolution": 2e-3 * force}
             out.append(cls(where, with_units(sized(cls.ON_JOINT, force=size), {"force": force_unit(model, where[0])})))
         return out
-
-
-def _ends(model: mujoco.MjModel) -> list[str]:
-    """Moving bodies that carry no other moving body: the tips of an arm on a fixed base."""
-    moving = moving_bodies(model)
-    ids = body_ids(model, moving)
-    parents = {int(model.body_weldid[model.body_parentid[b]]) for b in ids}
-    return [n for n, b in zip(moving, ids, strict=True) if int(b) not in parents]
 
 
 _GALE = 113.0  # m/s; the strongest gust measured near the ground (WMO)
@@ -119,7 +111,7 @@ class Wind(Effect):
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         out: list[Effect] = []
-        names = translating(model)
+        names = exposed_bodies(model)
         for name, b in zip(names, body_ids(model, names), strict=True):
             force, speed = body_scales(model, scales, int(b))
             push = {"probes": (0.05 * force,), "low": -2 * force, "high": 2 * force, "resolution": 1e-3 * force}

@@ -142,6 +142,42 @@ def base_bodies(model: mujoco.MjModel) -> list[str]:
     return out
 
 
+def end_bodies(model: mujoco.MjModel) -> list[str]:
+    """Moving bodies that carry no other moving body: the tips of an arm, the load of a crane."""
+    moving = moving_bodies(model)
+    ids = body_ids(model, moving)
+    parents = {int(model.body_weldid[model.body_parentid[b]]) for b in ids}
+    return [n for n, b in zip(moving, ids, strict=True) if int(b) not in parents]
+
+
+def exposed_bodies(model: mujoco.MjModel, arms: bool = False) -> list[str]:
+    """Bodies that air and pushes act on: bases, and the ends of what rides on a base that its rails keep from turning.
+
+    A push on a crane's load is none on its trolley, while one on a robot's foot is nearly one on its trunk.
+
+    Args:
+      arms: the ends of what no base carries, too.
+    """
+    bases = base_bodies(model)
+    ids = set(body_ids(model, bases).tolist())
+    rails = {b for b in ids if all(int(model.jnt_type[j]) == _SLIDE for j in _carriers(model, b)[0])}
+    out, ends = list(bases), [n for n in end_bodies(model) if n not in bases]
+    for name, body in zip(ends, body_ids(model, ends).tolist(), strict=True):
+        below = _below(model, body)
+        if below & rails or (arms and not below & ids):
+            out.append(name)
+    return out
+
+
+def _below(model: mujoco.MjModel, body: int) -> set[int]:
+    """Bodies that carry a body, down to the world."""
+    out: set[int] = set()
+    while body > 0:
+        body = int(model.body_parentid[body])
+        out.add(body)
+    return out
+
+
 def body_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
     """Id of each named body, (n,); an unknown name raises `InputError` listing what exists, and so does the world,
     which nothing moves."""
