@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from mujoco.batch import Batch, SimulationError
+from mujoco.batch import SimulationError
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
@@ -32,17 +31,17 @@ from nfc_gym.envs.contract import (
 )
 from nfc_gym.envs.forking import require_threads
 from nfc_gym.envs.look import HeldMaps
+from nfc_gym.envs.readable import ReadableVectorEnv
 from nfc_gym.envs.registry import EPISODE
 from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.screen import Screen, warn_without_mode
 from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.simulations import Simulations
 from nfc_gym.physics.fields import ModelFields
-from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.terrain import Heightfield
 
 
-class RobotVectorEnv(VectorEnv):
+class RobotVectorEnv(ReadableVectorEnv):
     """Robots on flat ground or rough terrain, stepped together.
 
     Args:
@@ -121,94 +120,7 @@ class RobotVectorEnv(VectorEnv):
         self._waiting = np.ones(n, bool)  # for a reset
         self._fresh = True  # nothing was reset yet
 
-    # ---- what may be read back ------------------------------------------------------------------------------------
-
-    @property
-    def dt(self) -> float:
-        """Control step, s."""
-        return self.model.opt.timestep * self.frame_skip
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """The nominal model; `set_terrains` replaces it, and the next three."""
-        return self._sims.model
-
-    @property
-    def batch(self) -> Batch:
-        """The simulations."""
-        return self._sims.batch
-
-    @property
-    def fields(self) -> ModelFields:
-        """Model fields of the batch; what is written through it goes back to nominal at every reset."""
-        return self._sims.fields
-
-    @property
-    def robot(self) -> Robot:
-        """The laws."""
-        return self._sims.robot
-
-    @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """Every simulation's generator, as Gymnasium's own vector environments have them."""
-        return tuple(self._sims.generators)
-
-    @property
-    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seeds that they began from."""
-        return tuple(self._sims.seeds)
-
-    @property
-    def psi_space(self) -> ParameterSpace:
-        """Names, units, bounds and nominal values of psi."""
-        return self._sims.space
-
-    @property
-    def psi(self) -> NDArray[np.float64]:
-        """(n, d) psi of every simulation in physical units."""
-        return self._sims.psi.copy()
-
-    def note_psi(self, psi: NDArray[np.float64], ids: Ids) -> None:
-        """Say what `psi` of some simulations (k,) is: for whoever has written another one, (k, d), through `fields`.
-
-        What the observation shows stays.
-        """
-        self._sims.psi[ids] = psi
-
-    @property
-    def terrain_id(self) -> Ids:
-        """(n,) which of `maps` every simulation stands on."""
-        return self._sims.chosen.copy()
-
-    @property
-    def maps(self) -> tuple[Heightfield, ...]:
-        """The maps to choose from; none on flat ground."""
-        return self._sims.maps
-
-    @property
-    def heightfield(self) -> list[Heightfield]:
-        """n terrains that are simulated; zeros on flat ground."""
-        return self._sims.terrains(self._sims.maps)
-
-    @property
-    def perceived(self) -> list[Heightfield]:
-        """n terrains that `elevation` is taken from: the simulated ones, unless `set_terrains` was told others."""
-        return self._sims.terrains(self._sims.perceived)
-
-    @property
-    def places(self) -> NDArray[np.float64]:
-        """(n, place_size) world places of the goals [m], of robots that have some."""
-        return self.robot.desired(self._view).copy()
-
-    @property
-    def proprio_components(self) -> list[str]:
-        """What each entry of `proprio` is, in the names of logs: how a residual of it reaches the state."""
-        return self.robot.components(self.model)
-
-    @property
-    def mjcf(self) -> str:
-        """The nominal model on the first map, as MJCF that plain MuJoCo loads."""
-        return self.robot.mjcf(self.maps[0] if self.rough else None)
+    # ---- ground ---------------------------------------------------------------------------------------------------
 
     def set_terrains(self, maps: Sequence[Any], perceived: Sequence[Any] | None = None) -> None:
         """Other maps for the simulations to choose from; the batch is built anew, and must be reset before a step.
@@ -217,9 +129,15 @@ class RobotVectorEnv(VectorEnv):
           maps: `Heightfield`s or heights (256, 256) m; with n of them, `reset(options={"terrain_id": range(n)})` gives
             each simulation its own.
           perceived: what `elevation` shows on each of them; by default the maps themselves.
+
+        Raises:
+          InputError: these are no maps, not one perceived for each, or the ground is a plane.
         """
         if not self.rough:
             raise InputError("set_terrains: the ground of a Flat environment is a plane; use the Rough one")
+        for name, given in (("maps", maps), ("perceived", [] if perceived is None else perceived)):
+            if isinstance(given, str) or not isinstance(given, Sequence | np.ndarray):
+                raise InputError(f"set_terrains: {name} is {given!r}, want a sequence of maps")
         if len(maps) == 0 or (perceived is not None and len(perceived) != len(maps)):
             raise InputError(f"set_terrains: {len(maps)} maps and {len(perceived or [])} perceived ones; want one each")
         simulated = [scene.checked(m, f"maps[{k}]") for k, m in enumerate(maps)]

@@ -220,6 +220,9 @@ def test_terrains_are_replaced() -> None:
     np.testing.assert_allclose(obs["proprio"][:, 12], home + np.array([0, 0.5, 2.0]), atol=5e-3)
     with pytest.raises(InputError, match=r"maps\[1\] has shape"):
         envs.unwrapped.set_terrains([maps[0], np.zeros((3, 3))])
+    for wrong in (None, 5, "maps"):
+        with pytest.raises(InputError, match=f"maps is {wrong!r}, want a sequence of maps"):
+            envs.unwrapped.set_terrains(wrong)
     with pytest.raises(InputError, match="0 to 2"):
         envs.reset(options={"terrain_id": 3})
     with pytest.raises(InputError, match="set_terrains"):
