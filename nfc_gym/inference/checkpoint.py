@@ -58,11 +58,12 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
     require_format(path, metadata, FORMAT)
     try:
         about = json.loads(metadata["about"])
-        own = PriorBox.from_dict(about["prior"])
+        own, frame = PriorBox.from_dict(about["prior"]), about.get("frame")
         config, sizes, notes = NetworkConfig(**about["network"]), Sizes(**about["sizes"]), dict(about["notes"])
-    except (KeyError, TypeError, ValueError) as e:
+        network = Network(config, sizes, own)
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, IndexError) as e:
         raise InputError(f"{path}: its metadata describe no network that this version knows ({e})") from None
-    if config.delta_s and sizes.place and about.get("frame") != FRAME:
+    if config.delta_s and sizes.place and frame != FRAME:
         raise InputError(
             f"{path}: of an earlier version: its delta_s is in the world's frame, of which windows do not tell; "
             "train it again"
@@ -71,7 +72,6 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
         prior.require_same(own, str(path))
     kept = {"facing": torch.tensor([[1.0, 0.0, 1.0]])} if any(k.startswith(GIVEN) for k in tensors) else {}
     kept |= {k.removeprefix(GIVEN): tensors.pop(k) for k in list(tensors) if k.startswith(GIVEN)}
-    network = Network(config, sizes, own)
     try:
         network.load_state_dict(tensors)
         given = Encoded(**kept) if kept else None

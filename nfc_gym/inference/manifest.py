@@ -1,11 +1,13 @@
 """What a set of windows says of itself: the `manifest.json` beside its shards."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.whole import is_number
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -88,7 +90,7 @@ class Manifest:
         """The manifest of a folder.
 
         Raises:
-          InputError: there is none, it is not JSON, of another format, or lacks a key.
+          InputError: there is none, it is not JSON, of another format, lacks a key, or has a value that is none.
         """
         path = folder / MANIFEST
         try:
@@ -104,6 +106,48 @@ class Manifest:
         odd = sorted(names ^ set(raw))
         if odd:
             raise InputError(f"{path}: the keys {', '.join(odd)} are missing or unknown")
+        for name, value in raw.items():
+            if not _KINDS[name](value):
+                raise InputError(f"{path}: {name} is {str(value)[:80]}, which no manifest has: simulate again")
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in raw.items()}
         values["finished"] = {int(k): v for k, v in values["finished"].items()}
+        for name, like in _ALIKE.items():
+            if len(values[name]) != len(values[like]):
+                raise InputError(f"{path}: {len(values[name])} {name} and {len(values[like])} {like}: simulate again")
         return cls(**values)
+
+
+def _whole(least: int) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _list_of(one: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and all(one(v) for v in value)
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _named(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+def _counted(value: Any) -> bool:
+    """Shard -> counts, the shards by their numbers."""
+    return _named(value) and all(
+        k.isdecimal() and _named(v) and all(_whole(0)(n) for n in v.values()) for k, v in value.items()
+    )
+
+
+# Whether a value, as JSON has it, may be that of a key; and keys whose lists are as long as another's.
+_KINDS: dict[str, Callable[[Any], bool]] = {
+    "environment": _text, "robot": _text, "rough": lambda value: isinstance(value, bool),
+    "psi_names": _list_of(_text), "psi_units": _list_of(_text), "psi_low": _list_of(is_number),
+    "psi_high": _list_of(is_number), "horizon": _whole(1), "dt": is_number, "state_names": _list_of(_text),
+    "action_names": _list_of(_text), "state_noise": _list_of(is_number), "families": _list_of(_text),
+    "effects": _list_of(_named), "terrain_kinds": _list_of(_text), "terrain_scale": is_number, "seed": _whole(0),
+    "windows": _whole(1), "per_shard": _whole(1), "settings": _named, "versions": _named, "finished": _counted,
+    "format": _whole(FORMAT),
+}  # fmt: skip
+_ALIKE = {"psi_units": "psi_names", "psi_low": "psi_names", "psi_high": "psi_names", "state_noise": "state_names"}

@@ -13,6 +13,7 @@ from nfc_gym import __version__
 from nfc_gym.core.differences import differences
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
+from nfc_gym.core.whole import is_number, require_whole
 
 FORMAT = "nfc_gym-training-1"
 
@@ -40,7 +41,7 @@ def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
     tensors, metadata = read(path)
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: format {metadata.get('format')!r}, want {FORMAT!r}: remove it to train anew")
-    plain = json.loads(metadata["state"])
+    plain = _described(path, metadata)
     differ = list(differences(plain["of"], json.loads(json.dumps(description))))
     if differ:
         raise InputError(
@@ -59,7 +60,23 @@ def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
             state["state"].setdefault(int(i), {})[name] = tensor
     run.optimiser.load_state_dict(state)
     run.step, run.loss_sum = plain["step"], plain["loss_sum"]
-    run.outcome = type(run.outcome)(**plain["outcome"])
+    try:
+        run.outcome = type(run.outcome)(**plain["outcome"])
+    except TypeError as e:
+        raise InputError(f"{path}: damaged ({e}): remove it to train anew") from None
+
+
+def _described(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
+    """What `save_state` kept as JSON: `step`, `loss_sum`, `outcome`, and `of` what run."""
+    try:
+        plain = json.loads(metadata["state"])
+        require_whole("step", plain["step"], 0)
+        whole = isinstance(plain["of"], dict) and isinstance(plain["outcome"], dict) and is_number(plain["loss_sum"])
+    except (KeyError, TypeError, ValueError) as e:
+        raise InputError(f"{path}: damaged ({e!r}): remove it to train anew") from None
+    if not whole:
+        raise InputError(f"{path}: damaged, what it says of its run is incomplete: remove it to train anew")
+    return plain
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

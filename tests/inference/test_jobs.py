@@ -371,6 +371,28 @@ def test_training_says_what_is_wrong(windows: Path, prior: PriorBox, tmp_path: P
         jobs.device_of("meta")
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("psi_names", None, "psi_names is None"),
+        ("psi_units", ["kg"], "1 psi_units and 9 psi_names"),
+        ("state_noise", "none", "state_noise is none"),
+        ("windows", True, "windows is True"),
+        ("horizon", 0, "horizon is 0"),
+        ("finished", {"first": {}}, "finished is"),
+        ("settings", [1], "settings is"),
+        ("environment", 3, "environment is 3"),
+    ],
+)
+def test_a_manifest_whose_values_are_none_is_refused(
+    windows: Path, tmp_path: Path, key: str, value: object, said: str
+) -> None:
+    about = json.loads((windows / "manifest.json").read_text())
+    (tmp_path / "manifest.json").write_text(json.dumps(about | {key: value}))
+    with pytest.raises(InputError, match=rf"manifest\.json: {said}.*simulate again"):
+        Windows(tmp_path)
+
+
 def test_windows_of_other_bounds_are_refused(windows: Path, prior: PriorBox, tmp_path: Path) -> None:
     """As of another version of the robot: their u would be read as psi that nothing was simulated under."""
     other = tmp_path / "other"

@@ -329,6 +329,21 @@ def test_a_checkpoint_that_lacks_a_part_is_told_as_that(tmp_path: Path, spoil: s
         load(path)
 
 
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [("prior", None), ("network", ["tcn"]), ("sizes", {"horizon": -3, "states": 2, "actions": 1}), ("notes", 1.5),
+     ("sizes", {"horizon": "x", "states": 2, "actions": 1})],
+)  # fmt: skip
+def test_metadata_that_describe_no_network_are_told_as_that(tmp_path: Path, part: str, value: object) -> None:
+    file = tmp_path / "p.safetensors"
+    cart()[0].save(file)
+    tensors, metadata = read(file)
+    about = json.loads(metadata["about"]) | {part: value}
+    save_file(tensors, file, {**metadata, "about": json.dumps(about)})
+    with pytest.raises(InputError, match=r"p\.safetensors: its metadata describe no network"):
+        load(file)
+
+
 def test_a_folder_is_no_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"{tmp_path} is a folder; want a file"):
         load(tmp_path)

@@ -1,5 +1,6 @@
 """The training loop: it learns what is known in closed form, goes on after a kill, and keeps what was good."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 import torch
 from problems import box, gaussian, linear_windows, motion_windows, network
+from safetensors.torch import save_file
 
 from nfc_gym.core import InputError
 from nfc_gym.inference.config import NetworkConfig
 from nfc_gym.inference.data import StoredWindows, TensorWindows
 from nfc_gym.inference.progress import Quiet
+from nfc_gym.inference.state import read
 from nfc_gym.inference.train import TrainConfig, train
 
 QUICK = TrainConfig(epochs=4, batch=64, rate=2e-3, warmup=10, average=0.98)
@@ -86,6 +89,22 @@ def test_a_state_of_something_else_is_refused(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:-1000])
     with pytest.raises(InputError, match="truncated"):
         train(network(windows), windows, held_out, replace(QUICK, epochs=1), folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"step": None}, {"step": -1}, {"of": []}, {"outcome": None}, {"outcome": {"best": 1, "odd": 2}},
+               {"loss_sum": "x"}],
+)  # fmt: skip
+def test_a_damaged_state_says_what_to_do(tmp_path: Path, change: dict[str, object]) -> None:
+    windows, once = motion_windows(32), TrainConfig(epochs=1, batch=16)
+    train(network(windows), *windows.split(0.1), once, folder=tmp_path)
+    file = tmp_path / "training.safetensors"
+    tensors, metadata = read(file)
+    plain = json.loads(metadata["state"])
+    for state in (plain | change, {k: v for k, v in plain.items() if k not in change}):
+        save_file(tensors, file, {**metadata, "state": json.dumps(state)})
+        with pytest.raises(InputError, match=r"training\.safetensors: damaged.*: remove it to train anew"):
+            train(network(windows), *windows.split(0.1), once, folder=tmp_path)
 
 
 def test_a_state_of_other_windows_of_the_same_sizes_is_refused(tmp_path: Path) -> None:
