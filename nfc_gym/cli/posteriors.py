@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -15,7 +16,11 @@ from nfc_gym.core import InputError, Sampler, kinds, load_source
 from nfc_gym.core.files import require_writable
 
 if TYPE_CHECKING:
+    from nfc_gym.inference.jobs import Told
     from nfc_gym.inference.posterior import Window
+    from nfc_gym.inference.space import PriorBox
+    from nfc_gym.inference.train import Outcome
+    from nfc_gym.simulate.policy import Perceptron
 
 
 def simulate(
@@ -70,20 +75,24 @@ def simulate(
         kinds.require_kind(out, kinds.WINDOWS)
         from nfc_gym.simulate import simulate as run
 
-        mover = policy
-        if policy is not None and Path(policy).suffix.lower() in ("", ".safetensors"):
-            from nfc_gym.adaptation import load_policy
-
-            mover = load_policy(policy).perceptron()  # plain arrays: any process can be sent them
         source = None if proposal is None else _proposal(proposal, environment)
         run(
-            environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=source, policy=mover,
+            environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=source, policy=_mover(policy),
             policy_share=policy_share, motor=motor, ray=ray, console=Console(),
         )  # fmt: skip
         if maps:
             from nfc_gym.simulate.maps import keep_maps
 
             keep_maps(out, jobs, Console())
+
+
+def _mover(policy: str | None) -> "Perceptron | str | None":
+    """What moves windows; policies of this package are plain arrays, since any process can be sent those."""
+    if policy is None or Path(policy).suffix.lower() not in ("", ".safetensors"):
+        return policy
+    from nfc_gym.adaptation import load_policy
+
+    return load_policy(policy).perceptron()
 
 
 def _proposal(file: Path, environment: str) -> Sampler:
@@ -154,37 +163,52 @@ def train(
         _require_used(not structure, "for a posterior: give it without --structure", **of_posteriors)
         kinds.require_kind(out, kinds.STRUCTURE if structure else kinds.POSTERIOR)
         require_writable(out.absolute().parent)
-        from nfc_gym.core import MissingExtra
-        from nfc_gym.inference.windows import Manifest
-        from nfc_gym.simulate.machine import Machine
-
-        try:
-            from nfc_gym.inference import jobs
-        except ImportError as e:
-            raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
+        jobs = _learning()
         from nfc_gym.inference.config import NetworkConfig
         from nfc_gym.inference.progress import Spoken
-        from nfc_gym.inference.space import PriorBox
         from nfc_gym.inference.train import TrainConfig
         from nfc_gym.simulate.teach import TRAINING, train_structure
 
-        machine = Machine(Manifest.read(windows).environment)
-        prior = PriorBox.of(machine.space, machine.kind.name)
-        config = NetworkConfig(
-            encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
-        )
         training = TRAINING if structure else TrainConfig()
         training = replace(training, epochs=epochs or training.epochs, batch=batch, seed=seed)
         how = {"report": Spoken(), "noise": noise}
+        prior = _prior(windows)
         if structure:
             done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
         else:
+            config = NetworkConfig(
+                encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
+            )
             done = jobs.train_posterior(windows, prior, out, config, training, device=device, **how)
-        if done.best:
-            said = f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
-        else:
-            said = "nothing that was learned held on the windows held out: simulate more of them"
-        say_written(out, f"{said} ({done.seconds:.0f} s){'' if structure else _told(out)}")
+        say_written(out, f"{_learned(done)} ({done.seconds:.0f} s){'' if structure else _told(out)}")
+
+
+def _learning() -> ModuleType:
+    """`inference.jobs`, which needs an extra."""
+    from nfc_gym.core import MissingExtra
+
+    try:
+        from nfc_gym.inference import jobs
+    except ImportError as e:
+        raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
+    return jobs
+
+
+def _prior(windows: Path) -> "PriorBox":
+    """Psi's box of the robot that windows are of."""
+    from nfc_gym.inference.space import PriorBox
+    from nfc_gym.inference.windows import Manifest
+    from nfc_gym.simulate.machine import Machine
+
+    machine = Machine(Manifest.read(windows).environment)
+    return PriorBox.of(machine.space, machine.kind.name)
+
+
+def _learned(done: "Outcome") -> str:
+    """What training came to, by the windows that chose the epoch."""
+    if not done.best:
+        return "nothing that was learned held on the windows held out: simulate more of them"
+    return f"held-out loss {done.start:.4f} before, {done.held_out[done.best - 1]:.4f} in epoch {done.best}"
 
 
 def _told(posterior: Path) -> str:
@@ -249,20 +273,13 @@ def infer(
     Example: nfc-gym infer jackal.safetensors window.npz --out psi.npz
     """
     with outcome(ctx):
-        from rich.table import Table
-
-        from nfc_gym.core import MissingExtra
-
         mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
         _require_used(mapped, f"of a mapping's logs, and {window} is no mapping file", log=log, until=until)
         _require_used(refine is not None, "for --refine: give --refine N too", device=device, jobs=jobs)
-        try:
-            from nfc_gym.inference import jobs as learning
-        except ImportError as e:
-            raise MissingExtra(f"{e}: pip install 'nfc_gym[inference]'") from None
+        learning = _learning()
+        from nfc_gym.inference.progress import Spoken
 
         seen = _window(posterior, window, log, until) if mapped else window
-        from nfc_gym.inference.progress import Spoken
 
         anew, report = None, Spoken()
         if refine is not None:
@@ -273,17 +290,24 @@ def infer(
                 report=report,
             )  # fmt: skip
         drawn, found = learning.infer(posterior, seen, samples=samples, seed=seed, out=out, refined=anew, report=report)
-        table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
-        for each in found:
-            note = "  not shown" if each.width >= learning.AS_WIDE else ""
-            interval = f"{each.low:.4g} to {each.high:.4g}"
-            table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
-        Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 140).print(table)
+        _print_table(found, learning.AS_WIDE)
         if out is not None and out.suffix == ".npz":
             parts = [part for part in ("psi", "delta_s") if getattr(drawn, part) is not None]
             say_written(out, f"{samples} draws of {' and '.join(parts)}")
         elif out is not None:
             say_written(out, "the posterior given this window")
+
+
+def _print_table(found: "list[Told]", as_wide: float) -> None:
+    """Median and 90 % interval of each parameter; those at least `as_wide` times the prior's are marked."""
+    from rich.table import Table
+
+    table = Table("parameter", "unit", "median", "90 % interval", "width over the prior's")
+    for each in found:
+        note = "  not shown" if each.width >= as_wide else ""
+        interval = f"{each.low:.4g} to {each.high:.4g}"
+        table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
+    Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 140).print(table)
 
 
 def _asked(ctx: typer.Context, *names: str) -> dict[str, object]:
