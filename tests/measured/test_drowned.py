@@ -1,6 +1,8 @@
 """Noise of start states that the motion magnifies, which no law may mend."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -74,6 +76,25 @@ def test_noise_that_is_magnified_is_told_from_noise_that_is_not(
     problem, x = bench.searched(bench.dataset.of("fit")), bench.plant.null
     under = metric(problem, problem.covariance(bench.plant, x))
     assert drowned(problem, under, bench.plant, x, seed=0) is lost
+
+
+@pytest.mark.parametrize(
+    ("twins", "own", "lost"),
+    [
+        ((3.0, 1.16, 1.12), 1.47, False),  # one of them came apart in one segment
+        ((1.0, 3.0, 3.0), 1.47, True),
+        ((3.0, 1.0, 1.1), 0.9, False),  # noise is not magnified
+    ],
+)
+def test_one_twin_decides_nothing(
+    monkeypatch: pytest.MonkeyPatch, twins: tuple[float, ...], own: float, lost: bool
+) -> None:
+    made = iter(twins)
+    problem: Any = SimpleNamespace(rough=False, residual=lambda *_: np.zeros((1, 1, 1)))
+    under: Any = SimpleNamespace(whiten=lambda residual: [own])
+    monkeypatch.setattr("nfc_gym.measured.drowned.twin", lambda *_: (problem, next(made)))
+    monkeypatch.setattr("nfc_gym.measured.drowned.mean_square", lambda problem, shown: shown)
+    assert drowned(problem, under, SimpleNamespace(), np.zeros(1), seed=0) is lost  # pyright: ignore[reportArgumentType]
 
 
 def test_nothing_is_claimed_of_noise_that_is_magnified(tmp_path: Path) -> None:
