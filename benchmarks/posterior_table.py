@@ -66,6 +66,7 @@ class Run:
 
     @property
     def over(self) -> bool:
+        """Whether it is too late to begin something."""
         return time.monotonic() > self.ends
 
     def sets(self, robot: str, terrain: str) -> Sets:

@@ -42,6 +42,7 @@ AREA, TWICE = 0.95, 2.0  # goals: of the area for strong effects, of the time wi
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; 1 where there is no figure."""
     args = parse(argv)
     threads(1)
     folder = args.out or Path(tempfile.mkdtemp(prefix="structure_"))
@@ -55,6 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    """The command line's arguments."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--quick", action="store_true", help="a toy's head, one tiny trial of the Quadcopter")

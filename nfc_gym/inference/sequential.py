@@ -99,9 +99,7 @@ def sequential(
     made = partial(_simulated, network.prior, simulate, noise)
     rng = np.random.default_rng(config.seed)
     out = Rounds(NeuralPosterior(network))
-    believed = _Beliefs(window, config)
-    train_set: TensorWindows | None = None
-    held_out: TensorWindows | None = None
+    believed, seen = _Beliefs(window, config), _Seen(config.held_out)
     for r in range(config.rounds):
         if r:
             proposal = believed.proposal(network, rng)
@@ -114,24 +112,39 @@ def sequential(
             draw = within.sample if within else partial(_prior, network.prior)
             new = begun or made(draw(config.simulations, rng), rng)
             believed.first = len(new)
-        learned, judged = new.split(config.held_out)
-        train_set = learned if train_set is None else train_set.append(learned)
-        held_out = judged if held_out is None else held_out.append(judged)
+        learned, held_out = seen.with_more(new)
         if r or begun is None:
-            outcome = train(network, train_set, held_out, training, device=device, report=report, scales=scales)
+            outcome = train(network, learned, held_out, training, device=device, report=report, scales=scales)
             out.outcomes.append(outcome)
             if network.density.widens:
                 _calibrate(network, held_out, config.seed)
         out.posterior = believed.now(network, rng)
         out.entropy.append(-float(told(out.posterior, drawn(out.posterior, config.samples, rng)).mean()))
-        report.message(f"round {r + 1}: {len(train_set)} windows, posterior entropy {out.entropy[-1]:.3f} nats")
+        out.windows = learned.append(held_out)
+        report.message(f"round {r + 1}: {len(learned)} windows, posterior entropy {out.entropy[-1]:.3f} nats")
         if r and out.entropy[-2] - out.entropy[-1] < config.narrows:
             out.stopped = "no longer narrows"
             break
-    assert train_set is not None  # at least one round was made
-    assert held_out is not None
-    out.windows = train_set.append(held_out)
     return out
+
+
+class _Seen:
+    """The windows of all rounds so far: a share of each round is held out.
+
+    Args:
+      share: that share.
+    """
+
+    def __init__(self, share: float) -> None:
+        self.share, self._parts = share, ()
+
+    def with_more(self, new: TensorWindows) -> tuple[TensorWindows, TensorWindows]:
+        """To train on and held out, with those of another round."""
+        parts = new.split(self.share)
+        if self._parts:
+            parts = tuple(old.append(more) for old, more in zip(self._parts, parts, strict=True))
+        self._parts = parts
+        return parts
 
 
 class _Beliefs:

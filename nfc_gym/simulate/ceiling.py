@@ -49,14 +49,7 @@ def ceiling(
     """
     machine = Machine(environment)
     sd = machine.noise if noise is None else np.asarray(noise, float)
-    if sd.shape != (machine.kind.proprio_size,):
-        raise InputError(f"noise has shape {sd.shape}, want ({machine.kind.proprio_size},): one of each state entry")
-    got = windows["psi"].shape[-1], windows["actions"].shape[-1]
-    if got != (len(machine.space), machine.kind.action_size):
-        raise InputError(
-            f"ceiling: windows of {got[0]} parameters and {got[1]} actions; {machine.environment} has "
-            f"{len(machine.space)} and {machine.kind.action_size}"
-        )
+    _require(machine, windows, sd)
     if motor == 0:
         cloud, pairs = 0, 1
     n, horizon, size = windows["actions"].shape
@@ -76,6 +69,18 @@ def ceiling(
 
         found.append(information(simulator, u, np.tile(sd, horizon), width, cloud, pairs))
     return bounds(np.array(found))
+
+
+def _require(machine: Machine, windows: Batch, noise: Array) -> None:
+    """Refuse windows or noise of another robot."""
+    if noise.shape != (machine.kind.proprio_size,):
+        raise InputError(f"noise has shape {noise.shape}, want ({machine.kind.proprio_size},): one of each state entry")
+    got = windows["psi"].shape[-1], windows["actions"].shape[-1]
+    if got != (len(machine.space), machine.kind.action_size):
+        raise InputError(
+            f"ceiling: windows of {got[0]} parameters and {got[1]} actions; {machine.environment} has "
+            f"{len(machine.space)} and {machine.kind.action_size}"
+        )
 
 
 def replayed(

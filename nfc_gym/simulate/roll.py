@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.envs.contract import broken
 from nfc_gym.envs.simulations import Simulations
-from nfc_gym.simulate.drive import drive_of
+from nfc_gym.simulate.drive import Drive, drive_of
 from nfc_gym.simulate.ground import begin
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.policy import Policy
@@ -123,19 +123,34 @@ def roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy |
         return _roll(machine, task, maps, policy, nthread)
 
 
-def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy | None, nthread: int) -> Rolled:
-    n, horizon, kind = len(task.psi), machine.habit.horizon, machine.kind
-    longest = task.signal.shape[1] - horizon
-    sims = machine.simulations(n, nthread, maps)
-    robot, view, batch = sims.robot, sims.view, sims.batch
+def _begun(machine: Machine, sims: Simulations, task: Task) -> Residuals:
+    """Simulations at their starts, under the task's psi and with its effects, which are given back."""
     begin(machine, sims, task.psi, task.which, task.start)
     if task.recorded is not None:
         place(machine, sims, task.recorded.starts, task.recorded.states[:, 0])
     for each in task.given:
         each.effect.bind(sims.model)
     residuals = Residuals(sims, task.given)
-    batch.forward()
-    view.now = robot.derive(view)
+    sims.batch.forward()
+    sims.view.now = sims.robot.derive(sims.view)
+    return residuals
+
+
+def _commanded(sims: Simulations, task: Task, t: int, drive: Drive, policy: Policy | None) -> Array:
+    """(n, a) actions of a control step: excitation under feedback, a policy's, or those that were recorded."""
+    action = drive(sims.view, task.signal[:, t]) if task.recorded is None else task.recorded.actions[:, t]
+    if policy is not None and task.guided.any():
+        action[task.guided] = policy.act(sims, task.guided) + _EXPLORE * task.signal[task.guided, t]
+    # What is recorded is what was commanded, to the bit.
+    return np.clip(action, -1, 1).astype(np.float32).astype(np.float64)
+
+
+def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy | None, nthread: int) -> Rolled:
+    n, horizon, kind = len(task.psi), machine.habit.horizon, machine.kind
+    longest = task.signal.shape[1] - horizon
+    sims = machine.simulations(n, nthread, maps)
+    robot, view, batch = sims.robot, sims.view, sims.batch
+    residuals = _begun(machine, sims, task)
     drive = drive_of(robot, sims.model)
     rows = np.concatenate([np.arange(n)[:0], *(np.arange(e.rows.start, e.rows.stop) for e in task.given)])
     shadow = Shadow(machine, task, rows, maps, nthread)
@@ -148,11 +163,7 @@ def _roll(machine: Machine, task: Task, maps: list[Heightfield], policy: Policy 
     shown = np.zeros((len(rows), kind.proprio_size))
     for t in range(longest + horizon):
         alive = (t >= longest - task.warm) & ~unstable & ~ended
-        action = drive(view, task.signal[:, t]) if task.recorded is None else task.recorded.actions[:, t]
-        if policy is not None and task.guided.any():
-            action[task.guided] = policy.act(sims, task.guided) + _EXPLORE * task.signal[task.guided, t]
-        # What is recorded is what was commanded, to the bit.
-        action = np.clip(action, -1, 1).astype(np.float32).astype(np.float64)
+        action = _commanded(sims, task, t, drive, policy)
         acted = np.clip(action + task.jitter[:, t], -1, 1)
         k = t - longest
         if k == 0:

@@ -75,28 +75,24 @@ def simulate(
     """
     _check(windows, seed, jobs, effects, policy_share, motor, per_shard)
     require_writable(Path(out))
-    sampler = _opened(proposal)
-    source = settled(policy)
-    shop = workshop(environment)
+    sampler, source, machine = _opened(proposal), settled(policy), workshop(environment).machine
     if source is not None:
-        Policy(source, shop.machine)  # says at once what is wrong with it
+        Policy(source, machine)  # says at once what is wrong with it
     settings = {
         "effects": effects,
-        "proposal": _digest(sampler, seed, shop.machine),
+        "proposal": _digest(sampler, seed, machine),
         "motor": motor,
-        "policy": _named(source, shop.machine),
+        "policy": _named(source, machine),
         "policy_share": policy_share if policy is not None else 0.0,
     }
     manifest = manifest_of(environment, windows, seed, per_shard, settings)
     writer = WindowWriter(Path(out), manifest)
     plan = Plan(manifest, source, effects, settings["policy_share"], motor)
-    left = writer.missing
 
     def proposed(shard: int) -> Array | None:
-        return None if sampler is None else drawn(sampler, shop.machine, seed, shard, manifest.size(shard))
+        return None if sampler is None else drawn(sampler, machine, seed, shard, manifest.size(shard))
 
-    made = workers.made(plan, left, proposed, jobs, ray)
-    _write(writer, made, console)
+    _write(writer, workers.made(plan, writer.missing, proposed, jobs, ray), console)
     return Windows(out)
 
 
