@@ -60,8 +60,10 @@ def advise(
         # sees, whose figures are then the same.
         present = look(bench, logs, present.lens.plant, present.lens.x)
         asks, pairs, before = _apart(bench, logs, report, present)
+        before = _refitted(bench, logs, report["effects"], asks, pairs, before, say, seed)
     for row in rows:
-        own = [(s, rival) for s, (claim, rival) in zip(before, pairs, strict=True) if claim == row["id"]]
+        told = zip(before, pairs, strict=True)
+        own = [(s, rival) for s, (claim, rival) in told if claim == row["id"] and np.isfinite(s)]
         if own:
             sigma, rival = min(own)
             row |= {"sigma": float(sigma), "worst_mimic": rival, "distinguishable": bool(sigma > TOLD)}
@@ -111,6 +113,29 @@ def _apart(
     """The questions that the claims leave open, the ids of claim and rival of each, and their distances in sigma."""
     asks, pairs, _ = rivalries(bench, logs, report, present)
     return asks, pairs, [float(s) for s in Distances(asks, present.lens, present.repeats).before] if asks else []
+
+
+def _refitted(
+    bench: Bench,
+    logs: Sequence[Log],
+    effects: list[dict[str, Any]],
+    asks: Sequence[Ask],
+    pairs: Sequence[tuple[str, str]],
+    before: Sequence[float],
+    say: Callable[[str], None],
+    seed: int,
+) -> list[float]:
+    """The distances, infinite of near rivals that the contest has excluded and that all segments exclude too.
+
+    A distance is that of the rival as slopes would have it; fitted, it may lie much farther off.
+    """
+    alike = {e["id"]: rivals_of(e, effects) for e in effects}
+    near = [i for i, s in enumerate(before) if s <= TOLD and pairs[i][1] not in alike.get(pairs[i][0], [])]
+    if not near:
+        return list(before)
+    gone = excluded(bench.searched(logs), [asks[i] for i in near], say, seed)
+    far = {i for i, out in zip(near, gone, strict=True) if out}
+    return [float("inf") if i in far else s for i, s in enumerate(before)]
 
 
 def _best_motion(

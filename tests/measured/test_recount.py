@@ -73,3 +73,22 @@ def test_an_equivalent_that_the_searched_segments_alone_could_not_exclude_is_tak
     assert left == []
     assert text.startswith("damping_poly:shaft does as well as coulomb:shaft on the 14 segments that were searched")
     assert text.endswith("and is excluded by all 28: it is no equivalent.")
+
+
+@pytest.mark.parametrize(
+    ("torque", "alike", "near"), [(lively, (), False), (lively, ("damping_poly:shaft",), True), (steady, (), True)]
+)
+def test_a_rival_is_not_called_too_near_that_loses_when_it_is_fitted(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch, torque: Torque, alike: tuple[str, ...], near: bool
+) -> None:
+    """Its distance along slopes is that of a point where it does not stay; who is listed as alike was fitted before."""
+    bench, logs, fitted = machine(torque)
+    dry, viscous = fitted(*DRY), fitted(*VISCOUS)
+    told = [Ask(dry, viscous, TOLD)], [("coulomb:shaft", "damping_poly:shaft")], [1.9]
+    monkeypatch.setattr("nfc_gym.measured.advice._apart", lambda *_: told)
+    claim = {"id": "coulomb:shaft", "equivalents": list(alike)}
+    report = {"effects": [claim], "identifiability": [{"id": "coulomb:shaft", "distinguishable": True}]}
+    advice = advise(bench, logs, report, look(bench, logs, dry.plant, dry.x), lambda text: None, 0)
+    assert advice.rows[0]["distinguishable"] is not near
+    assert advice.rows[0].get("sigma") == (1.9 if near else None)
+    assert any("too near to choose" in f["text"] for f in advice.findings) is near
