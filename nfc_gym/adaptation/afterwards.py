@@ -135,26 +135,31 @@ def learn_from_mission(
     if done is not None:
         return done
     told = quiet if console is None else Spoken(console)
-    out, report = Learned(old, watch, {}), {"of": of}
+    out = Learned(old, watch, {"of": of})
+    shared: dict[str, Any] = {
+        "training": config.training, "beside": beside, "report": told, "seed": config.seed, "device": device_of(device),
+    }  # fmt: skip
     if watch is not None:
-        calibrated = watch.calibration.rate if watch.calibration else RATE
-        rate = calibrated if config.rate is None else config.rate
-        out.detector, report["detector"] = normality.tuned(
-            watch, trajectories, normal, rate, training=config.training, beside=beside,
-            folder=_part(folder, "detector", of), report=told, seed=config.seed, device=device_of(device),
-        )  # fmt: skip
-        told.message(_says("detector", report["detector"]))
+        out.detector, out.report["detector"] = normality.tuned(
+            watch, trajectories, normal, _rate(config, watch), folder=_part(folder, "detector", of), **shared
+        )
+        told.message(_says("detector", out.report["detector"]))
     if old is not None:
-        out.posterior, report["posterior"] = relearned(
-            old, trajectories, environment, simulations=config.simulations, effects=config.effects,
-            motor=config.motor, training=config.training, beside=beside, folder=_part(folder, "posterior", of),
-            report=told, seed=config.seed, jobs=jobs, device=device_of(device),
+        out.posterior, out.report["posterior"] = relearned(
+            old, trajectories, environment, simulations=config.simulations, effects=config.effects, motor=config.motor,
+            folder=_part(folder, "posterior", of), jobs=jobs, **shared,
         )  # fmt: skip
-        told.message(_says("posterior", report["posterior"]))
-    out.report = report
+        told.message(_says("posterior", out.report["posterior"]))
     if folder is not None:
         _keep(folder, out)
     return out
+
+
+def _rate(config: LearnConfig, detector: WindowDetector) -> float:
+    """The wanted share of false alarms: as it is said, or as the detector was calibrated for."""
+    if config.rate is not None:
+        return config.rate
+    return detector.calibration.rate if detector.calibration else RATE
 
 
 def _check(posterior: Any, detector: Any) -> None:

@@ -5,7 +5,6 @@ policy is touched only after an anomaly. A world that never shows one leaves it 
 """
 
 import copy
-import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -22,7 +21,6 @@ from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.agent import Agent
 from nfc_gym.adaptation.beliefs import Inference, inference_of, require_spoken, require_width, width
 from nfc_gym.adaptation.choice import Choice, weights_of
-from nfc_gym.adaptation.digests import of_detector, of_posterior
 from nfc_gym.adaptation.earned import RATE, chance, require_home
 from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portable, spread
@@ -35,7 +33,7 @@ from nfc_gym.adaptation.record import Record, in_words
 from nfc_gym.adaptation.settings import require_number
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute, limited
-from nfc_gym.adaptation.weights import of_weights
+from nfc_gym.adaptation.whose import Whose
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
 from nfc_gym.core.whole import require_whole
@@ -44,8 +42,6 @@ from nfc_gym.wrappers.anomaly import opened
 
 STATE = "state.safetensors"
 _POINTS = 3  # how often weights are judged on the way of one mission's learning
-# Digests that the weights of this process began runs with, by folder: they have learned in place since then.
-_BEGAN: "weakref.WeakKeyDictionary[nn.Module, dict[Path, str]]" = weakref.WeakKeyDictionary()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,10 +181,7 @@ class _Run:
         self.belief: Sampler | None = None
         self.history: list[dict[str, Any]] = []
         self.now: dict[str, Any] = {}
-        self.whose = {
-            "agent": of_weights(weights_of(agent)), "detector": of_detector(self.detector),
-            "posterior": of_posterior(self.inference),
-        }  # fmt: skip
+        self.whose = Whose(agent, self.detector, self.inference)
         self._go_on()
 
     # ---- the lines of the algorithm -------------------------------------------------------------------------------
@@ -314,7 +307,7 @@ class _Run:
             return
         size = 0 if self.pi_h is None else len(self.pi_h.log_std)
         plain = {"t": self.t, "steps": self.steps, "pi_h": size, "past": len(self.past), "history": self.history}
-        plain["whose"] = self.whose
+        plain["whose"] = self.whose.told
         resume.save(self.folder / STATE, self._modules(), None, plain, self._described())
 
     def _go_on(self) -> None:
@@ -322,10 +315,10 @@ class _Run:
         path = None if self.folder is None else self.folder / STATE
         if path is None or not path.is_file():
             self.dataset = Dataset(self.folder)
-            self._remember()
+            self.whose.remember(self.folder)
             return
         kept = resume.plain(path)
-        self._require_same(path, kept.get("whose", {}))
+        self.whose.require(path, kept.get("whose", {}))
         self.past += [copy.deepcopy(self.past[0]) for _ in range(kept.get("past", 1) - 1)]
         size = int(kept["pi_h"])
         if size:
@@ -347,24 +340,3 @@ class _Run:
             if k == len(anomalous) or getattr(self.inference, "reads_belief", True):
                 self.belief = self.inference.infer(tau)
             self.inference = self.inference.updated(tau, self.belief)  # type: ignore[arg-type]
-
-    def _remember(self) -> None:
-        """What the agent's weights were as a run began in the folder; without one nothing goes on."""
-        if self.folder is not None:
-            _BEGAN.setdefault(weights_of(self.agent), {})[self.folder.resolve()] = str(self.whose["agent"])
-
-    def _require_same(self, path: Path, kept: Mapping[str, str | None]) -> None:
-        """Refuse to mix the run of a state with one of another agent, detector or posterior, where that can be told.
-
-        An agent that has learned in this very folder, in this process, is the one that began there.
-        """
-        assert self.folder is not None
-        began = _BEGAN.get(weights_of(self.agent), {}).get(self.folder.resolve())
-        self.whose["agent"] = began or self.whose["agent"]
-        odd = [f"another {k}" for k, now in self.whose.items() if now and kept.get(k) and kept[k] != now]
-        if odd:
-            raise InputError(
-                f"{path} is of another run, with {' and '.join(odd)}: give what that one began with, remove it to "
-                "begin anew, or choose another folder"
-            )
-        self._remember()

@@ -123,7 +123,7 @@ class Assimilation:
             return Assimilated(self.box, np.zeros(size), np.eye(size))
         mujoco.set_mju_user_warning(lambda message: None)  # draws that come apart are left out, not talked about
         most = SEGMENTS // max(1, len(self.remembered))
-        parts = [self.segments(t, SEGMENTS if t is trajectory else most) for t in told]
+        parts = [self.segments(t) if t is trajectory else self.segments(t, most) for t in told]
         rng, seen = np.random.default_rng(self.seed), self.machine.told
         scale = self.machine.noise[seen]
         d = len(self.machine.space) + len(self.structure)

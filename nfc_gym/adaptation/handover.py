@@ -81,34 +81,40 @@ def hand_over(
         another run.
     """
     require_whole("episodes", episodes, 2)  # each return is given an interval
-    began, name = time.monotonic(), full_id(environment)
+    began, name, folder = time.monotonic(), full_id(environment), Path(out)
+    config = config or FineTuneConfig()
     extension = Extension(read_found(effects), name, condition=condition, signals=signals)
     extension.require_something()
-    config = config or FineTuneConfig()
     start = load_policy(name if policy is None else policy, device_of(device))
     shape = {"threads": threads, "episode": config.episode, "settings": start.settings(name)}
     truth = _truth(world, name, condition, signals, shape)
     models = [extension] if truth is None or truth.extension is None else [extension, truth.extension]
     require_read(models, condition, signals)
     _require_fit(start, name)
-    folder = Path(out)
     _require_own(folder)
     limit_threads(threads)
     run = _Run(start, extension, truth, config, folder, episodes, threads,
                Record(folder / "log", console))  # fmt: skip
-    # The same finding is another model under another condition or signal.
-    constant = {name: float(value) for name, value in (signals or {}).items()}
-    run.of |= {k: v for k, v in (("condition", condition), ("signals", constant)) if v}
+    run.of |= _constant(condition, signals)
     adapted = run.trained(extension, folder)
-    ablated = {e.id: run.trained(extension.without(e.id), folder / "without" / _safe(e.id))
-               for e in extension.effects if ablate and e.acts}  # fmt: skip
-    report = run.report(adapted, ablated) | {"seconds": round(time.monotonic() - began, 1)}
-    best = Policy(adapted.policy.sight, adapted.best, dict(start.about))
+    report = run.report(adapted, run.ablated() if ablate else {})
+    report["seconds"] = round(time.monotonic() - began, 1)
+    _write(folder, Policy(adapted.policy.sight, adapted.best, dict(start.about)), report)
+    run.say(report)
+    return report
+
+
+def _constant(condition: str | None, signals: Mapping[str, float] | None) -> dict[str, Any]:
+    """What was given of these: the same finding is another model under another condition or signal."""
+    values = {name: float(value) for name, value in (signals or {}).items()}
+    return {k: v for k, v in (("condition", condition), ("signals", values)) if v}
+
+
+def _write(folder: Path, best: Policy, report: Mapping[str, Any]) -> None:
+    """The policy, which says how it was adapted, and the report."""
     best.about |= {"adapted": {k: report[k] for k in ("from", "policy", "config", "returns")}}
     best.save(folder / POLICY)
     write_together(folder, {PAGE: render(report), REPORT: json.dumps(report, indent=1, allow_nan=False)})
-    run.say(report)
-    return report
 
 
 @dataclass
@@ -194,6 +200,11 @@ class _Run:
         tuning = FineTuning(policy, extension, self.config, folder, of=of, threads=self.threads, record=record)
         tuning.run()
         return tuning
+
+    def ablated(self) -> dict[str, FineTuning]:
+        """Of each effect that acts, by its id, the policy that has learned without it."""
+        ids = [e.id for e in self.extension.effects if e.acts]
+        return {e: self.trained(self.extension.without(e), self.folder / "without" / _safe(e)) for e in ids}
 
     # ---- judging ---------------------------------------------------------------------------------------------------
 

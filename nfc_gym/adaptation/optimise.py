@@ -76,11 +76,8 @@ def optimise(
                 values = learner.learn(batch)
                 episodes.see(batch)
                 done += batch.numel()
-                found = {} if episodes.first is None else episodes.means()
-                record.scalars(before + done, {f"worlds/{k}": v for k, v in (values | found).items()})
-                shown = in_words(found) or "their first episodes have not all ended"
-                said = f"{done:,}/{steps:,} steps in {worlds.num_envs} worlds  {shown}"
-                record.line(said, done >= steps)
+                said = f"{done:,}/{steps:,} steps in {worlds.num_envs} worlds"
+                _tell(record, before + done, values, episodes, said, done >= steps)
                 if choice is not None and done * points >= (judged + 1) * steps:
                     record.scalars(before + done, {"worlds/judged": choice.judge()})
                     judged = done * points // steps
@@ -92,3 +89,12 @@ def optimise(
     after = None if first is None else episodes.means().get("return")
     told = {"imagined_before": first, "imagined_after": after}
     return told if choice is None else told | {"chosen": choice.best}
+
+
+def _tell(
+    record: Record, at: int, values: dict[str, float], episodes: Episodes, said: str, last: bool
+) -> None:  # fmt: skip
+    """What an iteration came to, written down and said; no means before each world has ended an episode."""
+    found = {} if episodes.first is None else episodes.means()
+    record.scalars(at, {f"worlds/{k}": v for k, v in (values | found).items()})
+    record.line(f"{said}  {in_words(found) or 'their first episodes have not all ended'}", last)

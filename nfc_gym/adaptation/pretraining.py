@@ -125,24 +125,11 @@ class Training:
 
 
 def pretrain(
-    environment: str,
-    out: str | Path,
-    *,
-    steps: int,
-    seed: int = 0,
-    envs: int = 1024,
-    horizon: int = 0,
-    net: str = "small",
-    spread: float = SPREAD,
-    task: str | None = None,
-    device: str = "auto",
-    threads: int = 0,
-    seconds: float | None = None,
-    start: str | Path | None = None,
-    ray: str | None = None,
-    workers: int = 0,
+    environment: str, out: str | Path, *, steps: int, seed: int = 0, envs: int = 1024, horizon: int = 0,
+    net: str = "small", spread: float = SPREAD, task: str | None = None, device: str = "auto", threads: int = 0,
+    seconds: float | None = None, start: str | Path | None = None, ray: str | None = None, workers: int = 0,
     console: Console | None = None,
-) -> Policy:
+) -> Policy:  # fmt: skip
     """Train a policy, and write it.
 
     Args:

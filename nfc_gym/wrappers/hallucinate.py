@@ -28,7 +28,7 @@ from nfc_gym.wrappers.belief import Belief
 from nfc_gym.wrappers.dynamics import Injection, Mode, checked_mode, component_names
 from nfc_gym.wrappers.order import PSI, TERRAIN, beneath
 from nfc_gym.wrappers.psi import Psi, Space, space_of
-from nfc_gym.wrappers.simulation import Simulation, simulation_of
+from nfc_gym.wrappers.simulation import Simulation, SingleSimulation, simulation_of
 from nfc_gym.wrappers.source import Source, sampler_of
 from nfc_gym.wrappers.terrain import Ground
 
@@ -58,6 +58,21 @@ def wider(space: gym.Space, more: int) -> spaces.Box:
         raise InputError(f"Hallucinate widens a Box of shape (k,), and the action is {space}")
     one = np.ones(more, space.dtype)
     return spaces.Box(np.concatenate([space.low, -one]), np.concatenate([space.high, one]), dtype=space.dtype.type)
+
+
+def ground_of(env: gym.Env, sim: SingleSimulation, belief: Belief) -> Ground | None:
+    """The ground that an episode's first action chooses; None where the posterior says nothing of it.
+
+    Raises:
+      InputError: it speaks of a map of another shape than the environment's.
+    """
+    if not belief.mode_count:
+        return None
+    ground = Ground(env, sim, "Hallucinate")
+    if belief.shape != ground.shape:
+        raise InputError(f"Hallucinate: delta_e has shape {belief.shape}, the ground {ground.shape}")
+    sim.late_ground = True
+    return ground
 
 
 def injection_of(
@@ -118,31 +133,23 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         self.beta = checked_beta(beta)
         self.belief = Belief(sampled, psi, modes)
         super().__init__(
-            env,
-            posterior=posterior,
-            beta=beta,
-            modes=modes,
-            samples=samples,
-            space=space,
-            mode=mode,
+            env, posterior=posterior, beta=beta, modes=modes, samples=samples, space=space, mode=mode,
             components=components,
-        )
+        )  # fmt: skip
         self.sim = sim
         self.own = int(np.prod(env.action_space.shape or (0,)))
         self.action_space = wider(env.action_space, self.belief.size)
         self._wanted = self.action_space.shape
         self.psi = None if psi is None else Psi(env, psi, sim)
-        self.ground = Ground(env, sim, "Hallucinate") if self.belief.mode_count else None
-        if self.ground is not None and self.belief.shape != self.ground.shape:
-            raise InputError(f"Hallucinate: delta_e has shape {self.belief.shape}, the ground {self.ground.shape}")
-        sim.late_ground = sim.late_ground or self.ground is not None
+        self.ground = ground_of(env, sim, self.belief)
         self.injection = injection_of(env, sim, self.belief, mode, components)
-        self._h = np.zeros(self.belief.size)
-        self._chosen, self._lever = False, self.belief.lever(self.beta)
-        self._high = np.ones(self.belief.step_size)
-        self._low = -self._high
+        # What the episode's first action has chosen, and delta_s as its latest one has, the mean at first.
+        self._h, self._chosen = np.zeros(self.belief.size), False
+        # Of delta_s: the part of it that holds throughout, what moves the rest, and the bounds of that part of pi_h.
         self._made = self.belief.held_part(self._h[: self.belief.held], self.beta)
-        self._again: tuple[Any, ...] = ()
+        self._lever, self._high = self.belief.lever(self.beta), np.ones(self.belief.step_size)
+        self._low = -self._high
+        self._again: tuple[Any, ...] = ()  # how the running episode began: seed, options, draws
 
     @property
     def fidelity(self) -> Fidelity:
