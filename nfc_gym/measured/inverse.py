@@ -38,7 +38,7 @@ class InverseProblem(InstantProblem):
                 "segments.mode inverse compares actuator forces: map at least one channel force:<actuator>"
             )
         self.actuators = [actuator_names(model).index(c.removeprefix("force:")) for c in found]
-        _require_told_apart(model, self.actuators)
+        require_told_apart(model, self.actuators)
         return found
 
     @cached_property
@@ -70,7 +70,7 @@ def levers(model: mujoco.MjModel) -> Array:
     return np.reshape(rows, (model.nu, model.nv)) * model.actuator_gear[:, :1]
 
 
-def _require_told_apart(model: mujoco.MjModel, actuators: Sequence[int]) -> None:
+def require_told_apart(model: mujoco.MjModel, actuators: Sequence[int]) -> None:
     """Refuse actuators whose forces the motion does not tell: of a moving lever, or beside others at the same joints.
 
     Raises:

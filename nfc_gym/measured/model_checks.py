@@ -13,6 +13,7 @@ from nfc_gym.measured.buffers import too_short
 from nfc_gym.measured.channels import ChannelName, parse_channel
 from nfc_gym.measured.export import unsaid
 from nfc_gym.measured.findings import Finding
+from nfc_gym.measured.inverse import require_told_apart
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.observe import observer
 from nfc_gym.measured.start_checks import unmeasured
@@ -20,6 +21,7 @@ from nfc_gym.measured.stiffness import stiffness_findings
 from nfc_gym.measured.yaml_marks import suggest
 from nfc_gym.physics.activations import integrators, on_servos
 from nfc_gym.physics.effects.drive import command_unit
+from nfc_gym.physics.effects.lookup import actuator_names
 from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.parameters import COMPOUND, Parameter, ParameterSpace, resolve, split_field
 
@@ -57,6 +59,7 @@ def model_findings(mapping: Mapping, spec: mujoco.MjSpec, model: mujoco.MjModel)
             size = int(model.sensor_dim[mujoco.mj_name2id(model, _OBJ.mjOBJ_SENSOR, parsed.object)])
             if channel.axes and max(channel.axis_indices or ()) >= size:
                 yield Finding("error", where, f"axes {list(channel.axes)} where the sensor has {size} components")
+    yield from _compared(mapping, model)
     yield from unmeasured(mapping, model)
     yield from _fields(mapping, spec, model)
     yield from _steps(mapping, model)
@@ -216,6 +219,27 @@ def _integrating(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
             message = f"the actuator integrates its command: what it had gathered is taken to be 0 {begin}"
             advice = "log what it has gathered, and make that the command of an actuator without dynamics"
             yield Finding("warning", where, message, advice)
+
+
+def _compared(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
+    """What the mode compares: there must be some, and forces must be those that a motion tells."""
+    mode = mapping.segments.mode
+    kind = {"inverse": "force", "forward": "sensor"}.get(mode)
+    if kind is None:
+        return
+    found = [c.removeprefix(f"{kind}:") for c in mapping.channels if c.startswith(f"{kind}:")]
+    if not found:
+        advice = f"map one, {kind}:<{'actuator' if kind == 'force' else 'name'}>, or choose another mode"
+        yield Finding("error", "segments", f"mode {mode} compares {kind}: channels, and there is none", advice)
+    known = actuator_names(model)
+    for name in found if mode == "inverse" else ():
+        if name not in known:
+            continue  # told of the channel
+        try:
+            require_told_apart(model, [known.index(name)])
+        except InputError as e:
+            message, _, advice = str(e).rpartition("; ")
+            yield Finding("error", f"channels.force:{name}", message.removeprefix(f"force:{name} "), advice)
 
 
 def _unused(mapping: Mapping) -> Iterator[Finding]:

@@ -247,6 +247,30 @@ def test_the_same_log_twice_is_told_of(build: Build, tmp_path: Path) -> None:
     assert "log 'run_9' holds the same as 'run_0'" in "\n".join(map(str, check(path)))
 
 
+@pytest.mark.parametrize(
+    ("mode", "channel", "servo", "said"),
+    [
+        ("inverse", "", "", "segments: mode inverse compares force: channels, and there is none"),
+        ("forward", "", "", "segments: mode forward compares sensor: channels, and there is none"),
+        ("inverse", '"force:servo": {column: goal, unit: N m}', "", ""),
+        ("inverse", '"force:push": {column: goal, unit: N}', "", "channels.force:push: cannot be compared with"),
+        (
+            "inverse", '"force:servo": {column: goal, unit: N m}', '<motor name="twin" joint="hinge"/>',
+            "twin can move the same joint",
+        ),
+    ],
+)  # fmt: skip
+def test_what_a_mode_compares_must_be_there(
+    build: Build, machine: str, mode: str, channel: str, servo: str, said: str
+) -> None:
+    """The other commands stop there, and so `check` tells."""
+    more = f'<general name="push" site="imu" gear="1 0 0 0 0 0"/>{servo}</actuator>'
+    gyro = '  "sensor:gyro": {columns: [gx, gy, gz], unit: rad/s, noise: 0.01}\n'
+    edits = [(gyro, f"  {channel}\n" if channel else ""), ("{length: 0.4}", f"{{mode: {mode}, length: 0.4}}")]
+    found = errors(build(None, *edits, model=machine.replace("</actuator>", more)))
+    assert [said in f for f in found] == ([True] if said else []), found
+
+
 def test_what_is_known_to_change_is_told_of_in_inverse_mode(build: Build) -> None:
     known = "known:\n  - {field: body_mass, of: [bob], column: m, unit: kg}\nsegments: {mode: inverse, length: 0.4}"
     force = '  "force:servo": {column: f, unit: N m, noise: 0.01}\n'
