@@ -19,7 +19,8 @@ _SURE = 5.0  # standard deviations of its sensors by which it may be
 def unmeasured(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
     """Joints whose motion no channel tells: every roll-out starts with them at their reference, at rest or settled.
 
-    A spring may well hold them there, which is worth a note; no channel measures a ball joint.
+    A spring may well hold them there, which is worth a note; no channel measures a ball joint, and where none measures
+    any other there is nothing to predict.
     """
     held: list[str] = []
     loose: list[str] = []
@@ -38,6 +39,10 @@ def unmeasured(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
                 yield from _without_attitude(mapping, body)
         elif not {f"joint:{name}:pos", f"joint:{name}:vel"} & set(mapping.channels):
             (held if model.jnt_stiffness[j] > 0 else loose).append(repr(name))
+    if len(held) + len(loose) == int((model.jnt_type != _BALL).sum()):
+        message = "no channel measures a joint or a free body of the model: there is no motion to begin with"
+        yield Finding("error", "channels", message, "log joint:<name>:pos, or body:<name>:pos and quat")
+        return
     if loose:
         how = "with the speed that it settles at" if settled else "at rest"
         message = f"no channel measures {', '.join(loose)}: every roll-out starts with it at its reference, {how}"

@@ -271,6 +271,17 @@ def test_what_a_mode_compares_must_be_there(
     assert [said in f for f in found] == ([True] if said else []), found
 
 
+def test_a_sensor_alone_is_no_motion(build: Build) -> None:
+    """Roll-outs begin at measured states, and the other modes look at these."""
+    shown = [
+        '  "joint:hinge:pos": {column: q, unit: rad, noise: 0.001}\n',
+        '  "joint:hinge:vel": {column: v, unit: rad/s, noise: 0.01}\n',
+        '  "body:base:quat": {columns: [qw, qx, qy, qz], order: wxyz, noise: 0.01}\n',
+    ]
+    (only,) = errors(build(None, *((line, "") for line in shown)))
+    assert "no channel measures a joint or a free body of the model" in only
+
+
 def test_what_is_known_to_change_is_told_of_in_inverse_mode(build: Build) -> None:
     known = "known:\n  - {field: body_mass, of: [bob], column: m, unit: kg}\nsegments: {mode: inverse, length: 0.4}"
     force = '  "force:servo": {column: f, unit: N m, noise: 0.01}\n'
