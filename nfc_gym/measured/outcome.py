@@ -20,7 +20,7 @@ from nfc_gym.measured.export import corrected, effects_of, pack
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.maps import maps
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.remarks import on_parameters
+from nfc_gym.measured.remarks import on_parameters, on_simplicity
 from nfc_gym.measured.report import render
 from nfc_gym.measured.search import Found
 from nfc_gym.measured.splits import Fold
@@ -89,7 +89,11 @@ def report(
             "extended_over_calibrated_95": gain,
         },
         "identifiability": [],
-        "findings": [{"kind": "check", "text": f"{w}."} for w in bench.warned] + on_parameters(extended, parameters),
+        "findings": [
+            *({"kind": "check", "text": f"{w}."} for w in bench.warned),
+            *on_parameters(extended, parameters),
+            *on_simplicity(judged.claimed, found.rounds),
+        ],
         "rounds": [r.__dict__ for r in (*found.rounds, *found.rest.rounds)],
         "noise": _noise(bench, fold),
         "details": details(bench, v, models, dataset.of("verify", fold))

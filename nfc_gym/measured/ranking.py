@@ -19,6 +19,8 @@ class Round:
       reason: why nothing was accepted.
       exchanged: id of the earlier law whose place the accepted one took.
       alike: of several laws that it added at once, by id: what explains the data as well in the place of each.
+      possible: ids of what explains the data as well with more numbers, where that is so much that the law it added is
+        named for its simplicity alone.
     """
 
     accepted: list[str]
@@ -28,6 +30,7 @@ class Round:
     reason: str = ""
     exchanged: str = ""
     alike: dict[str, list[str]] = field(default_factory=dict)
+    possible: list[str] = field(default_factory=list)
 
     def rivals(self, law: str) -> list[str]:
         """Ids of what explains the data as well as a law that it added; the list itself, to add to."""

@@ -112,7 +112,7 @@ class Contest:
           leading: of those that are believed, the one that gains most.
           entered: all of the shortlist.
         """
-        arena, met = self.arena, [*judged, *beaten]
+        arena, met, crowd = self.arena, [*judged, *beaten], list[str]()
         alike = self._choice.alike(met, best, leading)
         if too_many(alike):
             # So many causes that do alike are no finding: each would be named for want of the others.
@@ -122,14 +122,15 @@ class Contest:
             outcome.reason, best, alike = "", both, self._choice.alike([], both, both)
             outcome.ranking = [arena.row(best), *outcome.ranking]
         else:
-            # What the data cannot exclude is told even where more parameters make it the less likely, short of so much
-            # that it says nothing.
+            # What the data cannot exclude is an equivalent even where more parameters make it the less likely, short of
+            # so much that it says nothing: then it is told apart.
             possible = self._choice.alike(met, best, leading, priced=False)
-            alike = alike if too_many(possible) else possible
+            alike, crowd = (alike, possible) if too_many(possible) else (possible, [])
         outcome.accepted = [e.id for e in arena.new(best)]
         outcome.share = arena.explained(best)
         again = {arena.label(j) for j in judged}  # the others' fits are a first look
         outcome.equivalents = [i for i in alike[len(outcome.accepted) :] if i in again]
+        outcome.possible = [i for i in crowd if i not in alike]
         for effect in arena.new(best):
             rivals = outcome.rivals(effect.id)
             rivals += [i for i in known_as(effect, best.fitted, self.pool) if i not in rivals]

@@ -18,6 +18,7 @@ from nfc_gym.measured.bench import candidates, make_bench
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.owned import Data
+from nfc_gym.measured.remarks import on_simplicity
 from nfc_gym.measured.rounds import Contest
 from nfc_gym.measured.search import Found, Options, Search
 from nfc_gym.measured.unexplained import unexplained
@@ -206,6 +207,20 @@ def test_more_than_three_families_that_do_alike_are_no_claim(families: tuple, cl
     traits = {"where": ("x",), "place": "x", "simpler": (), "kin": (), "generic": False}
     effect = lambda f: SimpleNamespace(id=f"{f}:x", family=f, **traits)  # noqa: E731
     screened: Any = [SimpleNamespace(effect=effect(f), gain=1.0) for f in families]
-    outcome, best = Contest(arena, SimpleNamespace(chance=lambda *a: {}, projected=None), screened, 8, 0.02).hold()  # pyright: ignore[reportArgumentType]
+    contest: Any = Contest(arena, SimpleNamespace(chance=lambda *a: {}, projected=None), screened, 8, 0.02)  # pyright: ignore[reportArgumentType]
+    outcome, best = contest.hold()
     assert (best is not None) == claimed == bool(outcome.accepted)
     assert ("4 effects explain it alike" in outcome.reason) != claimed
+    assert not outcome.possible
+    # With more numbers in each of the others than in the first, they do as well but for the price of these.
+    contest.arena = arena
+    arena.ties = lambda one, other, *, priced=True: other is one or not priced
+    outcome, best = contest.hold()
+    assert outcome.accepted == ["lag:x"]
+    assert len(outcome.equivalents) == (2 if claimed else 0)
+    assert outcome.possible == ([] if claimed else ["gain:x", "payload:x", "wind:x"])
+    text = [f["text"] for f in on_simplicity([{"id": "lag:x"}], [outcome])]
+    assert text == ([] if claimed else [text[0]])
+    assert claimed or text[0].startswith(
+        "lag:x is named since it needs the fewest numbers: gain:x, payload:x and wind:x"
+    )
