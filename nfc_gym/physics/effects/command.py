@@ -189,7 +189,7 @@ class Saturation(_OnCommand):
     def say(self, theta: Array, sd: Array | None = None) -> str:
         if not self.on_force:
             return super().say(theta, sd)
-        inverse, unit = max(float(theta[0]), 1 / ENDLESS), self.params[0].unit.removeprefix("1/(").removesuffix(")")
+        inverse, unit = max(float(theta[0]), 1 / ENDLESS), self.params[0].unit.removeprefix("1/").strip("()")
         size = with_spread(1 / inverse, None if sd is None else sd[0] / inverse**2)
         what, unit = ("torque" if unit == "N m" else "force"), (f" {unit}" if unit != "1" else "")
         return f"{self.summary} at {together(self.where)}: {what} limited to {size}{unit}."
@@ -207,7 +207,7 @@ class Saturation(_OnCommand):
                 continue  # no limit bites on what pushes nothing
             # The scale is a root mean square: forces reach two or three times as high, where a limit begins to bite.
             change = {"probes": (0.4 / force, 0.7 / force, 1.2 / force), "high": 20 / force, "resolution": 2e-3 / force}
-            unit = {True: "1/(N)", False: "1/(N m)", None: "1"}[moves_length(model, known.index(where[0]))]
+            unit = {True: "1/N", False: "1/(N m)", None: "1"}[moves_length(model, known.index(where[0]))]
             out.append(cls(where, with_units(sized(cls.ON_FORCE, inverse_limit=change), {"inverse_limit": unit})))
         return out
 
