@@ -202,6 +202,8 @@ def _outcome(candidate: Row, label: str, r: Row) -> str:
     gain, low = finite(candidate.get("gain_select")), finite(candidate.get("gain_select_low"))
     if label and candidate.get("id") == label:
         return "accepted"
+    if candidate.get("id") in (r.get("possible") or []):
+        return "does as well with more numbers, as too many do: the accepted one is the simplest"
     if candidate.get("id") in (r.get("equivalents") or []):
         return "cannot be told from the accepted one, which is as plain or plainer"
     if gain is not None and gain <= 0:

@@ -223,6 +223,10 @@ def test_what_gains_more_by_more_parameters_is_not_said_to_gain_less() -> None:
     part = page[page.index("Round 1") : page.index("Round 2")]
     assert "201 gains no more than a plainer one would by chance: the accepted one is preferred" in part
     assert "gains less than the accepted one" in part, "of those that do gain less"
+    report["rounds"][0]["possible"] = ["load_friction:hinge"]
+    page = read(render(report, pictures())).text
+    part = page[page.index("Round 1") : page.index("Round 2")]
+    assert "201 does as well with more numbers, as too many do: the accepted one is the simplest" in part
 
 
 def test_values_of_each_place_keep_the_place_as_the_model_names_it() -> None:
