@@ -268,6 +268,7 @@ def lay(
         condition=np.array([logs[i].condition for i in where.log]),
         past=Past(past, np.arange(len(where.log))),
         channels=frozenset(logs[0].channels),
+        qacc=np.stack([states[i].qacc[s] for i, s in zip(where.log, where.start, strict=True)]),
     )
 
 
@@ -288,6 +289,8 @@ def pick(segments: Segments, index: NDArray[np.intp]) -> Segments:
     """Some of the segments."""
     past = segments.past and segments.past.pick(index)
     picked = _map(segments, lambda a: a[index], segments.qpos[index], segments.qvel[index], past)
+    if segments.qacc is not None:
+        picked = replace(picked, qacc=segments.qacc[index])
     return picked if segments.condition is None else replace(picked, condition=segments.condition[index])
 
 
@@ -295,6 +298,8 @@ def repeat(segments: Segments, n: int, qpos: Array, qvel: Array) -> Segments:
     """The segments n times over, from other starts: (n S, nq) and (n S, nv)."""
     past = segments.past and segments.past.repeat(n)
     many = _map(segments, lambda a: np.concatenate([a] * n), qpos, qvel, past)
+    if segments.qacc is not None:
+        many = replace(many, qacc=np.concatenate([segments.qacc] * n))
     return many if segments.condition is None else replace(many, condition=np.tile(segments.condition, n))
 
 

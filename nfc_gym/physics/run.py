@@ -72,7 +72,8 @@ class Run:
         plant.write(self.fields, rows)
         self.fields.commit()
         self.activations = Activations(model, segments.dt, self.fields.touched)
-        q, v = self._true(self._tile(segments.qpos), self._tile(segments.qvel))
+        a = None if segments.qacc is None else self._tile(segments.qacc)
+        q, v = self._true(self._tile(segments.qpos), self._tile(segments.qvel), a)
         # Live views: asking the batch for them anew costs as much as stepping a small machine.
         self.qpos, self.qvel, self.ctrl, self.act = (self.batch.bind(n) for n in ("qpos", "qvel", "ctrl", "act"))
         self.qpos[...], self.qvel[...] = q, v
@@ -85,9 +86,9 @@ class Run:
         """(P S, ...) copies of a segment's values (S, ...) for every parameter vector."""
         return array[self.copies]
 
-    def _true(self, q: Array, v: Array) -> tuple[Array, Array]:
+    def _true(self, q: Array, v: Array, a: Array | None = None) -> tuple[Array, Array]:
         """Measured states (P S, nq), (P S, nv) without the faults of the sensors that they were read from."""
-        return true_state(self.plant.effects, self.thetas, q, v, self.segments.channels)
+        return true_state(self.plant.effects, self.thetas, q, v, self.segments.channels, a)
 
     def _write_known(self) -> list[tuple[Any, Array]]:
         """Constant known fields are written once; those that vary through a segment are returned."""

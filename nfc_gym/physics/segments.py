@@ -34,6 +34,8 @@ class Segments:
       dt: physics step, s.
       history: H.
       qpos, qvel: (S, nq), (S, nv) measured start states.
+      qacc: (S, nv) how fast the speeds changed there, as measured; None where nobody knows. What a late sensor has
+        missed is told by it.
       ctrl: (S, H + K, nu) commands, or targets where a firmware servo computes the command.
       exogenous: name -> (S, H + K).
       known: (field, object names) -> (S, H + K) model fields that the log itself gives.
@@ -59,6 +61,7 @@ class Segments:
     condition: NDArray[np.str_] | None = None
     past: Past | None = None
     channels: frozenset[str] | None = None
+    qacc: Array | None = None
 
     def __len__(self) -> int:
         return len(self.qpos)

@@ -268,19 +268,26 @@ def _alike(quat: Array, vectors: Array) -> Array:
 
 
 def true_state(
-    effects: Sequence[Effect], thetas: Sequence[Array], q: Array, v: Array, channels: Collection[str] | None = None
+    effects: Sequence[Effect],
+    thetas: Sequence[Array],
+    q: Array,
+    v: Array,
+    channels: Collection[str] | None = None,
+    a: Array | None = None,
 ) -> tuple[Array, Array]:
     """The state that faulty sensors were measuring, from the state that was read from them as if they were right.
 
     The faults of each channel are undone in reverse order, and in what was computed from the channel as well: in a
-    speed that no other channel measures, in velocities that were turned by a faulty orientation. What a delayed
-    velocity has changed by since then is not known: a state holds no accelerations.
+    speed that no other channel measures, in velocities that were turned by a faulty orientation. What the speed of a
+    joint or of a free body's place has changed by since a late sensor measured it is told by accelerations; without
+    them, and of rotations, it is not known.
 
     Args:
       effects: in the order in which their `sense` acts; those that are no faults of sensors act by their `unsense`.
       thetas: the parameters of each, (..., k).
       q, v: (..., nq), (..., nv).
       channels: names of all that was measured; None takes it to be the channels that have a fault, and no others.
+      a: (..., nv) how fast the speeds changed.
     """
     faults: dict[str, list[tuple[_OnChannel, Array]]] = {}
     for effect, theta in zip(effects, thetas, strict=True):
@@ -297,7 +304,8 @@ def true_state(
     places = {channel.rpartition(":")[0]: of[0][0].at[channel] for channel, of in faults.items()}
     for name, at in places.items():
         if at.q is not None and at.v is not None:
-            (sensors.joint if at.kind == "joint" else sensors.body)(name, q[..., at.q :], v[..., at.v :])
+            course = None if a is None else a[..., at.v :]
+            (sensors.joint if at.kind == "joint" else sensors.body)(name, q[..., at.q :], v[..., at.v :], course)
     return q, v
 
 
@@ -321,26 +329,43 @@ class _Sensors:
             value, slope = fault.undo(channel or "", value, slope, theta)
         return value, slope
 
-    def _placed(self, channel: str | None, speed: str | None, at: Array, shown: Array) -> tuple[Array, Array]:
+    def _placed(
+        self, channel: str | None, speed: str | None, at: Array, shown: Array, course: Array | None
+    ) -> tuple[Array, Array]:
         """True position (..., n) and velocity, from the measured position and the velocity that the state has.
 
-        The latter is the true one where a channel `speed` measures it, and else the slope of the positions.
+        The latter is the true one where a channel `speed` measures it, and else the slope of the positions, which is as
+        late as these.
+
+        Args:
+          course: how fast that velocity changes; None where nobody knows.
         """
-        if speed is None:
-            return self._undo(channel, at, shown)
-        return self._undo(channel, at, self._slope(channel, shown))[0], shown
+        late = self._late(channel)
+        bent = 0.0 if course is None else late**2 / 2 * course
+        if speed is not None:
+            return self._undo(channel, at, self._slope(channel, shown))[0] - bent, shown
+        value, slope = self._undo(channel, at, shown)
+        return value + bent, slope if course is None else slope + late * course
 
-    def _speed(self, channel: str | None, shown: Array) -> Array:
-        return self._undo(channel, shown, np.zeros_like(shown))[0]
+    def _late(self, channel: str | None) -> Array:
+        """(..., 1) by how much a channel is late, s."""
+        delays = [
+            theta[..., :1] for fault, theta in self.faults.get(channel or "", ()) if fault.family == "sensor_delay"
+        ]
+        return np.asarray(sum(delays, np.zeros(1)))
 
-    def joint(self, place: str, q: Array, v: Array) -> None:
-        """A joint's state (..., 1 and more), in place."""
-        speed = self._first(place, ("vel",))
-        known = self._speed(speed, v[..., :1])
-        q[..., :1], v[..., :1] = self._placed(self._first(place, ("pos",)), speed, q[..., :1], known)
+    def _speed(self, channel: str | None, shown: Array, course: Array | None = None) -> Array:
+        return self._undo(channel, shown, np.zeros_like(shown) if course is None else course)[0]
 
-    def body(self, place: str, q: Array, v: Array) -> None:
-        """A free body's state (..., 7 and more), (..., 6 and more), in place."""
+    def joint(self, place: str, q: Array, v: Array, a: Array | None = None) -> None:
+        """A joint's state (..., 1 and more), in place; `a` is how fast its speed changes."""
+        speed, course = self._first(place, ("vel",)), None if a is None else a[..., :1]
+        known = self._speed(speed, v[..., :1], course)
+        q[..., :1], v[..., :1] = self._placed(self._first(place, ("pos",)), speed, q[..., :1], known, course)
+
+    def body(self, place: str, q: Array, v: Array, a: Array | None = None) -> None:
+        """A free body's state (..., 7 and more), (..., 6 and more), in place; `a` is how fast its speeds change."""
+        course = None if a is None else a[..., :3]
         speed, rates, attitude = (self._first(place, kinds) for kinds in (SPEEDS, RATES, ("quat",)))
         seen, turning = q[..., 3:7].copy(), v[..., 3:6].copy()
         # Where a state turned what was measured, only the difference is turned: where there is none, no bit changes.
@@ -354,5 +379,5 @@ class _Sensors:
             raw = rotate_back(seen, v[..., :3])
             known = v[..., :3] + (rotate(q[..., 3:7], self._speed(speed, raw)) - rotate(seen, raw))
         else:
-            known = self._speed(speed, v[..., :3])
-        q[..., :3], v[..., :3] = self._placed(self._first(place, ("pos",)), speed, q[..., :3], known)
+            known = self._speed(speed, v[..., :3], course)
+        q[..., :3], v[..., :3] = self._placed(self._first(place, ("pos",)), speed, q[..., :3], known, course)
