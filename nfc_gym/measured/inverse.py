@@ -272,7 +272,8 @@ class _Motion:
 
     def nominal(self, name: str) -> Array:
         """A model field (T, ...) as it was before any friction of effects."""
-        field = self.friction if name == "dof_frictionloss" else getattr(self.model, name)
+        owner = self.model.opt if name.startswith("opt.") else self.model
+        field = self.friction if name == "dof_frictionloss" else getattr(owner, name.removeprefix("opt."))
         return np.broadcast_to(field, (len(self.track.time), *np.shape(field)))
 
     def data(self, name: str) -> Array:

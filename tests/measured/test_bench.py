@@ -13,10 +13,12 @@ from nfc_gym.core import InputError
 from nfc_gym.measured.bench import candidates, make_bench, scales
 from nfc_gym.measured.checks import require
 from nfc_gym.measured.model import bare
+from nfc_gym.physics.effects import build as effect
 from nfc_gym.physics.effects.each import split
 
 PUSH = 20 * np.sin(0.05)  # of a servo of 10 N m/rad whose goal leads a swing of 1 rad by 0.1 rad of phase
 Build = Callable[..., Path]
+SLIP = ("lateral", "longitudinal")
 
 
 def with_ankle(machine: str) -> str:
@@ -161,6 +163,25 @@ def test_names_with_colons_are_measured_and_known(build: Build, machine: str) ->
         assert f"sensor_bias:joint:{name}:pos" in [e.id for e in candidates(bench, dataset.logs)]
         residuals.append(bench.problem(dataset.logs, 4).residual(bench.plant, bench.plant.null))
     np.testing.assert_array_equal(*residuals)
+
+
+def test_laws_of_the_ground_may_be_asked_in_inverse_mode(build: Build, machine: str) -> None:
+    """They read gravity, an option of the model."""
+    edits = [
+        ('  "sensor:gyro"', '  "force:servo": {column: goal, unit: N m, noise: 0.01}\n  "sensor:gyro"'),
+        ("{length: 0.4}", "{mode: inverse, length: 0.4}"),
+    ]
+    weight = '<geom name="weight" size="0.02" pos="0 0 -0.1" mass="0.1"/>'
+    rim = '<body name="rim" pos="0 0 -0.1"><joint name="axle" axis="0 1 0"/><geom name="tyre" size="0.01"/></body>'
+    dataset = require(build(None, *edits, model=machine.replace(weight, weight + rim)))[0]
+    bench = make_bench(dataset, 1)
+    problem, found = bench.problem(dataset.logs), []
+    for size in (0.0, 0.3):
+        law, theta = effect("slip", "tyre", dict.fromkeys(SLIP, size))
+        x = np.concatenate([bench.plant.null, theta])[None]
+        found.append(problem.residual(bench.plant.with_effects([law]), x))
+    np.testing.assert_array_equal(found[0], problem.residual(bench.plant, bench.plant.null[None]))
+    assert np.isfinite(found[1]).all()
 
 
 def test_roll_outs_of_a_model_that_sleeps_are_awake(build: Build, machine: str) -> None:
