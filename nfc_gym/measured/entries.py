@@ -14,10 +14,10 @@ from nfc_gym.physics.parameters import Parameter
 # fmt: off
 FAMILIES = (
     "coulomb", "stribeck", "load_friction", "directional_friction", "damping_poly", "armature", "spring_offset",
-    "hysteresis", "backlash", "cogging", "gain", "loss", "offset", "lag", "delay", "dead_zone", "saturation",
-    "torque_speed", "supply_sag", "thermal", "payload", "com_shift", "inertia", "drag_linear", "drag_quadratic",
-    "wind", "gust", "ground_effect", "rotor_drag", "external_force", "slope", "slip", "friction_patch",
-    "compliance", "sinkage", "sensor_bias", "sensor_gain", "sensor_delay", "misalignment",
+    "hysteresis", "backlash", "cogging", "gain", "loss", "command_gain", "offset", "lag", "delay", "dead_zone",
+    "saturation", "torque_speed", "supply_sag", "thermal", "payload", "com_shift", "inertia", "drag_linear",
+    "drag_quadratic", "wind", "gust", "ground_effect", "rotor_drag", "external_force", "slope", "slip",
+    "friction_patch", "compliance", "sinkage", "sensor_bias", "sensor_gain", "sensor_delay", "misalignment",
 )
 # fmt: on
 _AXES = {"x": 0, "y": 1, "z": 2}

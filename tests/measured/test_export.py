@@ -111,6 +111,7 @@ def gain(value: float) -> tuple[str, str, dict[str, float]]:
     return "gain", "m", {"gain": value}
 
 
+SCALED = ("command_gain", "m", {"gain": 1.4})
 OFFSET, DEAD = ("offset", "m", {"offset": 0.3}), ("dead_zone", "m", {"width": 0.5})
 LAG, DELAY = ("lag", "m", {"time_constant": 0.1}), ("delay", "m", {"delay": 0.05})
 BETWEEN = ("delay", "m", {"delay": 2.5 * DT})  # in units of steps no whole number
@@ -168,6 +169,7 @@ CASES: dict[str, tuple[Any, ...]] = {
         for rows in (
             (OFFSET, DEAD), (DEAD, OFFSET), (LAG, DEAD), (DEAD, LAG), (LAG, OFFSET), (OFFSET, LAG), (DELAY, LAG),
             (LAG, DELAY), (OFFSET, gain(0.5)), (FORCE, gain(0.5)), (gain(0.5), FORCE), (FORCE, DEAD, LAG),
+            (SCALED, OFFSET), (OFFSET, SCALED), (SCALED, gain(0.5)), (LAG, SCALED),
         )
     },
     "saturation then a delay between steps": (arm(LIMITED), [CUT, BETWEEN]),
@@ -175,6 +177,8 @@ CASES: dict[str, tuple[Any, ...]] = {
     "a delay between steps": (arm(LIMITED), [BETWEEN]),
     "lag, native delay between steps": (arm(MIXING), [LAG]),
     "saturation then offset": (arm(LIMITED), [CUT, OFFSET]),
+    "saturation then command gain": (arm(LIMITED), [CUT, SCALED]),
+    "command gain then saturation": (arm(LIMITED), [SCALED, CUT]),
     "offset then saturation": (arm(LIMITED), [OFFSET, CUT]),
     "a law that reads the command": (arm(), [LAG, ("law_command", ["j", "m"], {"size": 0.3})]),
     # friction is as soft as the nominal model's friction makes it

@@ -85,6 +85,24 @@ def test_gain_scales_a_servo_as_a_whole() -> None:
         assert half[0, 0, 0, 0] == pytest.approx(0.5 * full[0, 0, 0, 0], rel=1e-12)
 
 
+def test_a_servo_of_another_gear_answers_a_scaled_command_with_the_stiffness_it_had() -> None:
+    speed = _with('<velocity name="push" joint="rail" kv="3"/>')
+    made = _pushed(speed, [("command_gain", {"gain": 0.8})], NOISE)
+    velocity = np.r_[0, np.cumsum(made[:-1]) * DT / MASS]  # of the first steps, in which nothing else acts
+    np.testing.assert_allclose(made[:3], 3 * (0.8 * NOISE - velocity)[:3], rtol=2e-2)
+    rest = np.full(4000, 1.0)
+    np.testing.assert_allclose(_pushed(speed, [("command_gain", {"gain": 0.8})], rest)[-1], 0, atol=1e-2)  # 0.8 m/s
+
+
+def test_servos_alone_have_a_gain_of_their_command() -> None:
+    three = """<motor name="torque" joint="rail"/><velocity name="speed" joint="rail" kv="1"/>
+    <general name="volts" joint="rail" biastype="affine" biasprm="0 0 -2"/>"""
+    model = mujoco.MjModel.from_xml_string(_with(three).replace('actuator="push"', 'actuator="torque"'))
+    one = np.ones(1)
+    proposed = propose(model, Scales(one, one, np.ones(3), np.ones(3), 0.01), only=["command_gain"], generic=False)
+    assert {name for e in proposed for name in e.where} == {"speed", "volts"}
+
+
 def test_offset_and_dead_zone_shift_the_command() -> None:
     np.testing.assert_allclose(_made("offset", {"offset": 0.7}, NOISE), NOISE + 0.7)
     dead = _made("dead_zone", {"width": 1.0}, NOISE)
@@ -315,9 +333,12 @@ def test_a_range_without_width_is_not_native() -> None:
         ('<general name="push" joint="rail" dyntype="integrator"/>', False),
     ],
 )
-def test_an_offset_is_native_where_mjcf_can_say_it(actuator: str, native: bool) -> None:
+@pytest.mark.parametrize("row", [("offset", {"offset": 0.7}), ("command_gain", {"gain": 1.4})])
+def test_what_is_done_to_a_command_is_native_where_mjcf_can_say_it(
+    actuator: str, native: bool, row: tuple[str, dict[str, float]]
+) -> None:
     text = _with(actuator)
-    effect, theta = _bound("offset", {"offset": 0.7}, text)
+    effect, theta = _bound(*row, text)
     spec = mujoco.MjSpec.from_string(text)
     before = spec.to_xml()
     assert effect.spec(spec, theta) == native
@@ -329,7 +350,7 @@ def test_an_offset_is_native_where_mjcf_can_say_it(actuator: str, native: bool) 
         for model, own, values in ((spec.compile(), None, []), (mujoco.MjModel.from_xml_string(text), effect, theta))
     ]
     np.testing.assert_allclose(runs[0].qpos, runs[1].qpos, atol=1e-12)
-    assert np.abs(runs[0].qpos).max() > 1e-3
+    assert np.abs(runs[0].qpos).max() > 1e-4
 
 
 def test_a_lag_or_delay_is_not_native_in_a_step_of_stages() -> None:

@@ -12,7 +12,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import DragLinear, DragQuadratic
 from nfc_gym.physics.effects.backlash import Backlash
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
-from nfc_gym.physics.effects.command import DeadZone, Offset, Saturation, SupplySag
+from nfc_gym.physics.effects.command import CommandGain, DeadZone, Offset, Saturation, SupplySag
 from nfc_gym.physics.effects.drive import Gain, Loss, TorqueSpeed
 from nfc_gym.physics.effects.everywhere import ALL, everywhere
 from nfc_gym.physics.effects.friction import Coulomb, DirectionalFriction, LoadFriction, Stribeck
@@ -40,7 +40,7 @@ __all__ = ["FAMILIES", "Context", "Effect", "Forces", "Param", "Scales", "build"
 
 _TYPES: tuple[type[Effect], ...] = (
     Coulomb, Stribeck, LoadFriction, DirectionalFriction, DampingPoly, Armature, SpringOffset, Hysteresis, Backlash,
-    Cogging, Gain, Loss, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
+    Cogging, Gain, Loss, CommandGain, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
     Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, Gust, RotorDrag, GroundEffect, ExternalForce, Slope,
     Slip, FrictionPatch, Compliance, Sinkage, SensorBias, SensorGain, SensorDelay, Misalignment,
     GenericPosition, GenericVelocity, GenericTime, GenericMemory, GenericGrip,

@@ -10,11 +10,19 @@ import numpy as np
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
-from nfc_gym.physics.effects.drive import ENDLESS, actuator_places, command_unit, is_position, moves_length, plain
+from nfc_gym.physics.effects.drive import (
+    ENDLESS,
+    actuator_places,
+    command_unit,
+    is_position,
+    moves_length,
+    plain,
+    servos,
+)
 from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, index, limited
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized, with_units
-from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, shift_range
+from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, shift_range, stretch_range
 from nfc_gym.physics.effects.words import together, with_spread
 from nfc_gym.physics.fields import ModelFields
 
@@ -88,6 +96,42 @@ class Offset(_OnCommand):
             unit = command_unit(model, known.index(where[0]))
             out.append(cls(where, with_units(sized(cls.PARAMS, offset=change), {"offset": unit})))
         return out
+
+
+class CommandGain(_OnCommand):
+    """A servo's command times `gain`: a gear, a wheel or a drum of another size than the model's, a goal rescaled.
+
+    Of a motor, which answers commands with a force, it would be its `gain`; of a servo, whose stiffness or damping
+    stays what it was, it is another law.
+    """
+
+    family = "command_gain"
+    summary = "Servo command scaled"
+    kin = ("gain",)
+    PARAMS = (Param("gain", "1", 0.2, 3.0, null=1.0, probes=(1.1, 0.9), resolution=0.002),)
+
+    def action(
+        self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
+    ) -> tuple[Array, Any]:
+        out = np.array(ctrl)
+        out[..., self.rows] *= theta[..., :1]
+        return out, memory
+
+    def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
+        actuators, gain = [spec.actuator(n) for n in self.where], float(theta[0])
+        # What integrates its command has no gain between the two.
+        if any(int(a.dyntype) not in _FOLLOWS or int(a.gaintype) not in (_FIXED_GAIN, _AFFINE_GAIN) for a in actuators):
+            return False
+        for actuator in actuators:
+            actuator.gainprm = np.asarray(actuator.gainprm) * gain
+            # clip(gain u, low, high) = gain clip(u, low / gain, high / gain), and so of the state of a filter.
+            for kind in ("ctrl", "act"):
+                stretch_range(actuator, kind, 1 / gain)
+        return True
+
+    @classmethod
+    def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        return [cls(where, cls.PARAMS) for where in actuator_places(model, servos(model))]
 
 
 class DeadZone(_OnCommand):

@@ -35,6 +35,13 @@ def plain(model: mujoco.MjModel) -> list[str]:
     ]
 
 
+def servos(model: mujoco.MjModel) -> list[str]:
+    """Those of them whose force falls with what they move: position and velocity servos, motors with back-EMF."""
+    known = actuator_names(model)
+    affine, prm = model.actuator_biastype == _AFFINE_BIAS, model.actuator_biasprm
+    return [n for n in plain(model) if affine[i := known.index(n)] and prm[i, 1:3].any()]
+
+
 def is_position(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether the command is a position servo's goal; one that integrates its command (`intvelocity`) wants a speed."""
     return _holds(model, actuator) and not _integrates(model, actuator)

@@ -26,6 +26,13 @@ def shift_range(actuator: mujoco.MjsActuator, kind: str, by: float) -> None:
         setattr(actuator, f"{kind}range", (low - by, high - by))
 
 
+def stretch_range(actuator: mujoco.MjsActuator, kind: str, by: float) -> None:
+    """Multiply both ends by `by`, above 0, where there is a range."""
+    low, high = range_of(actuator, kind)
+    if low > -np.inf:
+        setattr(actuator, f"{kind}range", (low * by, high * by))
+
+
 def mixes(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> bool:
     """Whether an actuator's delay mixes two commands, which MuJoCo does before it clips them."""
     steps = actuator.delay / spec.option.timestep
