@@ -222,9 +222,16 @@ def _unmeasured(name: str) -> Array:
 
 
 def _merged(new: Any, old: Any, rows: NDArray[np.bool_]) -> Any:
-    """Hidden states with `rows` (n,) taken from `new` and the others from `old`."""
-    if isinstance(old, tuple | list):
-        return type(old)(_merged(a, b, rows) for a, b in zip(new, old, strict=True))
-    if old is None:
-        return None
+    """Hidden states with `rows` (n,) taken from `new` and the others from `old`.
+
+    A list that has grown in one of them goes on as it ends in the other; what is no array belongs to all rows.
+    """
+    if isinstance(old, tuple):
+        return tuple(_merged(a, b, rows) for a, b in zip(new, old, strict=True))
+    if isinstance(old, list):
+        count = max(len(new), len(old))
+        ends = ([*part, *[part[-1]] * (count - len(part))] for part in (new, old))
+        return [_merged(a, b, rows) for a, b in zip(*ends, strict=True)]
+    if not isinstance(old, np.ndarray):
+        return old
     return np.where(rows.reshape(-1, *(1,) * (np.ndim(old) - 1)), new, old)

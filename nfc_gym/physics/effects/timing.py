@@ -19,6 +19,8 @@ from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, range_of
 from nfc_gym.physics.recurrence import FORGOTTEN, chased
 
 _STATELESS = int(mujoco.mjtDyn.mjDYN_NONE)
+_ENDLESS = 2.0**53  # steps: more are no whole number of them
+_LONGEST = 1e6  # steps that MuJoCo's buffer of an actuator may hold: it makes room for all of them at once
 
 
 def command_limits(model: mujoco.MjModel, rows: Rows) -> tuple[Array, Array]:
@@ -124,31 +126,32 @@ class Delay(_Late):
     PARAMS = (Param("delay", "s", 0.0, 0.5, probes=(0.01, 0.03, 0.08)),)
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
-        """What each past command weighs, None for one that no simulation looks back to, and those commands."""
-        weights = self._weights(theta, dt)
-        return weights, [ctrl[..., self.rows]] * len(weights)
+        """What each past command weighs, and those that were seen so far, the latest first.
+
+        Before the first of them its like was held since ever: a long delay keeps no more than there was.
+        """
+        return self._weights(theta, dt), [ctrl[..., self.rows]]
 
     @staticmethod
-    def _weights(theta: Array, dt: float) -> list[Array | None]:
-        """(..., 1) of each past command, the latest first."""
-        steps = theta[..., :1] / dt
+    def _weights(theta: Array, dt: float) -> dict[int, Array]:
+        """(..., 1) of the commands that some simulation looks back to, by their ages in steps, in ascending order."""
+        steps = np.minimum(theta[..., :1], _ENDLESS * dt) / dt
         whole = np.rint(steps)
         steps = np.where(np.abs(steps - whole) < 1e-9, whole, steps)
-        ages = range(int(np.ceil(np.max(steps, initial=0.0))) + 1)
-        weights = [np.maximum(0.0, 1.0 - np.abs(steps - age)) for age in ages]
-        return [w if w.any() else None for w in weights]
+        ages = np.unique([np.floor(steps), np.ceil(steps)])
+        return {int(age): np.maximum(0.0, 1.0 - np.abs(steps - age)) for age in ages}
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
         weights, past = memory
-        past = [ctrl[..., self.rows], *past[:-1]]
-        made = reduce(add, [w * values for w, values in zip(weights, past, strict=True) if w is not None])
+        past = [ctrl[..., self.rows], *past[: max(weights)]]
+        made = reduce(add, [w * past[min(age, len(past) - 1)] for age, w in weights.items()])
         return self._replace(ctrl, limited(made, *self.limits)), (weights, past)
 
     def course(self, ctrl: Array, theta: Array, exogenous: Mapping[str, Array], dt: float) -> Array:
         wish, at = ctrl[..., self.rows], np.arange(ctrl.shape[-2])
-        weighed = ((age, w[..., None, :]) for age, w in enumerate(self._weights(theta, dt)) if w is not None)
+        weighed = ((age, w[..., None, :]) for age, w in self._weights(theta, dt).items())
         made = reduce(add, [w * wish[..., np.maximum(at - age, 0), :] for age, w in weighed])
         return self._replace(ctrl, limited(made, *self.limits))
 
@@ -164,7 +167,7 @@ class Delay(_Late):
         # MuJoCo reads its buffer before it writes, so that it knows no delay shorter than one step.
         if delay < dt * (1 - 1e-9) or any(a.delay > 0 or a.nsample > 0 for a in actuators):
             return False
-        if self._splits(spec) or not narrow_ranges(spec, self.where, "ctrl", *self.limits):
+        if delay > _LONGEST * dt or self._splits(spec) or not narrow_ranges(spec, self.where, "ctrl", *self.limits):
             return False
         for actuator in actuators:
             actuator.delay = delay
