@@ -80,6 +80,16 @@ def test_what_is_small_beside_guesses_is_no_cause() -> None:
     assert judged(3.0, 1.5, both).claimed == both, "without guesses it may be one of several"
 
 
+def test_what_mends_nothing_on_unseen_logs_is_no_cause() -> None:
+    one, other = ({"id": i, "share_of_excess": 0.2} for i in ("dead_zone:motor", "delay:motor"))
+    idle = {"id": "stribeck:swing", "share_of_excess": 0.0}
+    out = judged(3.0, 1.5, [one, other, idle])
+    assert (out.verdict, out.claimed) == ("partly explained", [one, other])
+    assert out.weak == [idle | {"nearest": True, "alike": []}]
+    assert judged(3.0, 1.5, [idle]).verdict == "unexplained"
+    assert judged(1.0, 1.0, [idle]).claimed == [idle], "nothing remains that another law could have left"
+
+
 def test_a_law_of_another_form_is_no_cause() -> None:
     of = {"spring_offset:knee": "generic_memory:knee"}
     spring, friction = ({"id": i, "share_of_excess": 0.6} for i in (*of, "coulomb:hip"))
