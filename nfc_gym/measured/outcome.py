@@ -152,7 +152,7 @@ def _judge(
     seen = gain[1] < most or calibrated > bound
     verdict, taken = say.verdict(v, len(named) if seen else 0, generic and seen), say.taken_away(v, errors)
     # What is weak predicts, and stays in the model; that it is the cause of what is missing is not shown.
-    every = [r | {"nearest": True, "alike": found.doubted.get(r["id"], [])} for r in named]
+    every: list[dict[str, Any]] = [r | {"nearest": True, "alike": found.doubted.get(r["id"], [])} for r in named]
     if not seen:
         return _Judged(verdict, [], every, proposed, taken)
     if verdict != "partly explained":
