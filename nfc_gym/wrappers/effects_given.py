@@ -48,8 +48,8 @@ def _own_pair(given: Any) -> tuple[Effect, Array]:
 def _values(effect: Effect, theta: ArrayLike) -> Array:
     """Values (k,) of an effect; another number of them, or what cannot be, raises `InputError`."""
     try:
-        values = np.asarray(theta, float)
-    except (TypeError, ValueError):
+        values = numbers(theta, effect.id)
+    except InputError:
         values = np.zeros(0)
     if values.shape != (len(effect.params),) or not np.isfinite(values).all():
         names = ", ".join(p.name for p in effect.params)

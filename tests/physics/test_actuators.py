@@ -248,6 +248,37 @@ def test_thermal_fades_a_step_as_it_heats_up() -> None:
     np.testing.assert_allclose(made[5:], 2 * (1 - 0.3 * (1 - np.exp(-time / 0.1))), atol=1e-12)
 
 
+def test_a_drive_that_is_too_hot_gives_nothing_and_never_turns_round() -> None:
+    """At 1.5 times the reference the heat goes to 2.25, beyond the 1 / 0.6 at which the last of the force is gone."""
+    made = _made("thermal", {"fade": 0.6, "time_constant": 0.02, "reference": 1.0}, np.r_[0.0, np.full(100, 1.5)])
+    assert made[1] > 1
+    assert (made >= 0).all()
+    np.testing.assert_array_equal(made[-20:], 0)
+
+
+def test_heat_and_sag_are_not_looked_for_in_goals_of_position_servos() -> None:
+    text = RAIL.replace("</actuator>", '<position name="hold" joint="rail" kp="3"/></actuator>')
+    model, one = mujoco.MjModel.from_xml_string(text), np.ones(1)
+    scales = Scales(one, one, np.ones(2), np.ones(2), 0.01, {"exo:supply": 12.0})
+    found = {e.id for e in propose(model, scales, only=("thermal", "supply_sag", "dead_zone"), generic=False)}
+    assert found == {"thermal:push", "supply_sag:push", "dead_zone:push"}
+
+
+@pytest.mark.parametrize(
+    ("family", "parameters", "signals", "wanted"),
+    [
+        ("dead_zone", {"width": 0.4}, {}, 4.6),
+        ("supply_sag", {"exponent": 1.0, "reference": 12.0}, {"exo:supply": np.full(9, 9.0)}, 3.75),
+        ("thermal", {"fade": 0.3, "time_constant": 0.1, "reference": 5.0}, {}, 3.5),
+    ],
+)
+def test_a_drive_is_given_no_more_than_its_range(
+    family: str, parameters: dict[str, float], signals: dict[str, np.ndarray], wanted: float
+) -> None:
+    """MuJoCo clips a command of 9 to 5: a drive loses of the 5, and is heated by them alone."""
+    np.testing.assert_allclose(_made(family, parameters, np.full(9, 9.0), exogenous=signals), wanted)
+
+
 def test_of_delays_that_differ_the_model_carries_all_or_none() -> None:
     """MJCF has no delay shorter than a step: were the longer one in the model, it would act there and beside it."""
     two = RAIL.replace("</actuator>", '<motor name="pull" joint="rail"/></actuator>')

@@ -56,6 +56,29 @@ def test_payload_is_a_welded_point_mass(mass: float, place: tuple[float, float, 
     assert model.body_subtreemass[1] == pytest.approx(2 + mass)
 
 
+FRAME = """
+<mujoco><worldbody><body name="frame" simple="false"><joint name="rail" type="slide" axis="1 0 0"/>
+<body pos="0 0 .2"><geom size=".1" mass="2"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.5])
+def test_a_body_without_mass_carries_a_payload_or_none(mass: float) -> None:
+    """A bare frame, whose mass is in what is welded to it: a load of nothing leaves it as it is."""
+    payload, theta = make("payload", "frame", {"mass": mass, "x": 0.1, "y": 0.0, "z": 0.0})
+    found = run(FRAME, payload, theta, 20, qvel=[1.0])
+    assert found.stable.all()
+    if mass == 0:
+        np.testing.assert_array_equal(found.qpos, run(FRAME, None, [], 20, qvel=[1.0]).qpos)
+    model = mujoco.MjModel.from_xml_string(FRAME)
+    payload.bind(model)
+    fields = ModelFields(model)
+    payload.model(fields, theta)
+    fields.commit()
+    assert model.body_mass[1] == mass
+    assert model.dof_M0[0] == pytest.approx(2 + mass)
+    np.testing.assert_allclose(model.body_ipos[1], [0.1 * (mass > 0), 0, 0])
+
+
 def test_payload_moves_as_the_welded_body_does() -> None:
     place = (0.2, -0.1, 0.15)
     effect, theta = make("payload", "b", {"mass": 0.7, **dict(zip("xyz", place, strict=True))})

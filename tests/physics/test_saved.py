@@ -63,6 +63,18 @@ def test_a_unit_of_something_else_is_refused(unit: str) -> None:
         build("coulomb", "j", {"level": {"value": 200, "unit": unit}})
 
 
+@pytest.mark.parametrize("flag", [True, {"value": False}, {"value": True, "unit": "deg"}, np.True_])
+def test_a_flag_is_no_value(flag: Any) -> None:
+    with pytest.raises(InputError, match=r"slope: roll is (np\.)?(True|False)_?; want a number"):
+        from_row({"family": "slope", "where": "world", "parameters": {"roll": flag, "pitch": 0.0}})
+
+
+def test_numbers_that_yaml_takes_for_text_are_numbers() -> None:
+    parameters = yaml.safe_load("{level: 1e-3}")
+    assert parameters == {"level": "1e-3"}
+    assert build("coulomb", "j", parameters)[1] == 1e-3
+
+
 def test_a_place_that_is_named_twice_is_refused() -> None:
     with pytest.raises(InputError, match="gain: m is named more than once"):
         build("gain", ["m", "n", "m"], {"gain": 0.1})

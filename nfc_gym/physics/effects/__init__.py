@@ -102,9 +102,16 @@ def build(family: str, where: Sequence[str] | str, parameters: Mapping[str, obje
         if isinstance(entry, Mapping):
             value, unit = _converted(f"{family}: {p.name}", entry["value"], str(entry.get("unit", p.unit)), p.unit)
         params.append(replace(p, unit=unit))
-        values.append(float(value))  # type: ignore[arg-type]
+        values.append(number(value, f"{family}: {p.name}"))
     placed = everywhere(kind) if places == (ALL,) else kind
     return placed(places, params), np.array(values)
+
+
+def number(value: Any, what: str) -> float:
+    """A parameter's value; text that reads like one is one, since YAML takes 1e-3 for text, and a flag is none."""
+    if isinstance(value, bool | np.bool_):
+        raise InputError(f"{what} is {value!r}; want a number")
+    return float(value)
 
 
 def _converted(what: str, value: Any, unit: str, own: str) -> tuple[Any, str]:
@@ -113,7 +120,7 @@ def _converted(what: str, value: Any, unit: str, own: str) -> tuple[Any, str]:
         return value, unit
     if not units.known(unit) or units.si_unit(unit) not in (own, slid(own)):
         raise InputError(f"{what} is in {unit!r}; want {own}")
-    return float(units.to_si(float(value), unit)), units.si_unit(unit)
+    return float(units.to_si(number(value, what), unit)), units.si_unit(unit)
 
 
 def _family(name: str) -> type[Effect]:

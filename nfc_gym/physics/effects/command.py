@@ -23,6 +23,7 @@ from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, index, 
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized, with_units
 from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, shift_range, stretch_range
+from nfc_gym.physics.effects.timing import command_limits
 from nfc_gym.physics.effects.words import together, with_spread
 from nfc_gym.physics.fields import ModelFields
 
@@ -40,6 +41,11 @@ class _OnCommand(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.rows = index(actuator_ids(model, self.where))
+        self.limits = command_limits(model, self.rows)
+
+    def _received(self, ctrl: Array) -> Array:
+        """(..., n) what a drive is given of commands: MuJoCo clips what lies beyond their range."""
+        return limited(ctrl[..., self.rows], *self.limits)
 
     @classmethod
     def _spread(cls, model: mujoco.MjModel, scales: Scales, where: Sequence[str]) -> float:
@@ -145,8 +151,8 @@ class DeadZone(_OnCommand):
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
-        out, width = np.array(ctrl), theta[..., :1]
-        out[..., self.rows] -= limited(ctrl[..., self.rows], -width, width)
+        out, width, given = np.array(ctrl), theta[..., :1], self._received(ctrl)
+        out[..., self.rows] = given - limited(given, -width, width)
         return out, memory
 
     @classmethod
@@ -297,7 +303,7 @@ class SupplySag(_OnCommand):
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
     ) -> tuple[Array, Any]:
         out = np.array(ctrl)
-        out[..., self.rows] *= self._factor(theta, exogenous)
+        out[..., self.rows] = self._received(ctrl) * self._factor(theta, exogenous)
         return out, memory
 
     def demand(self, force: Array, theta: Array, ctx: Context) -> Array:

@@ -169,7 +169,8 @@ def add_point_mass(fields: ModelFields, body: int, mass: Array, place: Array) ->
     masses, iposes = fields["body_mass"], fields["body_ipos"]
     inertias, iquats = fields["body_inertia"], fields["body_iquat"]
     old, quat = masses[..., body], iquats[..., body, :]
-    share = (mass / (old + mass))[..., None]
+    whole = old + mass
+    share = (mass / np.where(whole > 0, whole, 1.0))[..., None]  # nothing that is put on nothing lies nowhere
     d = rotate_back(quat, place - iposes[..., body, :])
     reduced = (share[..., 0] * old)[..., None, None]
     outer = d[..., :, None] * d[..., None, :]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects import build, number
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.each import Each, each
@@ -86,8 +86,9 @@ def _conditioned(family: str, where: str | list[str], given: Mapping[str, Any], 
     missing = [p.name for p in effect.params if p.name not in given]
     if missing:
         raise InputError(f"{effect.id}: the value of {missing[0]!r} is missing; there are: {', '.join(given)}")
-    values = [given[p.name] for p in effect.params]
-    return _possible(effect, np.array([float(v["value"] if isinstance(v, Mapping) else v) for v in values]))
+    values = [(f"{family}: {p.name}", given[p.name]) for p in effect.params]
+    values = [number(v["value"] if isinstance(v, Mapping) else v, what) for what, v in values]
+    return _possible(effect, np.array(values))
 
 
 def _keys(row: Any) -> tuple[str, str | list[str], Mapping[str, Any]]:

@@ -9,15 +9,17 @@ import mujoco
 import numpy as np
 
 from nfc_gym.physics.effects.base import Array, Effect, Scales
-from nfc_gym.physics.effects.drive import actuator_places, plain
-from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, index
+from nfc_gym.physics.effects.drive import actuator_places, is_position, plain
+from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, index, limited
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
+from nfc_gym.physics.effects.timing import command_limits
 from nfc_gym.physics.recurrence import chased
 
 
 class Thermal(Effect):
-    """Commands times 1 - fade h; the heat h follows (u / reference)^2: dh/dt = ((u / reference)^2 - h) / time_constant.
+    """Commands times max(1 - fade h, 0); the heat h goes after (u / reference)^2, with u the command within its range:
+    dh/dt = ((u / reference)^2 - h) / time_constant.
 
     One thermal mass heated by the losses of the winding, which go with the square of the current; the resistance that
     rises with it takes from the force. The heat starts settled at a log's or an episode's
@@ -36,9 +38,14 @@ class Thermal(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.rows = index(actuator_ids(model, self.where))
+        self.limits = command_limits(model, self.rows)
 
     def state0(self, shape: tuple[int, ...], ctrl: Array, theta: Array, dt: float) -> Any:
-        return (ctrl[..., self.rows] / theta[..., 2:3]) ** 2
+        return (self._received(ctrl) / theta[..., 2:3]) ** 2
+
+    def _received(self, ctrl: Array) -> Array:
+        """(..., n) what the drives are given of commands."""
+        return limited(ctrl[..., self.rows], *self.limits)
 
     def span(self, theta: Array) -> float:
         return np.inf  # it warms up over minutes
@@ -57,14 +64,15 @@ class Thermal(Effect):
 
     def _faded(self, ctrl: Array, theta: Array, heat: Array) -> Array:
         out = np.array(ctrl)
-        out[..., self.rows] *= 1 - theta[..., 0:1] * heat
+        out[..., self.rows] = self._received(ctrl) * np.maximum(1 - theta[..., 0:1] * heat, 0.0)
         return out
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         known = actuator_names(model)
         out: list[Effect] = []
-        for where in actuator_places(model, plain(model)):
+        names = [n for n in plain(model) if not is_position(model, known.index(n))]  # whose goal is no current
+        for where in actuator_places(model, names):
             size = max(float(np.max(scales.drive[[known.index(n) for n in where]])), 1e-6)
             # The reference only sets the unit of heat: free, it would be the fade under another name.
             fixed = {"probes": (size,), "low": size * (1 - 1e-3), "high": size * (1 + 1e-3)}
