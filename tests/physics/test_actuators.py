@@ -1,5 +1,6 @@
 """Effects on commands and on what actuators make of them, against closed forms."""
 
+import copy
 from collections.abc import Sequence
 from functools import partial
 
@@ -11,6 +12,7 @@ from machines import make, plant_of, run
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects import Context, Effect, Scales, build, propose
 from nfc_gym.physics.effects.each import each
+from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.segments import Segments
 
 DT, MASS = 0.002, 2.0
@@ -491,3 +493,56 @@ def test_a_limit_that_is_none_gives_a_motor_no_torque_speed_line() -> None:
         x = np.concatenate([np.zeros(0), *(theta for _, theta in pairs)])
         moved.append(plant_of(model, *(e for e, _ in pairs)).shoot(x[None], segments).qvel)
     np.testing.assert_array_equal(*moved)
+
+
+MUSCLE = """
+<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody><body>
+<joint name="knee" axis="0 1 0" range="-1 1" limited="true" damping="20"/>
+<geom size=".1" mass="1" pos="0 0 -.3"/></body></worldbody>
+<actuator><muscle name="push" joint="knee" lengthrange="-1 1" {}/></actuator>
+<sensor><actuatorfrc name="made" actuator="push"/></sensor></mujoco>"""
+
+
+@pytest.mark.parametrize("strength", ['scale="80"', 'force="5"', 'force="9" forcerange="-3 0"'])
+@pytest.mark.parametrize(
+    ("family", "parameters", "share"),
+    [("gain", {"gain": 0.5}, 0.5), ("loss", {"fraction": 1.0}, 0.0), ("gain", {"gain": -1.0}, 0.0)],
+)
+def test_a_muscle_loses_strength_and_keeps_its_lengths(
+    strength: str, family: str, parameters: dict[str, float], share: float
+) -> None:
+    """A share of the force at every activation and length, as it contracts and as it is stretched; it never pushes."""
+    text = MUSCLE.format(strength)
+    effect, theta = make(family, "push", parameters)
+    model = mujoco.MjModel.from_xml_string(text)
+    effect.bind(model)
+    spec = mujoco.MjSpec.from_string(text)
+    assert effect.spec(spec, theta)
+    for weak in (_edited(model, effect, theta), mujoco.MjModel.from_xml_string(spec.to_xml())):
+        for q, v, act in ((-0.8, 0.0, 0.2), (0.3, 0.5, 1.0), (0.9, -0.5, 0.4), (0.9, 0.0, 0.0)):
+            whole, left = (_muscle_force(m, q, v, act) for m in (model, weak))
+            assert whole < 0
+            assert left == pytest.approx(share * whole, rel=1e-6)
+
+
+def _edited(model: mujoco.MjModel, effect: Effect, theta: np.ndarray) -> mujoco.MjModel:
+    out = copy.copy(model)
+    fields = ModelFields(out, model)
+    effect.model(fields, theta)
+    fields.commit()
+    return out
+
+
+def _muscle_force(model: mujoco.MjModel, q: float, v: float, act: float) -> float:
+    data = mujoco.MjData(model)
+    data.qpos[0], data.qvel[0], data.act[0] = q, v, act
+    mujoco.mj_forward(model, data)
+    return float(data.actuator_force[0])
+
+
+def test_what_scales_an_unknown_force_is_not_guessed() -> None:
+    """The half of a user's law may be anything."""
+    text = RAIL.replace("</actuator>", '<general name="own" joint="rail" gaintype="user" biastype="user"/></actuator>')
+    for family, parameters in (("gain", {"gain": 0.5}), ("loss", {"fraction": 0.5})):
+        with pytest.raises(InputError, match="the force of 'own' is not known; actuators of which it is: push"):
+            make(family, "own", parameters)[0].bind(mujoco.MjModel.from_xml_string(text))

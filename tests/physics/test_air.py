@@ -275,3 +275,25 @@ def test_places_where_nothing_could_happen_are_refused(
     effect, _ = make(family, where, theta)
     with pytest.raises(InputError, match=said):
         effect.bind(mujoco.MjModel.from_xml_string(FLYER % 0))
+
+
+STAGE = """
+<mujoco><worldbody>
+  <body name="led" mocap="true" pos="0 0 2"><geom size=".1"/></body>
+  <body name="pedestal"><geom size=".1"/>
+    <body name="arm"><joint name="turn" axis="0 1 0"/><geom pos="0 0 .3" size=".1"/>
+      <body name="tool" pos="0 0 .5"><geom size=".05"/></body></body></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("where", ["led", "pedestal"])
+@pytest.mark.parametrize("family", ["payload", "inertia", "drag_linear", "external_force"])
+def test_what_no_force_moves_is_refused(family: str, where: str) -> None:
+    model = mujoco.MjModel.from_xml_string(STAGE)
+    effect, _ = make(family, where, dict.fromkeys("xyz", 1.0) | ({"mass": 1.0} if family == "payload" else {}))
+    with pytest.raises(InputError, match=f"body '{where}' does not move; bodies: arm, tool"):
+        effect.bind(model)
+    scales = Scales(np.ones(model.nv), np.ones(model.nv), np.zeros(0), np.zeros(0), 0.01)
+    found = propose(model, scales, only=("payload", "inertia", "external_force"), generic=False)
+    assert not {where} & {place for e in found for place in e.where}
+    make("drag_linear", "tool", dict.fromkeys("xyz", 1.0))[0].bind(model)  # it moves with the arm

@@ -183,7 +183,7 @@ def test_effects_act_in_their_order() -> None:
     two = plant_of(MODEL, second, first).shoot(np.concatenate([b, a])[None], segments).qpos
     shifted = replace(segments, ctrl=segments.ctrl.copy())
     push = MODEL.actuator("push").id
-    wish = segments.ctrl[..., push] + 0.4
+    wish = np.clip(segments.ctrl[..., push] + 0.4, *MODEL.actuator_ctrlrange[push])  # what reaches the drive
     shifted.ctrl[..., push] = wish - np.clip(wish, -0.3, 0.3)
     np.testing.assert_array_equal(one, plant_of(MODEL).shoot(NONE, shifted).qpos)
     assert np.abs(one - two).max() > 1e-6

@@ -18,6 +18,10 @@ from nfc_gym.physics.fields import ModelFields
 
 _FIXED, _AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
 _NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+_MUSCLE, _MUSCLE_BIAS = int(mujoco.mjtGain.mjGAIN_MUSCLE), int(mujoco.mjtBias.mjBIAS_MUSCLE)
+_STRENGTH = slice(
+    2, 4
+)  # of a muscle's parameters: its peak force, and the scale that it is made of where it is not given
 _INTEGRATOR = int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
 _JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
@@ -33,6 +37,12 @@ def plain(model: mujoco.MjModel) -> list[str]:
         if int(model.actuator_gaintype[i]) in (_FIXED, _AFFINE_GAIN)
         and int(model.actuator_biastype[i]) in (_NO_BIAS, _AFFINE_BIAS)
     ]
+
+
+def _muscles(model: mujoco.MjModel) -> list[str]:
+    """Actuators whose active and passive force are a muscle's."""
+    own = (model.actuator_gaintype == _MUSCLE) & (model.actuator_biastype == _MUSCLE_BIAS)
+    return [n for n, muscle in zip(actuator_names(model), own, strict=True) if muscle]
 
 
 def servos(model: mujoco.MjModel) -> list[str]:
@@ -108,9 +118,17 @@ def actuator_places(model: mujoco.MjModel, names: Sequence[str]) -> list[tuple[s
 
 
 def scale_force(fields: ModelFields, rows: NDArray[np.intp], factor: Array) -> None:
-    """Multiply everything that an actuator's force is made of, its limits included, by `factor` (...,)."""
-    for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
-        scale_rows(fields, name, rows, factor)
+    """Multiply everything that an actuator's force is made of, its limits included, by `factor` (...,).
+
+    Of a muscle's parameters these are its strength alone, the others are lengths and speeds; it pulls or does nothing.
+    """
+    muscles = np.asarray(fields.nominal_model.actuator_gaintype)[rows] == _MUSCLE
+    for name in ("actuator_gainprm", "actuator_biasprm"):
+        if not muscles.all():
+            scale_rows(fields, name, rows[~muscles], factor)
+        if muscles.any():
+            fields[name][..., rows[muscles], _STRENGTH] *= np.maximum(factor, 0.0)[..., None, None]
+    scale_rows(fields, "actuator_forcerange", rows, factor)
     ranges = fields["actuator_forcerange"]
     ranges[..., rows, :] = np.sort(ranges[..., rows, :], -1)  # of a force turned round the lower end was the upper
 
@@ -118,14 +136,20 @@ def scale_force(fields: ModelFields, rows: NDArray[np.intp], factor: Array) -> N
 def _scale_spec(spec: mujoco.MjSpec, names: Sequence[str], factor: float) -> None:
     for name in names:
         actuator = spec.actuator(name)
+        muscle = int(actuator.gaintype) == _MUSCLE
         for key in ("gainprm", "biasprm"):
-            setattr(actuator, key, np.asarray(getattr(actuator, key)) * factor)
+            values = np.array(getattr(actuator, key))
+            if muscle and factor <= 0:
+                values[_STRENGTH.start] = 0.0  # MJCF wants a scale above 0
+            else:
+                values[_STRENGTH if muscle else slice(None)] *= factor
+            setattr(actuator, key, values)
         if factor != 0:  # no force at all needs no limit, and MJCF has none of zero width
             actuator.forcerange = np.sort(np.asarray(actuator.forcerange) * factor)
 
 
 class Gain(Effect):
-    """Force of the actuator times `gain`: a motor constant or servo stiffness other than the model's."""
+    """Force of the actuator times `gain`: a motor constant, a servo's stiffness, a muscle's strength."""
 
     family = "gain"
     summary = "Actuator force scaled"
@@ -133,6 +157,12 @@ class Gain(Effect):
 
     def bind(self, model: mujoco.MjModel) -> None:
         self.rows = actuator_ids(model, self.where)
+        fit = {*plain(model), *_muscles(model)}
+        if unfit := [n for n in self.where if n not in fit]:
+            raise InputError(
+                f"{self.family}: what scales the force of {unfit[0]!r} is not known; actuators of which it is: "
+                f"{', '.join(n for n in actuator_names(model) if n in fit) or 'none'}"
+            )
 
     def factor(self, theta: Array) -> Array:
         """Force over nominal force, (...,)."""
@@ -147,7 +177,8 @@ class Gain(Effect):
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
         factor = float(self.factor(theta))
         # A servo's damping turned round is read as a damping ratio, which MJCF writes as a positive biasprm[2].
-        if factor < 0 and any(spec.actuator(name).biasprm[2] < 0 for name in self.where):
+        actuators = [spec.actuator(name) for name in self.where]
+        if factor < 0 and any(a.biasprm[2] < 0 and int(a.biastype) != _MUSCLE_BIAS for a in actuators):
             return False
         _scale_spec(spec, self.where, factor)
         return True

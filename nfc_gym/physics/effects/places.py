@@ -121,12 +121,20 @@ def largest_push(model: mujoco.MjModel, scales: Scales, names: Sequence[str]) ->
 
 def moving_bodies(model: mujoco.MjModel) -> list[str]:
     """Names of bodies that have mass and can move, one for each set of bodies welded together."""
-    names = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
+    names, moves = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody), _moves(model)
     return [
         names[b]
         for b in range(1, model.nbody)
-        if names[b] and int(model.body_weldid[b]) == b and model.body_mass[b] > 0
+        if names[b] and moves[b] and int(model.body_weldid[b]) == b and model.body_mass[b] > 0
     ]
+
+
+def _moves(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """(nbody,) whether forces move a body: it or one that carries it has a joint. A mocap goes where it is put."""
+    out = np.array(model.body_jntnum) > 0
+    for body in range(1, model.nbody):  # parents come first
+        out[body] |= out[model.body_parentid[body]]
+    return out
 
 
 def base_bodies(model: mujoco.MjModel) -> list[str]:
@@ -179,13 +187,18 @@ def _below(model: mujoco.MjModel, body: int) -> set[int]:
 
 
 def body_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
-    """Id of each named body, (n,); an unknown name raises `InputError` listing what exists, and so does the world,
-    which nothing moves."""
-    known = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
+    """Id of each named body, (n,).
+
+    Raises:
+      InputError: a name that the model lacks, or a body that no force moves: the world, what is welded to it, a mocap.
+    """
+    known, moves = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody), _moves(model)
     for name in names:
-        if name not in known[1:]:
-            told = "the world does not move" if name == known[0] else f"the model has no body named {name!r}"
-            raise InputError(f"{told}; bodies: {', '.join(n for n in known[1:] if n)}")
+        if name not in known or not moves[known.index(name)]:
+            told = f"body {name!r} does not move" if name in known else f"the model has no body named {name!r}"
+            told = "the world does not move" if name == known[0] else told
+            movable = ", ".join(n for n, free in zip(known, moves, strict=True) if n and free)
+            raise InputError(f"{told}; bodies: {movable or 'none'}")
     return np.array([known.index(n) for n in names], np.intp)
 
 
