@@ -24,6 +24,7 @@ MANY_TURNS = 4 * np.pi  # rad; a joint that goes further may be in degrees, unle
 
 _RUNS = 20  # changes of a value from which on it is told whether they come at a beat
 _TOUCHES = (int(mujoco.mjtSensor.mjSENS_TOUCH), int(mujoco.mjtSensor.mjSENS_CONTACT))
+_PILE = 5  # times as often as the step beside it that a clipped speed's extreme is
 _ALIKE = 0.8  # share of them that are as many rows apart: an encoder's steps are not
 
 
@@ -175,18 +176,30 @@ def _any_channel(name: str, channel: Channel, mapping: Mapping, model: mujoco.Mj
                 "warning", where, "constant part", message, "name the right column, or leave the component out"
             )
         for i in range(values.shape[1]):
-            if name.startswith(("sensor:", "force:")):  # a joint may well rest at the end of its travel
+            if name.startswith(("sensor:", "force:")):
                 yield from _clipped(where, compared[:, i], 0.02)
+            elif not name.endswith((":pos", ":quat")):  # a joint may well rest at the end of its travel
+                yield from _clipped(where, compared[:, i], 0.02, rests=True)
 
 
-def _clipped(where: str, values: Array, share: float) -> Iterator[Suspicion]:
-    """Many samples at exactly the largest or smallest value of a signal that otherwise takes many values."""
-    if len(values) < 50 or len(np.unique(values)) < 30:
+def _clipped(where: str, values: Array, share: float, rests: bool = False) -> Iterator[Suspicion]:
+    """Many samples at exactly the largest or smallest value of a signal that otherwise takes many values.
+
+    Args:
+      where: what the finding names.
+      values: (T,); NaN where a slower sensor has no sample.
+      share: of the samples from which on they are many.
+      rests: the signal is a speed: it may well be 0 for long, and where counts make steps of it (an encoder's) it is
+        clipped only if its extreme is far oftener than the step beside it.
+    """
+    values = values[np.isfinite(values)]
+    steps, often = np.unique(values, return_counts=True)
+    if len(values) < 50 or len(steps) < 30:
         return
-    for edge in (values.max(), values.min()):
-        at = float((values == edge).mean())
-        if at > share:
-            message = f"{at:.1%} of the samples are exactly {edge:.5g}, its extreme: clipped?"
+    for edge, beside in ((-1, -2), (0, 1)):
+        at = float(often[edge] / len(values))
+        if at > share and not (rests and (steps[edge] == 0 or often[edge] < _PILE * often[beside])):
+            message = f"{at:.1%} of the samples are exactly {steps[edge]:.5g}, its extreme: clipped?"
             yield Suspicion(
                 "warning", where, "clipped", message, "mask the rows where the reading is cut off (`mask: <column>`)"
             )

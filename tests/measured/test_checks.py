@@ -129,6 +129,8 @@ def test_scalar_order_is_found_without_rates(build: Build) -> None:
         (scale("goal", 3.0), ["ctrl:servo", "beyond the actuator's ctrlrange [-2.5, 2.5]"]),
         (lambda t: t.update(goal=np.clip(10 * t["goal"], -2.5, 2.5)), ["ctrl:servo", "saturated"]),
         (lambda t: t.update(gz=np.clip(t["gz"], -1.2, 1.2)), ["sensor:gyro", "clipped"]),
+        (lambda t: t.update(v=np.clip(t["v"], -0.7 * t["v"].max(), 0.7 * t["v"].max())),
+         ["joint:hinge:vel", "its extreme", "mask"]),
         (lambda t: [t.update({k: t[k][::2]}) for k in t] and t.update(t=np.delete(np.arange(203), [20, 21, 22]) * 0.02),
          ["time", "pause"]),
     ],
@@ -139,6 +141,17 @@ def test_a_doubtful_log_is_a_warning(build: Build, spoil: Any, words: list[str])
     text = "\n".join(str(f) for f in found if f.severity == "warning")
     for word in words:
         assert word in text
+
+
+def test_a_speed_in_steps_is_not_clipped(build: Build) -> None:
+    """An encoder counts them: many samples share the largest, as many as share the one below."""
+
+    def count(t: dict[str, Any]) -> None:
+        step = 2 * np.abs(t["v"]).max() / 35
+        t["v"] = np.round(t["v"] / step) * step
+        assert (t["v"] == t["v"].max()).mean() > 0.02 or (t["v"] == t["v"].min()).mean() > 0.02
+
+    assert "clipped" not in "\n".join(str(f) for f in check(build(count)))
 
 
 @pytest.mark.parametrize(
