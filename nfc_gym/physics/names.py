@@ -23,7 +23,7 @@ def names(model: mujoco.MjModel) -> Names:
     """The model's own names; an unnamed actuator is called after the joint it moves, all else by kind and number."""
     joints = _filled(names_of(model, _OBJ.mjOBJ_JOINT, model.njnt), "joint")
     bodies = _filled(names_of(model, _OBJ.mjOBJ_BODY, model.nbody), "body")
-    actuators = names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nu)
+    actuators = names_of(model, _OBJ.mjOBJ_ACTUATOR, model.nactuator)
     for i, name in enumerate(actuators):
         moves = int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_JOINT)
         joint = joints[int(model.actuator_trnid[i, 0])] if moves else ""

@@ -25,7 +25,7 @@ def drives(model: mujoco.MjModel) -> dict[str, int]:
     """Scalar joints that just one actuator moves, whose force is an affine function of command and motion: its id."""
     known, found = actuator_names(model), {}
     fit = {known.index(n) for n in plain(model)}
-    for a in range(model.nu):
+    for a in range(model.nactuator):
         joint = int(model.actuator_trnid[a, 0])
         if on_scalar(model, a):
             name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)

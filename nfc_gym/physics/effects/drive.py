@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
-from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, groups
+from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, groups, one_command_each
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import scale_rows, sized
 from nfc_gym.physics.fields import ModelFields
@@ -31,6 +31,8 @@ ENDLESS = 1e12  # N or N m: a force that no actuator reaches, as good as no limi
 
 def plain(model: mujoco.MjModel) -> list[str]:
     """Actuators whose force is gain * input + bias with constant or affine coefficients (motors and servos)."""
+    if not one_command_each(model):
+        return []
     return [
         n
         for i, n in enumerate(actuator_names(model))
@@ -255,6 +257,8 @@ class TorqueSpeed(Effect):
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         known = actuator_names(model)
+        if not plain(model):
+            return []
         rows = np.arange(model.nu)
         peaks = _peak(partial(getattr, model), rows, np.array([_reach(model, int(r)) for r in rows]))
         fit = [n for n in plain(model) if peaks[known.index(n)] > 0]

@@ -53,7 +53,7 @@ def places_of(effect: Effect, model: mujoco.MjModel) -> tuple[str, ...]:
 def _called(model: mujoco.MjModel) -> set[str]:
     """Names of whatever an effect can sit on."""
     counts = (
-        (_OBJ.mjOBJ_JOINT, model.njnt), (_OBJ.mjOBJ_ACTUATOR, model.nu), (_OBJ.mjOBJ_BODY, model.nbody),
+        (_OBJ.mjOBJ_JOINT, model.njnt), (_OBJ.mjOBJ_ACTUATOR, model.nactuator), (_OBJ.mjOBJ_BODY, model.nbody),
         (_OBJ.mjOBJ_GEOM, model.ngeom), (_OBJ.mjOBJ_SENSOR, model.nsensor),
     )  # fmt: skip
     return {name for kind, count in counts for name in names_of(model, kind, count)}

@@ -9,7 +9,7 @@ from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
 from nfc_gym.physics.effects.drive import command_unit
 from nfc_gym.physics.effects.generic import TIME
 from nfc_gym.physics.effects.law import Law, OfVariable, degrees, kind_of, pushed, time_of, turns
-from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names
+from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, one_command_each
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.words import with_spread
 
@@ -91,7 +91,7 @@ class LawCommand(_Linear):
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
         out: list[Effect] = []
         for place, dof, _, force, unit in pushed(model, scales):
-            for i, name in enumerate(actuator_names(model)):
+            for i, name in enumerate(actuator_names(model) if one_command_each(model) else ()):
                 if name and _tree(model, i) in (-1, int(model.dof_treeid[dof])):
                     of = command_unit(model, i)
                     size = force / max(float(scales.drive[i]), 1e-6)

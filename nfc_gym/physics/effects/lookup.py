@@ -71,9 +71,25 @@ def actuator_names(model: mujoco.MjModel) -> list[str]:
     return names_in(model).actuators
 
 
+def one_command_each(model: mujoco.MjModel) -> bool:
+    """Whether each actuator has one command and one force, so that its id is the column of both."""
+    return model.nu == model.nactuator == model.nout
+
+
 def actuator_ids(model: mujoco.MjModel, names: Sequence[str]) -> NDArray[np.intp]:
-    """Id of each actuator, (n,), as `actuator_names` calls them."""
+    """Id of each actuator, (n,), as `actuator_names` calls them.
+
+    Raises:
+      InputError: the model has no such actuator, or some with several commands or forces (`orientation`, `pid`).
+    """
     known = actuator_names(model)
+    if names and not one_command_each(model):
+        wide = [
+            n for n, c, f in zip(known, model.actuator_ctrlnum, model.actuator_outnum, strict=True) if c > 1 or f > 1
+        ]
+        raise InputError(
+            f"effects on actuators want one command and one force of each, and {', '.join(wide)} of this model has more"
+        )
     for name in names:
         if name not in known:
             raise InputError(f"the model has no actuator named {name!r}; it has: {', '.join(known)}")

@@ -63,7 +63,9 @@ def _carriers(model: mujoco.MjModel, body: int) -> tuple[list[int], bool]:
 def _floating(model: mujoco.MjModel) -> set[int]:
     """Undriven joints of bases that slide freely over the world along two axes or more, the turning ones included."""
     joint = int(mujoco.mjtTrn.mjTRN_JOINT)
-    driven = {int(model.actuator_trnid[i, 0]) for i in range(model.nu) if int(model.actuator_trntype[i]) == joint}
+    driven = {
+        int(model.actuator_trnid[i, 0]) for i in range(model.nactuator) if int(model.actuator_trntype[i]) == joint
+    }
     out: set[int] = set()
     for body in range(1, model.nbody):
         joints, grounded = _carriers(model, body)

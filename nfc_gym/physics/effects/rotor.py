@@ -8,7 +8,7 @@ import numpy as np
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.air import BodyMotion, body_scales, translating
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
-from nfc_gym.physics.effects.lookup import index
+from nfc_gym.physics.effects.lookup import index, one_command_each
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import body_ids, gyration, sized
 from nfc_gym.physics.fields import names_of
@@ -27,7 +27,7 @@ def thrusters(model: mujoco.MjModel, body: int) -> tuple[list[int], Array]:
     mujoco.mj_kinematics(model, data)
     frame = data.xmat[body].reshape(3, 3)
     found, pushes = [], []
-    for i in range(model.nu):
+    for i in range(model.nactuator if one_command_each(model) else 0):
         site = int(model.actuator_trnid[i, 0])
         if int(model.actuator_trntype[i]) != _SITE or int(model.body_rootid[model.site_bodyid[site]]) != int(
             model.body_rootid[body]

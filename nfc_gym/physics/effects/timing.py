@@ -12,7 +12,7 @@ import numpy as np
 
 from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
 from nfc_gym.physics.effects.drive import actuator_places
-from nfc_gym.physics.effects.lookup import Rows, actuator_ids, actuator_names, index, limited
+from nfc_gym.physics.effects.lookup import Rows, actuator_ids, actuator_names, index, limited, one_command_each
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import sized
 from nfc_gym.physics.effects.ranges import mixes, narrow_ranges, range_of
@@ -53,7 +53,7 @@ class _Late(Effect):
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
-        names = actuator_names(model)
+        names = actuator_names(model) if one_command_each(model) else []
         # Under a sample and a half the logs say little; beyond 0.3 s no drive of a robot would be called late.
         probes = tuple(p for p in (0.01, 0.03, 0.08) if p > 0.4 * scales.interval) or (2 * scales.interval,)
         params = sized(cls.PARAMS, **{cls.PARAMS[0].name: {"probes": probes, "resolution": 0.05 * scales.interval}})
