@@ -202,6 +202,21 @@ def test_soil_takes_work_in_proportion_to_load_and_way() -> None:
     assert kinetic["soil"] - kinetic["none"] == pytest.approx(c * weight * way, rel=0.03)
 
 
+@pytest.mark.parametrize("resistance", [0.3, 0.6, 1.0])
+def test_a_rover_that_soil_has_stopped_stands_still_at_any_step(resistance: float) -> None:
+    """The way to rest, v^2 / (2 c g) of the mass that rolls, hardly depends on the step; nothing shakes afterwards."""
+    way = {}
+    for step in (0.005, 0.0005):
+        model = _rover()
+        model.opt.timestep = step
+        speed = np.zeros(model.nv)
+        speed[0], speed[6:] = 1.0, 10.0
+        t = run(model, *make("sinkage", "ground", {"depth": 0.0, "resistance": resistance}), int(2 / step), qvel=speed)
+        assert np.abs(t.qvel[0, 0, -int(0.3 / step) :, 0]).max() < 1e-6
+        way[step] = float(t.qpos[0, 0, -1, 0])
+    assert way[0.005] == pytest.approx(way[0.0005], abs=0.005)
+
+
 def test_soil_under_one_wheel_and_without_wheels() -> None:
     model = _rover()
     speed = np.zeros(model.nv)

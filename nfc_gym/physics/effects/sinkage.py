@@ -17,16 +17,18 @@ from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.state import cross
 
 _EPS = 0.02  # m/s: below it the resistance fades out, as it must for a vehicle at rest
+_STEPS = 2.0  # in which it may stop a vehicle from there: in fewer it would throw one at rest to and fro
 
 
 class Sinkage(OnGround):
     """What touches the ground rests `depth` below its surface; each wheel is held back by `resistance` times its load.
 
     The resistance R = c N acts on the wheel's body against its way over the ground, N an even share of the vehicle's
-    weight: the work of pressing a rut. Bekker (Introduction to Terrain-Vehicle Systems, 1969, chapter 2) ties both for
-    a rigid wheel of diameter D and a pressure proportional to depth: c = 3/4 sqrt(depth / D); a soft tyre or a bow wave
-    adds to c, so both are free here. The depth is MuJoCo's contact `margin`, below zero by it. A machine without wheels
-    has the depth alone, single wheels have the resistance alone.
+    weight: the work of pressing a rut. It fades out below 0.02 m/s, or below what it takes off in two steps. Bekker
+    (Introduction to Terrain-Vehicle Systems, 1969, chapter 2) ties both for a rigid wheel of diameter D and a pressure
+    proportional to depth: c = 3/4 sqrt(depth / D); a soft tyre or a bow wave adds to c, so both are free here. The
+    depth is MuJoCo's contact `margin`, below zero by it. A machine without wheels has the depth alone, single wheels
+    have the resistance alone.
     """
 
     family = "sinkage"
@@ -77,7 +79,8 @@ class Sinkage(OnGround):
         velocity = spatial[..., 3:] + cross(spatial[..., :3], arm)
         velocity = velocity - (velocity * up).sum(-1, keepdims=True) * up
         normal = weight[..., None] * (ctx.nominal("body_mass") @ self.load)
-        held = theta[..., self.resistance] * normal / np.sqrt((velocity * velocity).sum(-1) + _EPS**2)
+        slow = np.maximum(_EPS, _STEPS * ctx.dt * theta[..., self.resistance] * weight[..., None])
+        held = theta[..., self.resistance] * normal / np.sqrt((velocity * velocity).sum(-1) + slow * slow)
         out.xfrc[..., self.bodies, :3] -= held[..., None] * velocity
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:
