@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core import InputError, units
-from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.mapping import Mapping
 from nfc_gym.measured.readers import Stream, Streams, Table
 from nfc_gym.measured.resampling import (
@@ -132,8 +131,8 @@ def shifted(name: str, shift: float) -> str:
 def uses(mapping: Mapping) -> list[Use]:
     """How each column of a mapping is brought to other times: commands and masks held, measurements interpolated."""
     found = [Use(c.columns, "hold" if c.hold == "zero" else "linear") for c in mapping.controls.values()]
-    for name, c in mapping.channels.items():
-        how = "slerp" if parse_channel(name).quantity == "quat" else "linear"
+    for c in mapping.channels.values():
+        how = "slerp" if c.order is not None else "linear"
         turn = float(units.from_si(2 * np.pi, c.unit)) if c.unit and units.si_unit(c.unit) == "rad" else None
         found.append(Use(c.columns, how, True, c.shift, c.rate, turn=turn))
         if c.mask:

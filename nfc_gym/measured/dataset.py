@@ -254,6 +254,7 @@ def _channel(name: str, entry: Measured, columns: LogColumns, alignment: Alignme
     names = tuple(_after_shift(columns, name, entry.shift) for name in entry.columns)
     raw = columns.many(names)
     width = len(entry.axes) if entry.axes else parsed.width or (1 if parsed.kind in ("joint", "force") else None)
+    width = width if entry.order is None else 4
     if width is not None and raw.shape[1] != width:
         raise InputError(
             f"{raw.shape[1]} columns where {width} {'are' if width > 1 else 'is'} wanted; name them in `columns`"
@@ -269,7 +270,7 @@ def _channel(name: str, entry: Measured, columns: LogColumns, alignment: Alignme
         raise InputError(f"columns {', '.join(entry.columns)}: every row is NaN or infinite; name other columns")
     unit = entry.unit or "1"
     values = units.to_si(_held(raw, present), unit)
-    if parsed.quantity == "quat":
+    if entry.order is not None:
         values = _quaternion(values, entry.order == "xyzw")
     return Channel(
         values=values[:, 0] if values.shape[1] == 1 else values,

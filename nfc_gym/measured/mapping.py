@@ -103,9 +103,14 @@ def _check_channel(name: ChannelName, channel: Measured) -> None:
     quaternion = name.quantity == "quat"
     if quaternion and channel.order is None:
         raise InputError("a quaternion's `order` must be said: wxyz (scalar first) or xyzw (scalar last)")
-    if not quaternion and channel.order is not None:
-        raise InputError("`order` is for quaternions")
-    if channel.unit is None and not quaternion:
+    if channel.order is not None and not quaternion:
+        if name.kind != "sensor":  # whether the model's sensor is one, `check` knows
+            raise InputError("`order` is for quaternions")
+        if channel.axes is not None:
+            raise InputError("`axes` is for vector sensors: of a quaternion all four columns are named")
+        if units.si_unit(channel.unit or "1") != "1":
+            raise InputError(f"unit {channel.unit!r} cannot be right: a quaternion has none")
+    if channel.unit is None and channel.order is None:
         raise InputError(f"`unit` is missing; {' or '.join(name.units) or 'say 1 if it has none'}")
     si = units.si_unit(channel.unit or "1")
     if name.units and si not in name.units:

@@ -13,6 +13,7 @@ from nfc_gym.physics.state import quat_difference, rotate, rotate_back
 
 Array = NDArray[np.float64]
 _OBJ = mujoco.mjtObj
+_TURNED = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
 # quantity -> (report group, SI unit) for joints (hinge, slide) and for bodies
 _JOINT = {"pos": (("joint angle", "rad"), ("position", "m")), "vel": (("joint speed", "rad/s"), ("velocity", "m/s"))}
 _BODY = {
@@ -48,12 +49,12 @@ class Observer:
     @property
     def quaternion(self) -> bool:
         """Whether the values are unit quaternions."""
-        return self._kind == "quat"
+        return self._kind in ("quat", "sensed quat")
 
     @property
     def needs_sensors(self) -> bool:
         """Whether prediction needs `sensordata`."""
-        return self._kind == "sensor"
+        return self._kind in ("sensor", "sensed quat")
 
     def predict(self, traj: Trajectory) -> Array:
         """Values (P, S, K + 1, dim) along a trajectory; of a vector sensor all components (see `pick`)."""
@@ -62,7 +63,7 @@ class Observer:
             return traj.qpos[..., a : a + 1]
         if self._kind == "qvel":
             return traj.qvel[..., a : a + 1]
-        if self._kind == "sensor":
+        if self.needs_sensors:
             assert traj.sensordata is not None
             return self.read(traj.sensordata)
         if self._kind == "pos":
@@ -136,6 +137,9 @@ def observer(model: mujoco.MjModel, name: str, axes: tuple[int, ...] | None = No
     if kind == "sensor":
         s = object_id(model, _OBJ.mjOBJ_SENSOR, rest)
         size = int(model.sensor_dim[s])
+        if is_orientation(model, s):
+            address = int(model.sensor_adr[s])
+            return Observer(name, f"sensor {rest}", "rad", 3, name, "sensed quat", address, size)
         return Observer(
             name,
             f"sensor {rest}",
@@ -157,6 +161,11 @@ def observer(model: mujoco.MjModel, name: str, axes: tuple[int, ...] | None = No
         f"channel {name!r}: want joint:<name>:pos|vel|acc, body:<name>:pos|quat|linvel|angvel, sensor:<name> "
         "or force:<actuator>"
     )
+
+
+def is_orientation(model: mujoco.MjModel, sensor: int) -> bool:
+    """Whether a sensor reads a unit quaternion, of which q and -q are the same orientation."""
+    return int(model.sensor_type[sensor]) in _TURNED
 
 
 def sensor_unit(model: mujoco.MjModel, sensor: int) -> str:

@@ -13,6 +13,7 @@ from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.frame_checks import exchanged
 from nfc_gym.measured.glitch_checks import glitches
 from nfc_gym.measured.mapping import Mapping
+from nfc_gym.measured.observe import is_orientation
 from nfc_gym.measured.rotation_checks import gravity, orientation, rate
 from nfc_gym.measured.speed_checks import DEGREES, TURN, explained, rate_ratio, ratio, strangers, too_fast
 from nfc_gym.measured.start_checks import open_loops
@@ -45,6 +46,7 @@ def suspicions(mapping: Mapping, model: mujoco.MjModel | None, log: Log) -> Iter
             yield from rate(name, channel)
         if model is not None and parsed.kind == "sensor":
             yield from _components(name, parsed.object, channel, model)
+            yield from _orientation_sensor(name, parsed.object, mapping, model)
             yield from gravity(name, parsed.object, channel, model)
     if mapping.segments.mode == "inverse":
         for name, values in log.known.items():
@@ -125,6 +127,25 @@ def _components(name: str, sensor: str, channel: Channel, model: mujoco.MjModel)
         message = f"{width} column{'s' * (width > 1)} where the sensor has {size} component{'s' * (size > 1)}"
         advice = "name all in `columns`, or say in `axes` which components these are"
         yield Suspicion("error", f"channels.{name}", "components", message, advice)
+
+
+def _orientation_sensor(name: str, sensor: str, mapping: Mapping, model: mujoco.MjModel) -> Iterator[Suspicion]:
+    """An orientation without a word on its scalar order, such a word on another sensor, and what mode forward lacks."""
+    at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, sensor)
+    if at < 0:
+        return
+    where, order = f"channels.{name}", mapping.channels[name].order
+    if not is_orientation(model, at):
+        if order is not None:
+            message = f"`order` is for orientations, and sensor {sensor!r} of the model reads none"
+            yield Suspicion("error", where, "order", message, "leave `order` out")
+    elif order is None:
+        message = f"sensor {sensor!r} of the model reads an orientation, and nothing says which column is the scalar"
+        advice = "say `order`: wxyz is scalar first (MuJoCo), xyzw scalar last (ROS, scipy, Vicon)"
+        yield Suspicion("error", where, "order", message, advice)
+    elif mapping.segments.mode == "forward":
+        message = "mode forward compares no orientations"
+        yield Suspicion("error", where, "forward", message, "leave the channel out, or use roll-outs")
 
 
 def _held(name: str, channel: Channel, log: Log) -> Iterator[Suspicion]:

@@ -47,7 +47,14 @@ def channel_noise(log: Log, name: str) -> float:
     if channel.noise is not None:
         return channel.noise
     values = channel.values[fresh_samples(log.time, channel.values, channel.rate)]
-    return estimate_noise(_turned(values) if parse_channel(name).quantity == "quat" else values)
+    return estimate_noise(_turned(values) if _turns(name, values) else values)
+
+
+def _turns(name: str, values: Array) -> bool:
+    """Whether a channel is an orientation's: a body's, or that of a sensor whose four numbers have a norm of 1."""
+    parsed = parse_channel(name)
+    four = parsed.kind == "sensor" and values.ndim == 2 and values.shape[1] == 4
+    return parsed.quantity == "quat" or (four and bool(np.allclose(np.linalg.norm(values, axis=1), 1, atol=1e-6)))
 
 
 def _measured(log: Log, channel: Channel) -> NDArray[np.intp]:
