@@ -123,6 +123,13 @@ class NeuralPosterior:
                 raise InputError(f"window: {name} holds {odd[0]:g}; every entry must be finite, also in float32")
         return states, actions, elevation
 
+    def _require_settings(self, name: str, how: dict[str, Any], known: tuple[str, ...]) -> None:
+        for odd in [key for key in how if key not in known]:
+            raise InputError(
+                f"{name}: {odd}= is no setting of the density {self.network.config.density!r}, "
+                f"which takes {' and '.join(f'{key}=' for key in known) or 'none'}"
+            )
+
     def _window(self) -> Encoded:
         if self.kept is None:
             raise InputError(
@@ -148,8 +155,15 @@ class NeuralPosterior:
         """`n` draws of psi in physical units, and of the other `parts`.
 
         `how` goes to the density: `steps=` and `stochastic=True` of a score model.
+
+        Raises:
+          InputError: n is no whole number of 1 or more, `rng` draws no numbers, a setting that this density does not
+            take, or no window was given.
         """
         require_whole("sample: n", n, 1)
+        if not isinstance(rng, np.random.Generator):
+            raise InputError(f"sample: rng is {rng!r}, want a generator of numbers: numpy.random.default_rng(seed)")
+        self._require_settings("sample", how, self.network.density.drawing)
         kept, maps = self._window(), None
         blocks = 2 if "delta_s" in self.parts else 1
         with seeded(rng, kept.mean.device):
@@ -176,8 +190,10 @@ class NeuralPosterior:
         density: `steps=` of a score model.
 
         Raises:
-          InputError: x has no psi, holds what this network does not infer or of another width, or no window was given.
+          InputError: x has no psi, holds what this network does not infer or of another width, a setting that this
+            density does not take, or no window was given.
         """
+        self._require_settings("log_prob", how, self.network.density.judging)
         kept = self._window()
         if x.psi is None:
             raise InputError("log_prob: the density is of psi, or of psi and delta_s together; x has no psi")

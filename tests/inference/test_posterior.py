@@ -223,12 +223,27 @@ def test_what_no_density_or_draw_can_be_asked_is_refused() -> None:
         for ask in (lambda s: given.sample(3, rng(), steps=s), lambda s: given.log_prob(Fidelity(drawn.psi), steps=s)):
             with pytest.raises(InputError, match=f"steps is {steps}, want a whole number, 1 or more"):
                 ask(steps)
+    for nothing in (None, 5):
+        with pytest.raises(InputError, match=f"sample: rng is {nothing}, want a generator of numbers"):
+            given.sample(3, nothing)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"log_prob: stochastic= is no setting of the density 'score', which takes st"):
+        given.log_prob(Fidelity(drawn.psi), stochastic=True)
     with pytest.raises(InputError, match=r"delta_s must end in 2 values, got shape \(3, 5\)"):
         given.log_prob(Fidelity(drawn.psi, np.zeros((3, 5))))
     states = np.array(window.states, float)
     states[4, 1] = 1e39
     with pytest.raises(InputError, match=r"states holds 1e\+39; every entry must be finite, also in float32"):
         posterior.given(Window(states, window.actions))
+
+
+@pytest.mark.parametrize("density", ["flow", "mixture"])
+def test_settings_of_another_density_are_refused(density: str) -> None:
+    given = NeuralPosterior(network(motion_windows(20), density=density)).given(cart()[1])
+    drawn = given.sample(3, rng())
+    with pytest.raises(InputError, match=f"sample: steps= is no setting of the density '{density}', which takes none"):
+        given.sample(3, rng(), steps=20)
+    with pytest.raises(InputError, match=f"log_prob: steps= is no setting of the density '{density}', which takes none"):
+        given.log_prob(drawn, steps=20)
 
 
 @pytest.mark.filterwarnings("error::UserWarning")

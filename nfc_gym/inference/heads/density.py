@@ -19,9 +19,13 @@ class Density(nn.Module):
 
     Attributes:
       widens: whether `calibrate` has something to set.
+      drawing: names of what `sample` takes beside.
+      judging: names of what `log_prob` takes beside.
     """
 
     widens = False
+    drawing: tuple[str, ...] = ()
+    judging: tuple[str, ...] = ()
 
     def __init__(self, sizes: Sequence[int], features: int) -> None:
         super().__init__()

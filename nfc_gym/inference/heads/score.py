@@ -69,6 +69,9 @@ class Score(Density):
       draws: noise draws for each point and step; the encoder runs once for all of them.
     """
 
+    drawing = ("steps", "stochastic")
+    judging = ("steps",)
+
     def __init__(
         self, sizes: Sequence[int], features: int, hidden: int = 256, depth: int = 4, dropout: float = 0.0,
         draws: int = 4,
