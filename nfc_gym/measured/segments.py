@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Inputs, Log
+from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.states import States
 from nfc_gym.physics.effects.base import TIME
 from nfc_gym.physics.past import Before, Past
@@ -22,6 +23,8 @@ _LEAD, _LEAST, _ROOM = 4000, 200, 1_000_000
 _STEP, _SHARE = 8.0, 0.02  # times its usual change from row to row, and of its range, from which a command steps
 _AROUND = 3  # rows on either side of a start from which its state is estimated
 _SETTLED = 0.05  # s after a step in which late drives may still pass it on
+_WINDOW = 7  # samples that states are told by (`estimate_states`)
+_SPARSE = 2.0  # times as far apart as usual that they may lie
 _PUT_OFF = 0.5  # of a stride, at most, by which a start is put off
 
 
@@ -104,6 +107,34 @@ def _put_off(log: Log, row: int, calm: tuple[NDArray[np.bool_], NDArray[np.bool_
     return row
 
 
+def _seen(log: Log) -> NDArray[np.bool_]:
+    """(T,) rows whose state is told by rows close by, in all channels that states come from.
+
+    The cubics of states go through seven samples. Where these lie twice as far apart as they usually do, in a stretch
+    that is masked, what a cubic cannot follow is no longer small beside the noise, and nothing tells how large it is.
+    """
+    out = np.ones(len(log), bool)
+    for name, channel in log.channels.items():
+        if channel.mask is None or parse_channel(name).kind not in ("joint", "body"):
+            continue
+        index = np.flatnonzero(channel.mask)
+        if len(index) <= _WINDOW:
+            continue
+        first = np.clip(np.searchsorted(index, np.arange(len(log))) - _WINDOW // 2, 0, len(index) - _WINDOW)
+        begin, end = log.time[index[first]], log.time[index[first + _WINDOW - 1]]
+        span = np.maximum(end, log.time) - np.minimum(
+            begin, log.time
+        )  # before a first sample and behind a last one too
+        out &= span <= _SPARSE * np.median(span[index])
+    return out
+
+
+def _onward(seen: NDArray[np.bool_], row: int) -> int:
+    """The first row from a row on that is told by rows close by; the number of rows where none is."""
+    found = np.flatnonzero(seen[row:])
+    return row + int(found[0]) if len(found) else len(seen)
+
+
 def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
     """(n,) rows whose time (T,), which increases, is nearest to other times (n,); of two as near the earlier."""
     after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
@@ -114,7 +145,7 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
     """Place segments end to end in every log that is long enough; each holds a sample beside its start.
 
     A start near which a command steps is put off to where its state can be told (`Layout.put_off`), and those behind it
-    with it.
+    with it. So is one in a stretch that is masked, however long that is, unless every start of the log would be.
 
     Raises:
       InputError: no log holds even one segment.
@@ -124,6 +155,9 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
         last = log.time[-1] - max(layout.horizons) + 0.5 * log.interval
         calm, told = _calm(log), log.inputs.time[0] < log.time[0]
         late = 0.0 if told or not layout.put_off else min(layout.unknown, max(last, 0.0) / 2)
+        seen = _seen(log)
+        if not layout.put_off or not (seen & (log.time <= last + 1e-9)).any():
+            seen[:] = True
         for count in itertools.count():
             begin = count * layout.stride + late
             if begin > last + 1e-9:
@@ -131,9 +165,14 @@ def cut(logs: Sequence[Log], layout: Layout) -> Cut:
             s = int(np.searchsorted(log.time, begin - 1e-9))
             if s >= len(log) - 1:  # the half interval that a log may be too short by reaches past its samples
                 continue
-            if layout.put_off:
+            began = s
+            s = _onward(seen, s)
+            if s < len(log) - 1 and layout.put_off:
                 later = _put_off(log, s, calm, min(log.time[s] + _PUT_OFF * layout.stride, last))
-                late, s = late + float(log.time[later] - log.time[s]), later
+                s = _onward(seen, later)
+            if s > began and not seen.all() and (s >= len(log) - 1 or log.time[s] > last + 1e-9):
+                break
+            late += float(log.time[s] - log.time[began])
             near = _nearest(log.time, log.time[s] + np.array(layout.horizons))
             if near.max() <= s:  # no sample lies as far after the start as any horizon
                 continue

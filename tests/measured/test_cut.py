@@ -85,6 +85,41 @@ def test_starts_stay_where_every_row_is_beside_a_step() -> None:
     np.testing.assert_array_equal(cut([busy], LAYOUT).start, cut([log(0.01, 240)], LAYOUT).start)
 
 
+def masked(*stretches: tuple[int, int], rows: int = 241) -> Log:
+    one = log(0.01, rows)
+    seen = np.ones(rows, bool)
+    for first, end in stretches:
+        seen[first:end] = False
+    return replace(one, channels={"joint:hinge:pos": replace(one.channels["joint:hinge:pos"], mask=seen)})
+
+
+def test_no_start_lies_in_a_masked_stretch() -> None:
+    """Of 0.5 s, which is longer than a segment; nor where half of a cubic's seven samples lie beyond it."""
+    np.testing.assert_array_equal(cut([masked((70, 120))], LAYOUT).start, [0, 40, 123, 163])
+    np.testing.assert_array_equal(cut([masked((0, 20))], LAYOUT).start, [14, 54, 94, 134, 174])
+    np.testing.assert_array_equal(cut([masked((150, 241))], LAYOUT).start, [0, 40, 80, 120])
+
+
+def test_starts_stay_where_single_rows_are_masked() -> None:
+    """Or all alike: a sensor that is slower than the log, whose rows between two samples are masked."""
+    whole = cut([log(0.01, 241)], LAYOUT).start
+    np.testing.assert_array_equal(cut([masked((39, 42), (80, 81), (119, 120))], LAYOUT).start, whole)
+    np.testing.assert_array_equal(cut([masked(*[(k, k + 4) for k in range(1, 240, 5)])], LAYOUT).start, whole)
+    np.testing.assert_array_equal(cut([masked((5, 241))], LAYOUT).start, whole)
+
+
+def test_starts_are_known_as_well_as_they_say_beside_masked_stretches() -> None:
+    one = masked((70, 100))
+    fast = replace(one.channels["joint:hinge:pos"], values=np.sin(9 * one.time), noise=5e-4)
+    one = replace(one, channels={"joint:hinge:pos": fast})
+    joint = '<body><joint name="hinge"/><geom size=".1" mass="1"/></body>'
+    states = estimate_states(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{joint}</worldbody></mujoco>"), one)
+    at = cut([one], LAYOUT).start
+    off = np.abs(states.qpos[:, 0] - np.sin(9 * one.time))
+    assert off[80] > 20 * states.qpos_sd[80, 0]  # a start would have lain here
+    assert (off[at] < states.qpos_sd[at, 0]).all()
+
+
 def test_a_step_of_the_physics_gets_the_mean_of_its_commands() -> None:
     """What is commanded every 10 ms, in steps of 4 ms: none of it is late."""
     time = 0.01 * np.arange(5)
