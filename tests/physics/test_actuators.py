@@ -201,6 +201,30 @@ def test_torque_speed_line_limits_driving_but_not_braking() -> None:
     np.testing.assert_allclose(force(5.0, 0.0), 5.0, rtol=1e-3)
 
 
+@pytest.mark.parametrize("inertia", [0.3, 0.05, 1e-3])
+@pytest.mark.parametrize("gear", [2.0, -0.5])
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_no_joint_is_driven_beyond_its_no_load_speed(inertia: float, gear: float, integrator: str) -> None:
+    """However light it is: a mass of 1 g would take 10 N through a step of 2 ms to 20 m/s, and the line ends at 3."""
+    text = RAIL.replace(f'mass="{MASS}"', f'mass="{inertia}"').replace('gear="2"', f'gear="{gear}"')
+    text = text.replace("<option", f'<option integrator="{integrator}"')
+    effect, theta = make("torque_speed", "push", {"fall": 1 / 3})
+    for u in (5.0, -5.0, 2.0):
+        v = run(text, effect, theta, 3000, ctrl=[u]).qvel[0, 0, :, 0] * np.sign(u * gear)
+        assert v.max() <= 3 + 1e-9
+        assert v[-1] == pytest.approx(3.0, rel=1e-2)
+
+
+def test_a_light_joint_holds_a_load_with_all_of_its_force() -> None:
+    """At rest, and at a speed that a load holds, the line is what it says, also where a step could cross it."""
+    text = RAIL.replace(f'mass="{MASS}"', 'mass="1e-3" ').replace('axis="1 0 0"', 'axis="1 0 0" damping="4"')
+    effect, theta = make("torque_speed", "push", {"fall": 1 / 3})
+    v = run(text, effect, theta, 500, ctrl=[5.0]).qvel[0, 0, -1, 0]
+    assert 4 * v == pytest.approx(10 * (1 - v / 3), rel=1e-6)
+    held = text.replace('damping="4"', 'damping="1" stiffness="100"')
+    assert run(held, effect, theta, 2000, ctrl=[5.0]).qpos[0, 0, -1, 0] == pytest.approx(0.1, rel=1e-6)
+
+
 def test_supply_sag_follows_the_measured_voltage() -> None:
     volts = np.linspace(12.6, 9.0, 60)
     made = _made("supply_sag", {"exponent": 2.0, "reference": 12.0}, NOISE, exogenous={"exo:supply": volts})

@@ -2,7 +2,7 @@
 
 # ruff: noqa: D102  (hooks are documented once, in base.Effect)
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import mujoco
@@ -226,6 +226,7 @@ class TorqueSpeed(Effect):
     family = "torque_speed"
     summary = "Force limit that falls with speed"
     driven = True
+    MODULATES = ("dof_damping",)
     PARAMS = (Param("fall", "s/rad", 0.0, 10.0, probes=(0.02, 0.1)),)
 
     def bind(self, model: mujoco.MjModel) -> None:
@@ -239,6 +240,8 @@ class TorqueSpeed(Effect):
                     f"actuators that do: {', '.join(fit) or 'none'}"
                 )
         self.arms = np.array(arms)
+        self.alone = np.array([on_scalar(model, int(r)) for r in self.rows])
+        self.joints = self.arms * self.alone[:, None]
         self.reach = np.array([_reach(model, int(r)) for r in self.rows])
 
     def marks(self, model: mujoco.MjModel) -> dict[str, Array]:
@@ -246,13 +249,31 @@ class TorqueSpeed(Effect):
         return {_reach_mark(n): np.array([end]) for n, end in zip(self.where, ends, strict=True) if end > 0}
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
+        back, slope, speed = self._line(ctx, theta)
+        out.qfrc[...] -= (back - slope * speed) @ self.arms
+
+    def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
+        fields["dof_damping"][...] += self._line(ctx, theta)[1] @ self.joints
+
+    def _line(self, ctx: Context, theta: Array) -> tuple[Array, Array, Array]:
+        """(force beyond the line, damping, speed) of what each actuator moves, (..., n) each.
+
+        A light joint may cross the line within a step, and nothing would bring it back. There its force falls through
+        the step from what it is, F at the speed v, to none at the no-load speed v0: F (v0 - v') / (v0 - v) at the speed
+        v' in which the step ends, as a damping that MuJoCo's integrators take implicitly. One that moves evenly has F.
+        """
         made = ctx.data("actuator_force")[..., self.rows]
         gear = ctx.nominal("actuator_gear")[..., self.rows, 0]
-        peak = _peak(ctx.nominal, self.rows, self.reach)
-        driving = np.maximum(0.0, np.sign(made * gear) * (ctx.v @ self.arms.T))
-        lost = np.minimum(theta[..., :1] * driving, 1.0) * peak
+        peak, fall = _peak(ctx.nominal, self.rows, self.reach), theta[..., :1]
+        speed = ctx.v @ self.arms.T
+        driving = np.sign(made * gear) * speed
+        lost = np.clip(fall * driving, 0.0, 1.0) * peak
         excess = np.clip(np.abs(made) - (peak - lost), 0.0, lost)
-        out.qfrc[...] -= (np.sign(made) * excess * gear) @ self.arms
+        push, room = np.abs(made) - excess, 1 - fall * driving  # room: share of the no-load speed that is left
+        ahead = driving + ctx.dt * np.abs(gear) * push * (ctx.nominal("dof_invweight0") @ self.joints.T)
+        crosses = (push > peak * (1 - fall * ahead)) & (room > 0) & (peak > 0) & self.alone
+        slope = np.where(crosses, np.abs(gear) * push * fall / np.where(crosses, room, 1.0), 0.0)
+        return np.sign(made) * excess * gear, slope, speed
 
     @classmethod
     def propose(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
