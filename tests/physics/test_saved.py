@@ -114,3 +114,31 @@ def test_members_and_conditions_hand_their_settings_on() -> None:
     for whole in (members, Conditioned(ambient, ("dry", "wet"))):
         assert whole.settings == {"signal": "exo:vbat"}
         assert whole.signals == ("exo:vbat",)
+
+
+@pytest.mark.parametrize("places", [("knee@left", "knee@right"), ("left", "knee@left"), ("hip joint", "hüfte:1+x")])
+def test_values_of_places_are_told_apart_by_any_name(places: tuple[str, ...]) -> None:
+    members = each([build("coulomb", [p], {"level": 0.0})[0] for p in places])
+    again, theta = from_row(yaml.safe_load(yaml.safe_dump(to_row(members, np.array([0.1, 0.2])))))
+    assert again.where == places
+    assert [p.name for p in again.params] == [f"level@{p}" for p in places]
+    np.testing.assert_array_equal(theta, [0.1, 0.2])
+
+
+def test_biases_of_velocities_in_the_bodies_own_axes_are_read_again() -> None:
+    channels = ["body:craft:linvel@body", "body:craft:angvel@body"]
+    members = each([build("sensor_bias", [c], dict.fromkeys("xyz", 0.0))[0] for c in channels])
+    again, theta = from_row(to_row(members, np.arange(6.0)))
+    again.bind(MODEL)
+    assert list(again.where) == channels
+    np.testing.assert_array_equal(theta, np.arange(6.0))
+
+
+def test_conditions_may_hold_any_sign() -> None:
+    wind = build("wind", "craft", {"push_x": 0.0, "push_y": 0.0, "push_z": 0.0, "drag": 0.0})[0]
+    whole, labels = Conditioned(wind, ("a@dawn", "dawn")), ("a@dawn", "dawn")
+    again, theta = from_row(to_row(whole, np.arange(7.0)))
+    assert isinstance(again, Conditioned)
+    assert again.conditions == labels
+    for label in labels:
+        np.testing.assert_array_equal(again.inside(theta, label), whole.inside(np.arange(7.0), label))

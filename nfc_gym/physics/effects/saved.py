@@ -46,7 +46,7 @@ def from_row(row: Mapping[str, Any]) -> tuple[Effect, Array]:
             return _possible(*_built(family, where, parameters, row))
         members, thetas = [], []
         for place in [where] if isinstance(where, str) else where:
-            own = {k.rpartition("@")[0]: v for k, v in parameters.items() if k.rpartition("@")[2] == place}
+            own = {name: v for name, at, v in _apart(parameters) if at == place}
             member, theta = _possible(*_built(family, [place], own, row))
             members.append(member)
             thetas.append(theta)
@@ -81,7 +81,7 @@ def _conditioned(family: str, where: str | list[str], given: Mapping[str, Any], 
     if not isinstance(labels, list | tuple) or not labels:
         raise InputError(f"effect {family!r}: `conditions` is a list of labels, and not {_short(labels)}")
     labels = [str(c) for c in labels]
-    first = {k.rpartition("@")[0] or k: v for k, v in given.items() if "@" not in k or k.endswith(f"@{labels[0]}")}
+    first = {name: v for name, at, v in _apart(given) if at in ("", labels[0])}
     effect = Conditioned(_built(family, where, first, row)[0], labels)
     missing = [p.name for p in effect.params if p.name not in given]
     if missing:
@@ -89,6 +89,12 @@ def _conditioned(family: str, where: str | list[str], given: Mapping[str, Any], 
     values = [(f"{family}: {p.name}", given[p.name]) for p in effect.params]
     values = [number(v["value"] if isinstance(v, Mapping) else v, what) for what, v in values]
     return _possible(effect, np.array(values))
+
+
+def _apart(parameters: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
+    """Name, place or condition, and value of each `name@place`; places may hold an @ (`body:b:linvel@body`)."""
+    parts = [(*k.partition("@"), v) for k, v in parameters.items()]
+    return [(name, at, v) for name, _, at, v in parts]
 
 
 def _keys(row: Any) -> tuple[str, str | list[str], Mapping[str, Any]]:
