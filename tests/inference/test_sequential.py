@@ -5,11 +5,13 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from problems import NOISE, box, gaussian, linear_windows, mix, network
+from problems import NOISE, SMALL, box, gaussian, linear_windows, mix, network
 from scipy.special import gamma
-from scipy.stats import kstest, norm
+from scipy.stats import chi2, kstest, norm
 
 from nfc_gym.core import Fidelity, InputError
+from nfc_gym.inference.config import NetworkConfig, Sizes
+from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Quiet
 from nfc_gym.inference.proposals import SLACK, Around, Corrected, Proposed, SequentialConfig, TruncatedPrior, told
@@ -82,6 +84,82 @@ def test_proposals_fill_the_region_of_a_narrow_posterior(size: int, rho: float) 
     assert proposal.kept == pytest.approx(share, rel=0.15)
 
 
+@pytest.mark.parametrize("way", [TruncatedPrior, Around])
+@pytest.mark.parametrize("wider", [1.0, 2.0])
+def test_a_region_is_some_times_as_wide_as_a_posterior_reaches(way: type, wider: float) -> None:
+    posterior = Together(6, 0.9)
+    # what the farthest of a few draws are differs from time to time, the tenth of many does not
+    config = SequentialConfig(samples=4000, quantile=0.1, wider=wider)
+    threshold = way(posterior, config, np.random.default_rng(0)).threshold + (SLACK if way is Around else 0)
+    edge = np.sqrt(2 * (told(posterior, posterior.prior.from_z(np.zeros((1, 6))))[0] - threshold))
+    assert edge == pytest.approx(wider * np.sqrt(chi2(6).ppf(0.9)), rel=0.03)
+
+
+class Partly(Together):
+    """Some parameters that go together, and others of which nothing is told."""
+
+    def __init__(self, size: int, of: int) -> None:
+        super().__init__(size, 0.95)
+        self.prior, self.of = box(of), of
+
+    def log_prob(self, x: Fidelity) -> np.ndarray:
+        z = self.prior.to_z(x.psi)[:, : self.size]
+        own = np.linalg.norm(np.linalg.solve(self.root, z.T), axis=0)
+        return (z**2).sum(1) / 2 - own**2 / 2 - np.log(self.root.diagonal()).sum() - self.prior.log_volume
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        z = rng.normal(size=(n, self.of))
+        z[:, : self.size] = z[:, : self.size] @ self.root.T
+        return Fidelity(self.prior.from_z(z))
+
+
+@pytest.mark.parametrize("way", [TruncatedPrior, Around])
+def test_what_was_not_told_of_is_proposed_as_the_prior_has_it(way: type) -> None:
+    """Of candidates wider than the prior in fourteen parameters hardly any would be left to choose from."""
+    posterior, config = Partly(3, 17), SequentialConfig(oversampling=8)
+    proposal = way(posterior, config, np.random.default_rng(0))
+    z = posterior.prior.to_z(proposal.sample(3000, np.random.default_rng(1)))
+    np.testing.assert_allclose(z[:, 3:].std(0), 1, atol=0.06)
+    away = np.linalg.norm(np.linalg.solve(posterior.root, z[:, :3].T), axis=0)
+    # evenly in a ball of radius R, whose mean square is 3/5 R^2 and of which half lies within 0.5^(1/3) R
+    assert (away**2).mean() / np.median(away) ** 2 == pytest.approx(0.6 / 0.5 ** (2 / 3), rel=0.05)
+
+
+def together(psi: np.ndarray, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    """Six parameters of which the sum is seen, and neighbours' differences four times worse."""
+    z = box(6).to_z(psi)
+    x = z @ SUM.T + 0.02 * rng.normal(size=z.shape)
+    return {"states": torch.as_tensor(x[:, None], dtype=torch.float32), "actions": torch.zeros(len(x), 0, 0)}
+
+
+SUM = np.vstack([np.ones(6), 0.25 * (np.eye(6)[:5] - np.eye(6)[1:])])
+
+
+def test_what_rounds_learn_of_many_parameters_is_as_wide_as_the_posterior() -> None:
+    """A region as far as its draws reach is to a regression a prior of variance R^2 / (d + 2): 0.87 of the spread."""
+    covariance = np.linalg.inv(np.eye(6) + SUM.T @ SUM / 0.02**2)
+    root, seen = np.linalg.cholesky(covariance), together(box(6).from_z(np.full((1, 6), 0.3)), np.random.default_rng(5))
+    middle = covariance @ SUM.T @ seen["states"][0, 0].double().numpy() / 0.02**2
+
+    class Coarse:
+        prior = box(6)
+
+        def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+            return Fidelity(self.prior.from_z(middle + 1.5 * rng.normal(size=(n, 6)) @ root.T))
+
+    config = SequentialConfig(2, 1500, oversampling=8, narrows=-np.inf)
+    windows = linear_windows(10, 6)
+    net = Network(NetworkConfig(**SMALL | {"density": "flow"}, linear=True), Sizes.of(windows.tensors), box(6))
+    within = Around(Coarse(), config, np.random.default_rng(0))  # type: ignore[arg-type]
+    out = sequential(
+        net, together, Window(seen["states"][0].numpy(), np.zeros((0, 0))), config,
+        TrainConfig(epochs=1, batch=128, rate=1e-9, average=0.5), within=within,
+    )  # fmt: skip
+    z = box(6).to_z(out.posterior.sample(4000, np.random.default_rng(0)).psi)
+    spread = np.linalg.solve(root, (z - middle).T).std(1)
+    assert np.exp(np.log(spread).mean()) == pytest.approx(1, abs=0.05)
+
+
 def test_the_truth_is_hardly_ever_cut_off() -> None:
     proposal = TruncatedPrior(given(), SequentialConfig(), np.random.default_rng(0))
     truths = gaussian(X[0]).sample((4000,)).double().numpy()
@@ -98,7 +176,7 @@ def test_rounds_close_in_and_end_where_they_no_longer_narrow() -> None:
             heard.append(text)
 
     out = sequential(
-        net, simulate, OBSERVED, SequentialConfig(rounds=2, simulations=400, samples=150, oversampling=4),
+        net, simulate, OBSERVED, SequentialConfig(rounds=2, simulations=400, samples=150, oversampling=4, wider=1),
         TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.95), report=Heard(),
     )  # fmt: skip
     assert len(out.entropy) == len(out.outcomes) == len(out.kept) >= 2
@@ -315,13 +393,16 @@ def test_bad_settings_are_refused() -> None:
         ((name, value),) = wrong.items()
         with pytest.raises(InputError, match=f"sequential: {name} is {value}, want a whole number"):
             SequentialConfig(**wrong)  # type: ignore[arg-type]
+    for wider in (0.9, np.nan, np.inf):
+        with pytest.raises(InputError, match=f"sequential: wider is {wider}, want a number of 1 or more"):
+            SequentialConfig(wider=wider)
     with pytest.raises(InputError, match="narrows is nan"):
         SequentialConfig(narrows=np.nan)
 
 
 def test_around_draws_the_prior_holds_the_posterior_and_is_the_prior_there() -> None:
     posterior, rng = given(), np.random.default_rng(0)
-    around = Around(posterior, SequentialConfig(samples=1000), rng)
+    around = Around(posterior, SequentialConfig(samples=1000, wider=1), rng)
     psi = around.sample(3000, np.random.default_rng(1))
     brute = box(3).psi_of(np.random.default_rng(2).uniform(size=(200_000, 3)))
     inside = brute[around.gain(box(3).to_z(brute)) > around.threshold]
