@@ -81,6 +81,7 @@ class Context:
       data: derived field of `MjData` by name, (..., *shape), one substep behind the state as after `mj_step`.
       nominal: a model field of the simulation before any per-step hook wrote to it, (..., *shape).
       memory: hidden state of the effect whose `force` or `modulate` is called, as its `follow` made it for this step.
+      scratch: by effect, what its `modulate` found that its `force` needs in the same step.
     """
 
     model: mujoco.MjModel
@@ -92,6 +93,7 @@ class Context:
     data: Callable[[str], Array]
     nominal: Callable[[str], Array]
     memory: Any = None
+    scratch: dict[Any, Any] = field(default_factory=dict)
 
 
 @dataclass

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.physics.effects.base import Array, Context, Effect, Forces, Scales
-from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, groups, one_command_each
+from nfc_gym.physics.effects.lookup import actuator_ids, actuator_names, groups, limited, one_command_each
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.places import scale_rows, sized
 from nfc_gym.physics.fields import ModelFields
@@ -249,11 +249,12 @@ class TorqueSpeed(Effect):
         return {_reach_mark(n): np.array([end]) for n, end in zip(self.where, ends, strict=True) if end > 0}
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
-        back, slope, speed = self._line(ctx, theta)
+        back, slope, speed = ctx.scratch.pop(self, None) or self._line(ctx, theta)
         out.qfrc[...] -= (back - slope * speed) @ self.arms
 
     def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
-        fields["dof_damping"][...] += self._line(ctx, theta)[1] @ self.joints
+        ctx.scratch[self] = line = self._line(ctx, theta)
+        fields["dof_damping"][...] += line[1] @ self.joints
 
     def _line(self, ctx: Context, theta: Array) -> tuple[Array, Array, Array]:
         """(force beyond the line, damping, speed) of what each actuator moves, (..., n) each.
@@ -267,8 +268,8 @@ class TorqueSpeed(Effect):
         peak, fall = _peak(ctx.nominal, self.rows, self.reach), theta[..., :1]
         speed = ctx.v @ self.arms.T
         driving = np.sign(made * gear) * speed
-        lost = np.clip(fall * driving, 0.0, 1.0) * peak
-        excess = np.clip(np.abs(made) - (peak - lost), 0.0, lost)
+        lost = limited(fall * driving, 0.0, 1.0) * peak
+        excess = limited(np.abs(made) - (peak - lost), 0.0, lost)
         push, room = np.abs(made) - excess, 1 - fall * driving  # room: share of the no-load speed that is left
         ahead = driving + ctx.dt * np.abs(gear) * push * (ctx.nominal("dof_invweight0") @ self.joints.T)
         crosses = (push > peak * (1 - fall * ahead)) & (room > 0) & (peak > 0) & self.alone
