@@ -141,6 +141,18 @@ def test_backlash_loses_what_plastic_impacts_lose() -> None:
     assert work.sum() - energy[-1] == pytest.approx(impacts.sum(), rel=0.05)
 
 
+def test_backlash_knows_whether_commands_are_clipped() -> None:
+    """Where the model says that they are not, their range is no limit of the drive."""
+    motor, flag = '<motor name="push" joint="rail"/>', '<flag clampctrl="disable"/></option>'
+    ranged = RAIL.replace(motor, '<motor name="push" joint="rail" ctrlrange="-1 1"/>').replace(
+        "/><world", f">{flag}<world"
+    )
+    effect, theta = make("backlash", "rail", {"gap": 0.01, "rotor": 0.2})
+    ctrl = np.where(np.arange(300) // 60 % 2, 4.0, -4.0)[:, None]
+    found, wanted = (run(text, effect, theta, 300, ctrl=ctrl).qpos for text in (ranged, RAIL))
+    np.testing.assert_array_equal(found, wanted)
+
+
 def test_backlash_lets_go_of_a_servos_damping_too() -> None:
     """In the gap a stiff servo's damping is gone as well as its force: the joint keeps its speed."""
     effect, theta = make("backlash", "rail", {"gap": 0.5, "rotor": 0.5})

@@ -45,6 +45,7 @@ class Drive:
     def __init__(self, model: mujoco.MjModel, actuators: NDArray[np.intp]) -> None:
         joints = model.actuator_trnid[actuators, 0]
         self.rows = index(actuators)
+        self.clips = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
         self.q, self.v = (
             index(model.jnt_qposadr[joints].astype(np.intp)),
             index(model.jnt_dofadr[joints].astype(np.intp)),
@@ -62,6 +63,7 @@ class Drive:
     def _ends(self, ctx: Context, kind: str) -> tuple[Array, Array]:
         """(low, high) of the actuators' `ctrl` or `force` ranges, infinite where there are none."""
         bounded = ctx.nominal(f"actuator_{kind}limited")[..., self.rows] != 0
+        bounded = bounded & (kind == "force" or self.clips)
         ends = ctx.nominal(f"actuator_{kind}range")[..., self.rows, :]
         return np.where(bounded, ends[..., 0], -np.inf), np.where(bounded, ends[..., 1], np.inf)
 
