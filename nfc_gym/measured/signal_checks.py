@@ -237,7 +237,7 @@ def _angle(name: str, log: Log, model: mujoco.MjModel | None) -> Iterator[Suspic
         return
     speed = log.channels.get(f"joint:{joint}:vel")
     if speed is not None and speed.values.shape == values.shape:
-        found = rate_ratio(log, values, speed.values)
+        found = rate_ratio(log, values, speed.values, (log.channels[name].mask, speed.mask))
         if found is not None:  # its own speed is the best witness
             yield from explained(where, found)
             return

@@ -1,6 +1,6 @@
 """Positions against measured speeds of the same motion: units, signs, the clock's unit, another motion's column."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.entries import TimeColumn
 from nfc_gym.measured.findings import Suspicion
 from nfc_gym.measured.offsets import agreement
-from nfc_gym.measured.smoothing import estimate_noise, fresh_samples, moving_average
+from nfc_gym.measured.smoothing import covered, estimate_noise, fresh_samples, moving_average
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,7 @@ SEEN = 10.0  # times its noise, by which a motion must show before it is compare
 STRANGE = 0.7  # correlation with its own speed below which a position may be that of another motion
 CLEAR = 0.95  # correlation with another motion's speed above which it is
 UNLIKE = 0.5  # correlation, at any offset of the clocks, below which a position follows no speed of its own
+WHOLE = 40  # rows in unmasked stretches from which a speed is judged by these alone
 LEAST = 100  # samples from which motions can be told from each other
 SHORTEST, FEWEST = 4, 8  # samples of the shortest stretch of motion; stretches of the longest, that a log must hold
 FASTEST = 100.0  # m/s, above which a length is more likely in another unit
@@ -99,11 +100,22 @@ def ratio(x: Array, y: Array) -> float | None:
     return float(np.linalg.norm(y) / np.linalg.norm(x)) * float(np.sign(x @ y))
 
 
-def rate_ratio(log: Log, position: Array, speed: Array) -> float | None:
-    """Derivative over measured speed, both (T,) and smoothed over nine samples, where the two follow each other."""
+def rate_ratio(log: Log, position: Array, speed: Array, masks: Sequence[NDArray[np.bool_] | None] = ()) -> float | None:
+    """Derivative over measured speed, both (T,) and smoothed over nine samples, where the two follow each other.
+
+    Args:
+      log: where they come from.
+      position, speed: (T,).
+      masks: (T,) each, true where a channel was measured: stretches in which all were are compared, unless masked rows
+        lie between all samples, as of a slow sensor.
+    """
     n = min(9, max(len(log) // 10, 1))
     derived = np.gradient(position, log.time)
-    return ratio(moving_average(speed, n)[n:-n], moving_average(derived, n)[n:-n])
+    seen = np.logical_and.reduce([np.ones(len(log), bool), *(m for m in masks if m is not None)])
+    whole = covered(seen, n + 2)[n:-n] == 1  # a slope reaches to the rows on both sides
+    if whole.sum() < WHOLE:
+        whole[:] = True
+    return ratio(moving_average(speed, n)[n:-n][whole], moving_average(derived, n)[n:-n][whole])
 
 
 def explained(where: str, found: float) -> Iterator[Suspicion]:

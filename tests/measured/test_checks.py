@@ -143,6 +143,20 @@ def test_a_doubtful_log_is_a_warning(build: Build, spoil: Any, words: list[str])
         assert word in text
 
 
+def test_speeds_are_not_compared_where_they_are_masked(build: Build) -> None:
+    """As `check` advises of a tachometer that is cut off: what is left agrees with the angle's slope."""
+    masked = ("column: v, unit: rad/s, noise: 0.01", "column: v, unit: rad/s, noise: 0.01, mask: ok")
+
+    def cut(t: dict[str, Any]) -> None:
+        top = 0.4 * np.abs(t["v"]).max()
+        t["v"] = np.clip(t["v"], -top, top)
+        t["ok"] = np.abs(t["v"]) < top
+
+    assert "times the measured speed" in "\n".join(str(f) for f in check(build(cut)))
+    assert check(build(cut, masked)) == []
+    assert "opposite signs" in "\n".join(errors(build(lambda t: (cut(t), scale("v", -1)(t)), masked)))
+
+
 def test_a_speed_in_steps_is_not_clipped(build: Build) -> None:
     """An encoder counts them: many samples share the largest, as many as share the one below."""
 
