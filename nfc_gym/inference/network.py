@@ -232,6 +232,16 @@ class Network(Learner):
         return torch.cat(parts, 1)
 
     @torch.no_grad()
+    def middles(self, batch: Batch) -> Tensor:
+        """(B, size of psi) z amid what is said of windows, see `Density.middle`."""
+        parts = zip(batch["states"].split(_CHUNK), batch["actions"].split(_CHUNK), strict=True)
+        out = []
+        for given in (self.encode(*part) for part in parts):
+            y = self.density.middle(given.features)
+            out.append(y if self.base is None else self.base.colour(y[:, None], given.mean[:, None])[:, 0])
+        return torch.cat(out)
+
+    @torch.no_grad()
     def calibrate(self, batch: Batch) -> None:
         """Take the density's width from windows that were not trained on, see `Density.calibrate`."""
         x, maps = self.targets(batch), batch.get("map")

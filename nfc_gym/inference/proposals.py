@@ -23,7 +23,7 @@ from nfc_gym.inference.space import PriorBox
 Array = NDArray[np.float64]
 TRUNCATED, POSTERIOR = PROPOSALS = ("truncated", "posterior")
 QUANTILE = 5e-4  # of the posterior's density, that says how far its draws reach
-WIDER = 2.0  # how many times as far truncated proposals do
+WIDER = 1.0  # how many times as far truncated proposals do
 SLACK = 1.0  # nats
 _FILLS = 1.5  # times the variance of what lies evenly in a region: that of candidates for it
 _OWN = 0.25  # of such candidates: draws of the posterior itself
@@ -46,6 +46,8 @@ class SequentialConfig:
       oversampling: candidates for each draw that importance resampling chooses from.
       narrows: nats of entropy that a round must take from the posterior for another to follow.
       held_out: share of each round that is held out.
+      fresh: windows simulated after the last round at the posterior's own draws, which its width is taken from
+        (`widths`); 0 leaves a flow as wide as held-out windows have it.
       anew: whether every later round trains a network of new weights; one that goes on from the last round's may learn
         what is new less well (Ash and Adams, On warm-starting neural network training, NeurIPS 2020).
       proposal: of later rounds: "truncated", the prior where the posterior has mass, or "posterior", draws of it.
@@ -60,12 +62,14 @@ class SequentialConfig:
     oversampling: int = 16
     narrows: float = _NARROWS
     held_out: float = 0.1
+    fresh: int = 0
     anew: bool = False
     proposal: str = TRUNCATED
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("rounds", 1), ("simulations", 20), ("samples", 100), ("oversampling", 1), ("seed", 0)):
+        least_of = {"rounds": 1, "simulations": 20, "samples": 100, "oversampling": 1, "fresh": 0, "seed": 0}
+        for name, least in least_of.items():
             require_whole(f"sequential: {name}", getattr(self, name), least)
         if np.isnan(self.narrows):  # by which nothing would ever stop
             raise InputError("sequential: narrows is nan, want nats that a round must win")
@@ -81,11 +85,6 @@ def reach(gain: Array, config: SequentialConfig) -> tuple[float, float]:
     """The highest of `gain` (n,), log densities over the prior's of draws, and how far proposals go below it, nats.
 
     That is `wider` times as far as a quantile of them, as distances go in a normal likelihood, whose nats are squares.
-    At that quantile itself (Deistler et al. 2022) the region holds nearly all of this window's posterior, and yet what
-    is learned there is too sure of itself. Nearly all of its volume lies near its edge, which cuts the posteriors of
-    most windows, and a network of few windows gives all the same spread. To a regression a ball of radius R in d
-    dimensions is a prior of variance R^2 / (d + 2): 1.5 to 1.9 times the posterior's spread at the quantile, so that
-    what comes out has 0.84 to 0.88 of it, and 0.95 to 0.97 where the ball is twice as wide.
     """
     highest = float(gain.max())
     return highest, config.wider**2 * (highest - float(np.quantile(gain, config.quantile)))

@@ -39,9 +39,11 @@ from nfc_gym.inference.proposals import (
 from nfc_gym.inference.random import mixed, seeded
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
+from nfc_gym.inference.widths import LEAST, factor
 
 Array = NDArray[np.float64]
 Simulator = Callable[[Array, np.random.Generator], Batch]
+Made = Callable[[Array, np.random.Generator], TensorWindows]
 _PASSES = 4  # over held out windows, each with noise of its own
 
 
@@ -125,7 +127,30 @@ def sequential(
         if r and out.entropy[-2] - out.entropy[-1] < config.narrows:
             out.stopped = "no longer narrows"
             break
+    if config.fresh:
+        _widen(out, made, window, config, rng)
     return out
+
+
+def _widen(out: Rounds, made: Made, window: Window, config: SequentialConfig, rng: np.random.Generator) -> None:
+    """Take the last posterior's width from windows simulated at its own draws (`widths`), where it has one to set."""
+    network, prior = out.posterior.network, out.posterior.prior
+    if not isinstance(out.posterior, NeuralPosterior) or not network.density.widens:
+        return
+    if config.fresh < LEAST * (prior.size + 1):
+        raise InputError(
+            f"sequential: fresh is {config.fresh}, want 0 or {LEAST * (prior.size + 1)} and more for {prior.size} "
+            "parameters"
+        )
+    psi = drawn(out.posterior, config.fresh, rng)
+    windows = made(psi, rng)
+    batch = next(windows.batches(len(windows), None))
+    found = network.middles({name: t.to(next(network.parameters()).device) for name, t in batch.items()})
+    own = prior.to_z(drawn(out.posterior, config.samples, rng))
+    by = factor(prior.to_z(psi), found.double().cpu().numpy(), own)
+    network.density.widen(by)
+    out.posterior = NeuralPosterior(network).given(window)
+    out.entropy[-1] = -float(told(out.posterior, drawn(out.posterior, config.samples, rng)).mean())
 
 
 class _Seen:

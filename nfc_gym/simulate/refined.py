@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
-from nfc_gym.inference.refine import SIMULATIONS, halved, refine
+from nfc_gym.inference.refine import FRESH, SIMULATIONS, halved, refine
 from nfc_gym.inference.train import TrainConfig
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.repeated import Repeated
@@ -32,7 +32,7 @@ def refined(
       posterior: trained on windows of any motion of that robot.
       window: what was observed.
       environment: id; by default the one whose windows the posterior was trained on.
-      simulations: windows of the same commands in two rounds, `BEGINNINGS` aside.
+      simulations: windows of the same commands in two rounds, `BEGINNINGS` and `FRESH` aside.
       seed: of simulations and training.
       jobs: processes of the simulation; 0 takes all cores.
       training: see `TrainConfig`; by default it ends after ten epochs without a better one.
@@ -65,7 +65,7 @@ def refined(
     beginnings = replace(simulator, names=("states", "start"))
     known = _in_portions(BEGINNINGS, lambda rows: beginnings.draw(len(rows), rng), report)
     again = Repeated.of(simulator, states, actions, {k: t.numpy() for k, t in known.items()})
-    report.message(f"simulates {simulations} windows of these commands, in two rounds")
+    report.message(f"simulates {simulations} windows of these commands, in two rounds, and {FRESH} to tell its width")
     training = training or TrainConfig(patience=10, seed=seed)
     done = refine(
         posterior, window, _Told(again, report), halved(simulations, seed), training, device=device, report=report

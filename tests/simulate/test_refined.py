@@ -60,7 +60,7 @@ def test_a_posterior_is_refined_and_says_so(monkeypatch: pytest.MonkeyPatch) -> 
     told = [text for text in heard.said if text.endswith("windows simulated")]
     assert told == [f"{130 * k} of 260 windows simulated" for k in (1, 2)] + 2 * [
         f"{100 * k} of 200 windows simulated" for k in (1, 2)
-    ]
+    ] + [f"{100 * k} of 500 windows simulated" for k in range(1, 6)]
     assert own.notes == posterior.notes | {"refined": 400, "kept": pytest.approx(own.notes["kept"])}
     assert 0.01 < own.notes["kept"] < 0.95  # the second of two rounds
     u = own.prior.u_of(own.sample(2000, np.random.default_rng(0)).psi)
