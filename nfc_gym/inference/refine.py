@@ -31,7 +31,10 @@ FRESH = 500  # windows beside those, from which the answer's width is taken
 
 
 def halved(simulations: int, seed: int = 0) -> SequentialConfig:
-    """Two rounds with so many simulations in all: 2 x 5000 tell more than 10,000 do, on most robots by far."""
+    """Two rounds with so many simulations in all: 2 x 5000 tell more than 10,000 do, on most robots by far.
+
+    `FRESH` more tell how wide the answer is to be.
+    """
     return SequentialConfig(2, simulations // 2, anew=True, oversampling=8, fresh=FRESH, seed=seed)
 
 
@@ -59,7 +62,8 @@ def refine(
       posterior: trained on windows of any motion; the first round is drawn where it has mass.
       window: what was observed.
       again: simulates windows of the same commands, `simulate.Repeated`.
-      config: rounds; by default two with `SIMULATIONS` in all, of which the second trains new weights.
+      config: rounds; by default two with `SIMULATIONS` in all, of which the second trains new weights, and `FRESH` more
+        windows for the answer's width.
       training: of each round.
       network: what learns.
       device: to train on; the posterior's network stays where it is.
