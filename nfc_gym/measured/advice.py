@@ -92,18 +92,26 @@ def _recounted(
     say: Callable[[str], None],
     seed: int,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Effects without the equivalents that all segments exclude, of which the search saw so many; and who they are."""
+    """Effects without the equivalents that all segments exclude, of which the search saw so many; and who they are.
+
+    Of several effects the first were accepted when the others were not there, and what did as well then need not now.
+    """
     left = {e["id"]: dict(e) for e in effects}
     listed = [(ask, p) for ask, p in pairs if p[1] in rivals_of(left.get(p[0], {}), effects)]
     whole = bench.searched(logs) if listed else None
-    if whole is None or len(whole) <= seen:
+    if whole is None or (len(whole) <= seen and len(effects) < 2):
         return effects, []
     findings = []
     for (_, (claim, rival)), gone in zip(listed, excluded(whole, [ask for ask, _ in listed], say, seed), strict=True):
         if gone:
             left[claim]["equivalents"] = [i for i in left[claim]["equivalents"] if i != rival]
             text = f"{rival} does as well as {claim} on the {seen} segments that were searched, and is excluded by all"
-            findings.append({"kind": "recount", "text": f"{text} {len(whole)}: it is no equivalent."})
+            text = (
+                f"{text} {len(whole)}"
+                if len(whole) > seen
+                else f"{rival} does not do as well as {claim} beside the rest"
+            )
+            findings.append({"kind": "recount", "text": f"{text}: it is no equivalent."})
     return list(left.values()), findings
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rotor import LEVEL, Torque, lively, record, steady
 
-from nfc_gym.measured.advice import advise
+from nfc_gym.measured.advice import _recounted, advise
 from nfc_gym.measured.bench import make_bench
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.distances import Ask, Model
@@ -73,6 +73,21 @@ def test_an_equivalent_that_the_searched_segments_alone_could_not_exclude_is_tak
     assert left == []
     assert text.startswith("damping_poly:shaft does as well as coulomb:shaft on the 14 segments that were searched")
     assert text.endswith("and is excluded by all 28: it is no equivalent.")
+
+
+@pytest.mark.parametrize(("others", "left"), [(0, ["damping_poly:shaft"]), (1, [])])
+def test_who_did_as_well_before_the_rest_was_there_is_asked_again_beside_it(
+    machine: Machine, others: int, left: list[str]
+) -> None:
+    bench, logs, fitted = machine(lively)
+    told = [(Ask(fitted(*DRY), fitted(*VISCOUS), TOLD), ("coulomb:shaft", "damping_poly:shaft"))]
+    claim = {"id": "coulomb:shaft", "equivalents": ["damping_poly:shaft"]}
+    effects = [claim, *({"id": f"delay:{k}", "equivalents": []} for k in range(others))]
+    seen = len(bench.searched(logs))
+    (first, *_), findings = _recounted(bench, logs, effects, told, seen, lambda text: None, 0)
+    assert first["equivalents"] == left
+    said = ["damping_poly:shaft does not do as well as coulomb:shaft beside the rest: it is no equivalent."]
+    assert [f["text"] for f in findings] == ([] if left else said)
 
 
 @pytest.mark.parametrize(
