@@ -17,9 +17,7 @@ Array = NDArray[np.float64]
 # Standard deviations of the declared noise by which a channel's fit is off what was measured, from which on the motion
 # is one that a polynomial does not follow, as a wheel's speed that is another after each command.
 _FAR = 5.0
-# Standard deviations of the noise by which a cubic is off its seven samples once in a thousand times.
-_MISSED = 2.33
-_DEGREE = 5  # of the polynomials that take its place where it is off by more
+_BENT = 5  # degree of the polynomials that slopes are taken from there
 _FEWEST = 8  # rows of a channel from which its course is told without those that are masked
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
@@ -74,39 +72,22 @@ def _turned(quat: Array) -> Array:
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
 
 
-def _smooth(log: Log, channel: Channel, values: Array, noise: float, points: int, raw: bool) -> Local:
+def _smooth(log: Log, channel: Channel, values: Array, points: int, raw: bool) -> Local:
     index, wide = _measured(log, channel), values.reshape(len(log), -1)
     fit = local_polynomial(log.time[index], wide[index], log.time, points)
-    off = float(np.sqrt(np.square(wide[index] - fit.value[index]).mean()))
-    if not raw and noise > 0:
-        fit = _bent(fit, log.time[index], wide[index], log.time, points, noise)
     if channel.mask is None and len(index) < len(log):
         return fit
+    off = float(np.sqrt(np.square(wide[index] - fit.value[index]).mean()))
     if not raw and (channel.noise is None or off <= _FAR * channel.noise):
         return fit
+    if not raw and channel.noise:  # slopes of a curve that bends more; what it is off still, they are off too
+        fit = local_polynomial(log.time[index], wide[index], log.time, points, _BENT)
+        fit = replace(fit, slope_gain=fit.slope_gain * np.maximum(1.0, fit.misfit / channel.noise))
     value, gain = fit.value.copy(), fit.value_gain.copy()
     value[index] = wide[index]
     if not raw:
         gain[index] = 1.0
     return replace(fit, value=value, value_gain=gain)
-
-
-def _bent(fit: Local, time: Array, values: Array, at: Array, points: int, noise: float) -> Local:
-    """The fit with values and slopes of curves that bend more, where the cubic is off its samples by more than noise.
-
-    By what such a curve is off still, beyond the noise, what it says is off too.
-    """
-    here = fit.misfit > _MISSED * noise
-    if not here.any():
-        return fit
-    curve = local_polynomial(time, values, at[here], points, _DEGREE)
-    doubt = np.maximum(1.0, curve.misfit / noise)
-    found = {"value": curve.value, "slope": curve.slope}
-    found |= {"value_gain": curve.value_gain * doubt, "slope_gain": curve.slope_gain * doubt}
-    changed = {name: getattr(fit, name).copy() for name in found}
-    for name, numbers in found.items():
-        changed[name][here] = numbers
-    return replace(fit, **changed)
 
 
 def _averaged(log: Log, channel: Channel) -> Array:
@@ -132,11 +113,6 @@ class _Builder:
                 return name, self.log.channels[name]
         return None
 
-    def smoothed(self, key: str, channel: Channel, values: Array) -> tuple[float, Local]:
-        """Noise of a channel, and its course."""
-        noise = channel_noise(self.log, key)
-        return noise, _smooth(self.log, channel, values, noise, self.points, self.raw)
-
     def scalar(self, name: str, q: int, v: int) -> None:
         """A hinge or slide joint."""
         position, speed = self.get(f"joint:{name}:pos"), self.get(f"joint:{name}:vel")
@@ -144,13 +120,13 @@ class _Builder:
         self.observed[v] = position is not None or speed is not None
         if position is not None:
             key, channel = position
-            noise, fit = self.smoothed(key, channel, channel.values)
+            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points, self.raw)
             self.qpos[:, q], self.qpos_sd[:, v] = fit.value[:, 0], noise * fit.value_gain
             self.qvel[:, v], self.qvel_sd[:, v] = fit.slope[:, 0], noise * fit.slope_gain
             self.qacc[:, v] = fit.curvature[:, 0]
         if speed is not None:
             key, channel = speed
-            noise, fit = self.smoothed(key, channel, channel.values)
+            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points, self.raw)
             self.qvel[:, v], self.qvel_sd[:, v], self.qacc[:, v] = (
                 fit.value[:, 0],
                 noise * fit.value_gain,
@@ -178,7 +154,7 @@ class _Builder:
             self._vector(key, channel, values, v + 3)
         if position is not None:
             key, channel = position
-            noise, fit = self.smoothed(key, channel, channel.values)
+            noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, channel.values, self.points, self.raw)
             self.qpos[:, q : q + 3], self.qpos_sd[:, v : v + 3] = fit.value, noise * fit.value_gain[:, None]
             self.qvel[:, v : v + 3], self.qvel_sd[:, v : v + 3] = fit.slope, noise * fit.slope_gain[:, None]
             self.qacc[:, v : v + 3] = fit.curvature
@@ -188,7 +164,7 @@ class _Builder:
             self._vector(key, channel, values, v)
 
     def _vector(self, key: str, channel: Channel, values: Array, v: int) -> None:
-        noise, fit = self.smoothed(key, channel, values)
+        noise, fit = channel_noise(self.log, key), _smooth(self.log, channel, values, self.points, self.raw)
         self.qvel[:, v : v + 3], self.qvel_sd[:, v : v + 3] = fit.value, noise * fit.value_gain[:, None]
         self.qacc[:, v : v + 3] = fit.slope
 
@@ -196,10 +172,11 @@ class _Builder:
         """Smooth a quaternion as a rotation vector about the nearest sample."""
         key, channel = attitude
         quat = channel.values / np.linalg.norm(channel.values, axis=1, keepdims=True)
+        noise = channel_noise(self.log, key)
         index = _measured(self.log, channel)
         vectors = np.zeros((len(quat), 3))
         vectors[index] = _turned(quat[index])
-        noise, fit = self.smoothed(key, channel, vectors)
+        fit = _smooth(self.log, channel, vectors, self.points, self.raw)
         hold = index[np.maximum(np.searchsorted(index, np.arange(len(quat)), side="right") - 1, 0)]
         self.qpos[:, q + 3 : q + 7] = quat_multiply(quat[hold], vector_to_quat(fit.value - vectors[hold]))
         self.qpos_sd[:, v + 3 : v + 6] = noise * fit.value_gain[:, None]

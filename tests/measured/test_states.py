@@ -8,7 +8,6 @@ import pytest
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.segments import Layout, cut, lay, pick, repeat
-from nfc_gym.measured.smoothing import local_polynomial
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.base import Array, Effect
@@ -209,21 +208,3 @@ def test_the_speed_of_a_motion_that_no_cubic_follows_is_known_as_badly_as_the_cu
     cubics, _ = errors(None)
     assert np.sqrt(np.mean(error**2)) < 0.35 * np.sqrt(np.mean(cubics**2))
     assert np.mean(np.abs(error) < 3 * sd) > 0.9
-
-
-def test_where_a_cubic_misses_its_samples_a_curve_that_bends_more_takes_its_place_there_alone() -> None:
-    """A joint that swings slowly but for a jerk of a tenth of a second, which is no course for a cubic of 60 ms."""
-    rng, time = np.random.default_rng(2), DT * np.arange(ROWS)
-    jerk = 0.05 * np.exp(-(((time - 0.6) / 0.02) ** 2))
-    angle = 0.2 * np.sin(3 * time) + jerk
-    speed = 0.6 * np.cos(3 * time) - 2 * (time - 0.6) / 0.02**2 * jerk
-    channel = Channel(angle + 5e-4 * rng.normal(size=ROWS), "rad", 5e-4)
-    states = estimate_states(MODEL, Log("jerks", time, {}, {J + "pos": channel}))
-    cubic = local_polynomial(time, channel.values[:, None], time)
-    error, sd = np.abs(states.qvel[:, 6] - speed), states.qvel_sd[:, 6]
-    within, calm = np.abs(time - 0.6) < 0.03, np.abs(time - 0.6) > 0.1
-    before = np.abs(cubic.slope[:, 0] - speed)
-    assert np.sqrt(np.mean(error[within] ** 2)) < 0.4 * np.sqrt(np.mean(before[within] ** 2))
-    assert np.mean(before[within] > 4 * 5e-4 * cubic.slope_gain[within]) > 0.5
-    assert np.mean(error[within] < 4 * sd[within]) > 0.8
-    np.testing.assert_array_equal(sd[calm], 5e-4 * cubic.slope_gain[calm])
