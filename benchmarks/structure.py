@@ -184,12 +184,19 @@ def hit(trial: dict[str, Any]) -> bool:
 
 
 def row(
-    robot: str, name: str, value: float, unit: str, baseline: float | None = None, goal: float | None = None
+    robot: str, name: str, value: float | None, unit: str, baseline: float | None = None, goal: float | None = None
 ) -> dict[str, Any]:
-    """A line of the table, but for the seeds: as `timing.Row`. A goal is reached by that much or more."""
+    """A line of the table, but for the seeds: as `timing.Row`. A goal is reached by that much or more.
+
+    The value is None where too few windows tell it.
+    """
     told = None if goal is None else f">= {goal:g}"
-    rest = {"baseline": baseline, "goal": told, "holds": None if goal is None else bool(value >= goal)}
-    return {"name": f"{robot}: {name}", "value": float(value), "unit": unit} | rest
+    rest = {
+        "baseline": baseline,
+        "goal": told,
+        "holds": None if goal is None else value is not None and bool(value >= goal),
+    }
+    return {"name": f"{robot}: {name}", "value": None if value is None else float(value), "unit": unit} | rest
 
 
 def said(t: dict[str, Any]) -> str:

@@ -288,7 +288,7 @@ def test_the_commands_are_not_written_where_they_would_be_read_as_a_log(
     [
         ([('controls:\n  "ctrl:motor": {column: torque, unit: Nm}\n', "")], "names no `controls`"),
         ([('"joint:shaft:vel": {column: v, unit: rad/s, noise: 0.02}', '"force:motor": {column: v, unit: N m}'),
-          ("segments: {", "segments: {mode: inverse, ")], "none of its channels"),
+          ("segments: {", "segments: {mode: inverse, ")], "no channel measures a joint or a free body"),
     ],
 )  # fmt: skip
 def test_nothing_to_propose_is_refused(tmp_path: Path, edits: list[tuple[str, str]], words: str) -> None:
