@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +28,7 @@ from nfc_gym.adaptation.structure import Structure, structure_of
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.posterior import Sampler
+from nfc_gym.physics.quiet import no_warnings
 from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.start import disturbed, observed
 from nfc_gym.terrain import Heightfield
@@ -107,6 +107,7 @@ class Assimilation:
 
     # ---- `Inference` ----------------------------------------------------------------------------------------------
 
+    @no_warnings()  # draws that come apart are left out
     def infer(self, trajectory: Trajectory) -> Assimilated:
         """The belief given the whole trajectory and those that are remembered.
 
@@ -121,7 +122,6 @@ class Assimilation:
         if not told:
             size = len(self.machine.space)
             return Assimilated(self.box, np.zeros(size), np.eye(size))
-        mujoco.set_mju_user_warning(lambda message: None)  # draws that come apart are left out, not talked about
         most = SEGMENTS // max(1, len(self.remembered))
         parts = [self.segments(t) if t is trajectory else self.segments(t, most) for t in told]
         rng, seen = np.random.default_rng(self.seed), self.machine.told

@@ -20,6 +20,7 @@ from nfc_gym.measured.signal_checks import suspicions
 from nfc_gym.measured.speed_checks import clock_unit
 from nfc_gym.measured.splits import Source, find_logs
 from nfc_gym.measured.stream_checks import stream_notes
+from nfc_gym.physics.quiet import no_warnings
 
 __all__ = ["Finding", "check", "examine", "require"]
 
@@ -44,10 +45,10 @@ def require(dataset_path: Path | str) -> tuple[Dataset, list[Finding]]:
     return dataset, findings
 
 
+@no_warnings()  # a nominal model that comes apart would say so in each roll-out
 def examine(dataset_path: Path | str) -> tuple[Dataset | None, list[Finding]]:
     """Read a data set once, and say all that is wrong with it; None where it cannot be used at all."""
     path = Path(dataset_path)
-    mujoco.set_mju_user_warning(lambda message: None)  # a nominal model that comes apart would say so in each roll-out
     try:
         mapping = load_mapping(path)
     except InputError as e:

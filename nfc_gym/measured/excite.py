@@ -30,6 +30,7 @@ from nfc_gym.measured.metric import metric
 from nfc_gym.measured.proposal_page import render
 from nfc_gym.measured.questions import Present, Visible
 from nfc_gym.measured.telling import teller, warned
+from nfc_gym.physics.quiet import no_warnings
 
 Array = NDArray[np.float64]
 _ROUNDS = 8  # iterations of a rival's refit to the simulated recording
@@ -47,6 +48,7 @@ class _Task:
     effects: list[Visible]
 
 
+@no_warnings()  # some of what is tried comes apart
 def excite(
     mapping: Path,
     fit: Path | None = None,
@@ -85,7 +87,6 @@ def excite(
     if not _SHORTEST <= seconds <= _LONGEST:
         raise InputError(f"--seconds {seconds:g}: want {_SHORTEST:g} to {_LONGEST:g}")
     out = _outputs(out if out is not None else mapping.with_name("excite.csv"), overwrite)
-    mujoco.set_mju_user_warning(lambda message: None)
     say = teller(console, time.monotonic())
     dataset, noticed = require(mapping)
     _require_no_log(out, mapping.parent, [entry.path for entry in dataset.mapping.logs])

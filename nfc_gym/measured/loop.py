@@ -8,7 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
@@ -49,6 +48,7 @@ from nfc_gym.measured.stakes import Stakes
 from nfc_gym.measured.suspects import NONE, Suspects, Witness, ask, kept, looked_at, restored
 from nfc_gym.measured.telling import teller, warned
 from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.quiet import no_warnings
 from nfc_gym.physics.untimed import untimed
 
 Array = NDArray[np.float64]
@@ -106,9 +106,8 @@ def close_loop(
     """
     require_writable(out)
     _require_room(out, overwrite, fold)
-    with one_blas_thread(), untimed():
-        # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
-        mujoco.set_mju_user_warning(lambda message: None)
+    # Candidates at the edge of what a model bears may be unstable: that is counted, not printed a thousand times.
+    with one_blas_thread(), untimed(), no_warnings():
         dataset, noticed = require(mapping)
         bench = make_bench(dataset, jobs)
         bench.warned = warned(console, noticed)

@@ -4,7 +4,6 @@ import itertools
 import json
 from pathlib import Path
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +18,7 @@ from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.segments import Cut, Layout, servos
 from nfc_gym.measured.shooting import RolloutProblem, interpolate
+from nfc_gym.physics.quiet import no_warnings
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -26,6 +26,7 @@ _HISTORY = 5.0  # s, at least, of the past that hidden states are led through: t
 _ABREAST = 256  # pieces, at most: their histories must fit in memory
 
 
+@no_warnings()  # what comes apart is an error here, said once
 def predict(
     mapping: Path, fit: Path | None, mode: str, stage: str, out: Path, *, restart: float | None = None
 ) -> dict[str, Array]:
@@ -59,7 +60,6 @@ def predict(
     if out.exists() and not out.is_file():
         raise InputError(f"--out {out} is a device, not a file: choose another")
     require_writable(out.parent)
-    mujoco.set_mju_user_warning(lambda message: None)  # what comes apart is an error here, said once
     dataset = require(mapping)[0]
     bench = make_bench(dataset)
     models = _models(bench, dataset, fit, stage)

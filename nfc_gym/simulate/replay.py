@@ -33,6 +33,7 @@ from nfc_gym.envs.quadcopter import Quadcopter
 from nfc_gym.envs.simulations import Simulations
 from nfc_gym.inference.detector import checked
 from nfc_gym.physics.effects import Effect
+from nfc_gym.physics.quiet import no_warnings
 from nfc_gym.simulate.ensemble import innovation
 from nfc_gym.simulate.machine import MOTOR, Machine
 from nfc_gym.simulate.residuals import Given, Residuals
@@ -144,6 +145,7 @@ class Replay:
         """(n, H) X of each control step; infinite from where replays come apart. Arguments as of `told_of`."""
         return self.told_of(states, actions, start, which)[..., 0] / len(self.told)
 
+    @no_warnings()  # replays that come apart are nan
     def told_of(
         self, states: Array, actions: Array, start: Array | None = None, which: NDArray[np.intp] | None = None
     ) -> Array:
@@ -238,7 +240,6 @@ class Replay:
     def _begin(self, states: Array, starts: Array, which: NDArray[np.intp], hidden: bool) -> Simulations:
         """n windows times draws simulations at their starts."""
         machine, n, nq = self.machine, len(states), self.machine.model.nq
-        mujoco.set_mju_user_warning(lambda message: None)  # replays that come apart are nan
         sims = self._sims
         # An effect's edits of the model are made once: on other ground than before it gets new simulations.
         anew = self.lacks is not None and len(self.maps) > 1

@@ -3,13 +3,13 @@
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.windows import Manifest, packed
 from nfc_gym.physics.effects import Effect
+from nfc_gym.physics.quiet import no_warnings
 from nfc_gym.simulate import draws, ground, motion
 from nfc_gym.simulate.draws import LABELS, MOTION, PLACES, Array, between, generator, geometric, picked, uniforms
 from nfc_gym.simulate.drive import channels
@@ -85,6 +85,7 @@ def _policy(source: Act | str, environment: str) -> Policy:
     return Policy(source, workshop(environment).machine)
 
 
+@no_warnings()  # windows that come apart are counted
 def make_shard(plan: Plan, shard: int, proposed: Array | None = None, nthread: int = 1) -> bytes:
     """The file of a shard; the same bits for the same plan and shard, at any number of threads, in any process.
 
@@ -97,7 +98,6 @@ def make_shard(plan: Plan, shard: int, proposed: Array | None = None, nthread: i
     Raises:
       InputError: the robot cannot be kept going for the length of a window.
     """
-    mujoco.set_mju_user_warning(lambda message: None)  # windows that come apart are counted, not talked about
     manifest = plan.manifest
     shop = workshop(manifest.environment)
     policy = None if plan.policy is None else _policy(plan.policy, manifest.environment)

@@ -1,11 +1,11 @@
 """Windows of machines that are given: psi as it is told, inside the prior's box or not, with one effect or none."""
 
-import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.windows import Batch
 from nfc_gym.physics.effects import Effect
+from nfc_gym.physics.quiet import no_warnings
 from nfc_gym.simulate import ground, motion
 from nfc_gym.simulate.draws import Array, picked
 from nfc_gym.simulate.drive import channels
@@ -16,6 +16,7 @@ from nfc_gym.simulate.roll import Task, roll
 _PATIENCE = 12  # attempts at the motion of a window
 
 
+@no_warnings()  # windows that come apart are drawn anew
 def trials(
     machine: Machine,
     psi: Array,
@@ -50,7 +51,6 @@ def trials(
     psi = np.asarray(psi, float)
     if psi.ndim != 2 or psi.shape[1] != len(machine.space):
         raise InputError(f"trials: psi has shape {psi.shape}, want (n, {len(machine.space)})")
-    mujoco.set_mju_user_warning(lambda message: None)  # windows that come apart are drawn anew
     rng = np.random.default_rng(seed)
     pending, parts = np.arange(len(psi)), []
     for _ in range(_PATIENCE):
