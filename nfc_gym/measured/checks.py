@@ -128,7 +128,7 @@ def _whole(dataset: Dataset) -> list[Finding]:
     if not dataset.independent_splits:
         message = "some logs are cut by time, so fitting and verification are not independent"
         findings.append(Finding("note", "split", message, "the report will say so; separate logs prove more"))
-    findings += _copies(dataset)
+    findings += [*_copies(dataset), *_unfitted(dataset)]
     quiet = [name for name, c in dataset.mapping.channels.items() if c.noise is None]
     if quiet:
         advice = "give `noise` (standard deviation of one sample) where you know it"
@@ -148,6 +148,16 @@ def _copies(dataset: Dataset) -> list[Finding]:
             message = f"log {log.name!r} holds the same as {other!r}: one that fits may verify itself"
             return [Finding("warning", "logs", message, "leave one of them out")]
     return []
+
+
+def _unfitted(dataset: Dataset) -> list[Finding]:
+    """Conditions of which no log is fitted to, in some fold: what belongs to such a day alone cannot be known."""
+    fitted = [{log.condition for log in dataset.of("fit", fold)} for fold in dataset.folds]
+    lone = sorted({log.condition for log in dataset.logs if any(log.condition not in own for own in fitted)})
+    if not lone:
+        return []
+    message = f"no log of the condition {lone[0]!r} is fitted to: what belongs to that day alone nobody will know"
+    return [Finding("warning", "logs", message, "record more logs of it, or give one of them `split: fit`")]
 
 
 _DOES = {"fit": "is fitted to", "select": "selects", "verify": "verifies"}

@@ -217,10 +217,39 @@ def _by_unit(rule: SplitRule, free: Sequence[Log]) -> dict[str, Split]:
     verify = max(round(rule.verify * len(units)), 1) if rule.verify > 0 else 0
     while select + verify >= len(units):  # rounding up must leave something to fit
         select, verify = (select, verify - 1) if verify > select else (select - 1, verify)
-    counts: list[tuple[Split, int]] = [("select", select), ("verify", verify), ("fit", len(units) - select - verify)]
-    kinds: list[Split] = [split for split, count in counts for _ in range(count)]
-    split_of: dict[str, Split] = {units[i]: kind for i, kind in zip(order, kinds, strict=True)}
-    return {log.name: split_of[log.group if rule.by == "group" else log.name] for log in free}
+    unit_of = {log.name: log.group if rule.by == "group" else log.name for log in free}
+    days = {u: frozenset(log.condition for log in free if unit_of[log.name] == u) for u in units}
+    split_of = _dealt([units[i] for i in order], days, {"select": select, "verify": verify})
+    return {name: split_of[unit] for name, unit in unit_of.items()}
+
+
+def _dealt(units: Sequence[str], days: Dict[str, frozenset[str]], counts: Dict[Split, int]) -> dict[str, Split]:
+    """What each unit is for: so many of each split in the order given, the rest fits.
+
+    Where conditions differ each split gets its share of every one of them, and one unit at least of each fits where
+    that can be: what belongs to a day that is not fitted to nobody would know.
+
+    Args:
+      units: in a random order.
+      days: the conditions of each unit's logs.
+      counts: units that a split other than fit takes.
+    """
+    left: dict[frozenset[str], list[str]] = {}
+    for unit in units:
+        left.setdefault(days[unit], []).append(unit)
+    shares = {day: len(own) / len(units) for day, own in left.items()}
+    given: Counter[tuple[Split, frozenset[str]]] = Counter()
+    out: dict[str, Split] = {}
+    turns = [(split, (k + 0.5) / count) for split, count in counts.items() for k in range(count)]
+    if len(left) > 1:  # one after the other in turn, that none takes all that a condition can spare
+        turns.sort(key=lambda turn: turn[1])
+    for split, _ in turns:
+        spare = {day for day, own in left.items() if len(own) > 1} or {day for day, own in left.items() if own}
+        wants = {day: shares[day] * counts[split] - given[split, day] for day in left if day in spare}
+        day = max(wants, key=lambda d: (round(wants[d], 9), len(left[d])))
+        given[split, day] += 1
+        out[left[day].pop(0)] = split
+    return out | {unit: "fit" for own in left.values() for unit in own}
 
 
 def _by_time(log: Log, rule: SplitRule) -> dict[Split, Log]:
@@ -246,6 +275,7 @@ def _cut(log: Log, fractions: Sequence[tuple[Split, float]]) -> dict[Split, Log]
 def _rotate(rule: SplitRule, fixed: dict[str, Split], free: Sequence[Log]) -> tuple[Fold, ...]:
     """Every group verifies in turn; a fifth of the remaining logs selects, chosen by the seed."""
     group_of = {log.name: log.group or log.name for log in free}
+    day_of = {log.name: frozenset([log.condition]) for log in free}
     groups = sorted(set(group_of.values()))
     fits, selects = (list(fixed.values()).count(s) for s in ("fit", "select"))
     folds = []
@@ -257,8 +287,9 @@ def _rotate(rule: SplitRule, fixed: dict[str, Split], free: Sequence[Log]) -> tu
                 f"split: {len(free)} logs in {len(groups)} groups are too few to rotate: besides the group that "
                 "verifies one log must fit and one select; record more, or say `by: time` (reported as not independent)"
             )
-        chosen = {rest[k] for k in np.random.default_rng([rule.seed, i]).permutation(len(rest))[:count]}
-        own: dict[str, Split] = {n: "select" if n in chosen else "fit" if n in rest else "verify" for n in group_of}
+        shuffled = [rest[k] for k in np.random.default_rng([rule.seed, i]).permutation(len(rest))]
+        dealt = _dealt(shuffled, day_of, {"select": count})
+        own: dict[str, Split] = {name: dealt.get(name, "verify") for name in group_of}
         folds.append(Fold(group, fixed | own))
     if not folds:
         raise InputError("split: `by: rotate` needs logs with `split: auto`")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import InputError
+from nfc_gym.measured.checks import check
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.excite import excite
 from nfc_gym.measured.loop import close_loop
@@ -142,6 +143,19 @@ def test_a_condition_that_was_never_fitted_is_named(folder: Path, report: Mappin
     (tmp_path / "mapping.yaml").write_text(MAPPING)
     with pytest.raises(InputError, match=r"no values for the condition 'storm'.*breeze, calm, gale"):
         predict(tmp_path / "mapping.yaml", folder / "out", "rollout", "extended", tmp_path / "p.npz")
+
+
+def test_a_day_that_no_log_is_fitted_to_is_told_of(folder: Path, tmp_path: Path) -> None:
+    for file in folder.glob("*.npz"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    for name in ("sled.xml", "mapping.yaml"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    assert "'gale'" not in "".join(map(str, check(tmp_path / "mapping.yaml")))
+    for k in range(2):
+        (tmp_path / f"fit_gale_{k}.npz").unlink()
+    (found,) = (f for f in check(tmp_path / "mapping.yaml") if "'gale'" in str(f))
+    assert found.severity == "warning"
+    assert "is fitted to" in str(found)
 
 
 def test_a_pattern_that_does_not_match_is_named(folder: Path, tmp_path: Path) -> None:

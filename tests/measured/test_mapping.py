@@ -200,11 +200,13 @@ def test_numbers_are_not_columns(build: Build) -> None:
 # ---- splits
 
 
-def logs(groups: list[str], rows: int = 40) -> tuple[list[Source], list[Log]]:
+def logs(groups: list[str], rows: int = 40, days: str = "") -> tuple[list[Source], list[Log]]:
     names = [f"log{k:02d}" for k in range(len(groups))]
     sources = [Source(n, Path(n), "auto", g) for n, g in zip(names, groups, strict=True)]
-    time = np.arange(float(rows))
-    return sources, [Log(n, time, {}, {}, group=g) for n, g in zip(names, groups, strict=True)]
+    time, days = np.arange(float(rows)), days or " " * len(groups)
+    return sources, [
+        Log(n, time, {}, {}, group=g, condition=d.strip()) for n, g, d in zip(names, groups, days, strict=True)
+    ]
 
 
 @given(st.integers(3, 40), st.integers(0, 5))
@@ -239,6 +241,38 @@ def test_rotation_verifies_every_log_once(groups: list[str]) -> None:
         rest = len(members) - len(fold.names("verify"))
         assert len(fold.names("select")) == max(round(rest / 5), 1)
         assert len(fold.names("fit")) == rest - len(fold.names("select")) >= 1
+
+
+@given(st.lists(st.sampled_from("abc"), min_size=3, max_size=30), st.integers(0, 20))
+def test_every_day_is_fitted_to(days: list[str], seed: int) -> None:
+    """And each split has its share of every day, to one log; how many logs a split has the days do not change."""
+    sources, members = logs([""] * len(days), days="".join(days))
+    splits = divide(SplitRule(seed=seed), sources, members).folds[0].splits
+    plain = divide(SplitRule(seed=seed), *logs([""] * len(days))).folds[0].splits
+    assert Counter(splits.values()) == Counter(plain.values())
+    count = Counter((log.condition, splits[log.name]) for log in members)
+    own, total = Counter(days), Counter(splits.values())
+    spare = all(n > 1 for n in own.values()) and sum(n - 1 for n in own.values()) >= total["select"] + total["verify"]
+    if spare:
+        assert all(count[day, "fit"] for day in own)
+    if min(own.values()) >= 5:
+        for (day, split), n in count.items():
+            assert abs(n - total[split] * own[day] / len(days)) <= 1 + (split == "fit")
+
+
+def test_a_day_of_three_logs_is_in_every_split() -> None:
+    sources, members = logs([""] * 9, days="aaabbbccc")
+    splits = divide(SplitRule(fit=1 / 3, select=1 / 3, verify=1 / 3), sources, members).folds[0].splits
+    of_day = {day: {splits[log.name] for log in members if log.condition == day} for day in "abc"}
+    assert all(own == {"fit", "select", "verify"} for own in of_day.values())
+
+
+def test_rotation_leaves_each_day_a_log_to_fit() -> None:
+    sources, members = logs(list("abcdefg"), days="xxyyzzz")
+    for seed in range(10):
+        for fold in divide(SplitRule(by="rotate", seed=seed), sources, members).folds:
+            fitted = {log.condition for log in members if fold.splits[log.name] == "fit"}
+            assert fitted == {"x", "y", "z"}
 
 
 def test_cut_by_time_keeps_the_order_and_every_row() -> None:
