@@ -1,6 +1,6 @@
 """One round of the search: refit the shortlist, judge it on the selection logs, and decide which law is accepted."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from nfc_gym.measured.arena import Arena, contains
@@ -231,9 +231,21 @@ class Contest:
         names = [f"{family}:{new[0].place}" for family in new[0].kin]
         kin = [s for name in names if name not in asked and (s := self._screened(name)) is not None]
         asked |= {s.effect.id for s in kin}
+        places = self._elsewhere(new[0], asked)
+        asked |= {s.effect.id for s in places}
         others = [s for s in self.screened if s.effect.id not in asked]
         like = mimics(self._known[new[0].id], others, self.screen.projected)
-        return [arena.enter_beside(best, [s]) for s in (*kin, *like)]
+        return [arena.enter_beside(best, [s]) for s in (*kin, *places, *like)]
+
+    def _elsewhere(self, law: Effect, asked: Collection[str]) -> list[Screened]:
+        """The same law at the places where it does nearly the same, of which a shortlist has two and screening some.
+
+        Where bodies touch those alone that were screened: straight lines are rough there, and screening is dear.
+        """
+        places = [i for i, e in self.pool.items() if e.family == law.family and i not in asked]
+        places = [i for i in places if i in self._known or not self.rough]
+        found = [s for i in places if (s := self._screened(i)) is not None]
+        return mimics(self._known[law.id], found, self.screen.projected)
 
     @property
     def _choice(self) -> Choice:

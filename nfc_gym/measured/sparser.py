@@ -2,8 +2,8 @@
 
 Values of their own suit whatever differs by place: one rotor that is worn on a drone whose rotors all push a little
 more, where one number for all and another for that one would do; or knees that all push more than they are told, where
-one number for the knees would do and every other joint has none. Whether these do is asked in the same contest, in
-which each number has its price.
+one number for the knees would do and every other joint has none; or one joint that rubs, beside a like one that does
+not. Whether these do is asked in the same contest, in which each number has its price.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +17,8 @@ from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.each import Each
 
 Array = NDArray[np.float64]
-_PLACES = 3  # of fewer, plain laws are no fewer numbers
+_PLACES = 3  # of fewer, two plain laws are no fewer numbers
+_NOTHING = 0.1  # of the squared size at one place, up to which all others together may be nothing
 
 
 def sparser(arena: Arena, pool: Sequence[Effect], worth: float) -> tuple[Each, Judged] | None:
@@ -31,7 +32,7 @@ def sparser(arena: Arena, pool: Sequence[Effect], worth: float) -> tuple[Each, J
     known = {e.id: e for e in pool}
     plant = arena.current.plant
     for effect, theta in zip(plant.effects, plant.split(arena.current.x)[1], strict=True):
-        if not isinstance(effect, Each) or len(effect.members) < _PLACES:
+        if not isinstance(effect, Each):
             continue
         without = arena.without(effect)
         own: float | None = None  # what the law itself is worth, judged once a plainer one is believed
@@ -50,6 +51,8 @@ def _plainer(effect: Each, values: Array, known: Mapping[str, Effect]) -> Iterat
     if (part := like_part(effect, values, known)) is not None:
         inside = _inside(effect, part)
         yield [part], [np.clip(np.median(values[inside], axis=0), part.low, part.high)]
+    if len(values) < _PLACES:
+        return
     odd = odd_one_out(values)
     shared, single = (known.get(i) for i in (effect.id.removesuffix(":each"), effect.members[odd].id))
     if shared is not None and single is not None:
@@ -58,7 +61,10 @@ def _plainer(effect: Each, values: Array, known: Mapping[str, Effect]) -> Iterat
 
 
 def like_part(effect: Each, values: Array, known: Mapping[str, Effect]) -> Effect | None:
-    """The law at some of the places that comes nearest to values (places, k): alike there, and nothing elsewhere."""
+    """The law at some of the places that comes nearest to values (places, k): alike there, and nothing elsewhere.
+
+    At one place alone only where next to nothing is elsewhere: any values at all are alike there.
+    """
     spread = values.std(0)
     unit = np.where(spread > 0, spread, 1.0)
     nothing = np.square((values - effect.members[0].null) / unit).sum(1)
@@ -67,7 +73,8 @@ def like_part(effect: Each, values: Array, known: Mapping[str, Effect]) -> Effec
         inside = _inside(effect, law)
         covered = sum(len(m.where) for m, yes in zip(effect.members, inside, strict=True) if yes)
         plain = law.family == effect.family and not isinstance(law, Each) and covered == len(law.where)
-        if plain and 1 < inside.sum() < len(inside):
+        lone = inside.sum() == 1 and nothing[~inside].sum() <= _NOTHING * nothing[inside].sum()
+        if plain and (lone or 1 < inside.sum() < len(inside)):
             alike = values[inside] / unit
             apart = np.square(alike - alike.mean(0)).sum() + nothing[~inside].sum()
             best, least = (law, apart) if apart < least else (best, least)

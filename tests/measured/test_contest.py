@@ -305,7 +305,7 @@ def test_plainer_laws_take_the_place_of_an_accepted_one_that_wants_values_of_its
 
 
 def candidate(name: str, columns: list[list[float]]) -> Screened:
-    effect: Any = SimpleNamespace(id=name, place=name, kin=())
+    effect: Any = SimpleNamespace(id=name, place=name, kin=(), family=name)
     return Screened(effect, 1.0, np.zeros(1), np.zeros(1), np.array(columns, float).reshape(-1, 4).T)
 
 
@@ -366,6 +366,21 @@ def test_a_shifted_centre_of_mass_is_not_believed_before_a_load_was_asked() -> N
     best = Judged(both, np.zeros(1), np.zeros(1), 1.0, 1.0)
     contest.arena.label = lambda j: "+".join(e.id for e in contest.arena.new(j))
     assert contest._mimics(best, [best]) == []
+
+
+@pytest.mark.parametrize("rough", [False, True])
+def test_a_law_is_not_believed_before_its_likest_other_places_were_asked(rough: bool) -> None:
+    """Though other families do more alike, and though a thinned screening left such a place out."""
+    here, there, far, aside = (FAMILIES["coulomb"]((j,)) for j in ("hip", "knee", "toe", "neck"))
+    lines = {here.id: [1, 0.1, 0, 0], there.id: [1, 0.3, 0, 0], far.id: [0, 1, 0, 0], aside.id: [1, 0.2, 0, 0]}
+    screened = [replace(candidate(e.id, [lines[e.id]]), effect=e) for e in (here, there, far)]
+    screened += [candidate(f"near_{k}", [[1, 0.1 + 0.01 * k, 0, 0]]) for k in range(2)]
+    contest = asking(screened, [here, there, far, aside])
+    contest.rough = rough
+    contest.screen.try_one = lambda e: replace(candidate(e.id, [lines[e.id]]), effect=e)  # type: ignore[method-assign]
+    best = refitted(here)
+    wanted = [there.id] if rough else [aside.id, there.id]
+    assert contest._mimics(best, [best]) == [*wanted, "near_0", "near_1"]
 
 
 def test_the_leading_law_is_tried_where_like_places_share_it() -> None:

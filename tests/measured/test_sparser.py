@@ -39,7 +39,8 @@ def test_two_laws_stand_for_many_values_where_they_are_worth_more(total: float) 
 
 
 def test_two_places_need_two_numbers_anyway_and_what_may_not_be_named_is_not_tried() -> None:
-    assert asked("ab", [1.0, 1.1], 200.0, ["a", "b", "a+b"]) == (None, [])
+    assert asked("ab", [1.05, 1.1], 200.0, ["a", "b", "a+b"]) == (None, [])
+    assert asked("ab", [1.0, 1.1], 200.0, ["a", "a+b"]) == (None, [])
     assert asked("abc", [1.0, 1.1, 1.0], 200.0, ["a", "c", "a+b+c"]) == (None, [])
 
 
@@ -51,6 +52,15 @@ def test_a_law_at_some_places_is_tried_first_and_is_the_one_that_comes_nearest()
     assert found[1].total == 101
     _, tried = asked("abcd", [1.0, 1.002, 1.1, 1.098], 99.0, pool)
     assert [ids for ids, _ in tried] == [["gain:c+d"], ["gain:a+b+c+d", "gain:a"]]
+
+
+@pytest.mark.parametrize("places", ["ab", "abc"])
+def test_one_place_stands_for_many_where_the_others_have_nothing(places: str) -> None:
+    values = [1.003, 0.8, 0.998][: len(places)]
+    found, tried = asked(places, values, 101.0, [*places, "+".join(places)])
+    assert tried == [(["gain:b"], [pytest.approx(0.8)])]
+    assert found is not None
+    assert found[0].id.endswith(":each")
 
 
 def test_the_odd_one_out_leaves_the_others_alike() -> None:

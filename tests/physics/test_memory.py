@@ -119,6 +119,19 @@ def test_backlash_coasts_while_its_rotor_crosses_the_gap(gap: float) -> None:
         assert behind == pytest.approx(rate * crossing**2 / 2, rel=0.1)  # within half a step of 20
 
 
+def test_a_rotor_that_the_model_forgot_crosses_the_gap_with_the_inertia_of_its_effect() -> None:
+    """Play and armature at one joint are the play of a drive whose rotor the model knows."""
+    force, first, count = 5.0, 101, 600
+    ctrl = np.where(np.arange(count) < first, -force, force)[:, None]
+    play, small = make("backlash", "rail", {"gap": 0.02, "rotor": 0.01})
+    inertia, own = make("armature", "rail", {"inertia": 0.05})
+    segments = Segments(DT, 0, np.zeros((1, 1)), np.zeros((1, 1)), ctrl[None])
+    both = plant_of(MODEL, play, inertia).shoot(np.concatenate([small, own])[None], segments)
+    whole, theta = make("backlash", "rail", {"gap": 0.02, "rotor": 0.05})
+    known = run(_geared(0.05), whole, theta, count, ctrl=ctrl)
+    np.testing.assert_allclose(both.qpos, known.qpos, atol=1e-12)
+
+
 def test_backlash_loses_what_plastic_impacts_lose() -> None:
     """The drive's work on its rotor is the energy of both masses, less J M / (J + M) dv^2 / 2 in each impact."""
     rng, rotor, count = np.random.default_rng(0), 0.02, 1000

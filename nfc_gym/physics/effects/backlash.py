@@ -79,7 +79,9 @@ class Backlash(Effect):
     servo's position) is read at the joint, whose acceleration is that of the last step.
 
     `rotor` is not fitted: it is the joint's `armature`, or a tenth of the joint's inertia where the model has none.
-    The gap is known to the same factor as the rotor is, since the time to cross it goes with their product.
+    The gap is known to the same factor as the rotor is, since the time to cross it goes with their product. Where the
+    joint has more armature than that, as parameters or an effect of its own have it, all of it is the rotor's: a drive
+    with play whose rotor the model forgot is this law and `armature` together.
     """
 
     family = "backlash"
@@ -111,7 +113,7 @@ class Backlash(Effect):
         """(place of the rotor in the play, its speed, share of the step for which it pushes, impulse with which it
         hits, the joint's speed), (..., n) each."""
         place, speed, share, hit, before = memory
-        v, half, rotor, dt = ctx.v[..., self.drive.v], theta[..., 0:1] / 2, theta[..., 1:2], ctx.dt
+        v, half, rotor, dt = ctx.v[..., self.drive.v], theta[..., 0:1] / 2, self._rotor(ctx, theta), ctx.dt
         own = self.drive.torque(ctx) / rotor
         pull = own - np.where(hit == 0, (v - before) / dt, 0.0)  # the rotor's acceleration as the joint sees it
         side, pull = np.sign(pull), np.abs(pull)
@@ -144,7 +146,11 @@ class Backlash(Effect):
             fields[name][..., self.rows, :] *= share[..., None]
         armature = fields["dof_armature"]
         whole = armature[..., self.drive.v]
-        armature[..., self.drive.v] = whole - np.where(share > 0, 0.0, np.minimum(whole, theta[..., 1:2]))
+        armature[..., self.drive.v] = whole - np.where(share > 0, 0.0, np.minimum(whole, self._rotor(ctx, theta)))
+
+    def _rotor(self, ctx: Context, theta: Array) -> Array:
+        """(..., n) kg m^2 or kg: inertia of the rotors as it shows at the joints."""
+        return np.maximum(theta[..., 1:2], ctx.nominal("dof_armature")[..., self.drive.v])
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
         out.qfrc[..., self.drive.v] += ctx.memory[3] / ctx.dt
