@@ -8,7 +8,8 @@ import numpy as np
 
 from nfc_gym import assets
 from nfc_gym.core import InputError
-from nfc_gym.physics.names import name_all
+from nfc_gym.physics.effects.lookup import one_command_each
+from nfc_gym.physics.names import name_all, names
 
 
 def registered(name: str) -> str | None:
@@ -62,7 +63,7 @@ def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
 
     Raises:
       InputError: it does not compile, in MuJoCo's own words, holds a number that is not finite or a name that is no
-        text, or has the flag `ipc`.
+        text, has the flag `ipc`, or an actuator with several commands.
     """
     try:
         model = spec.compile()
@@ -75,6 +76,16 @@ def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
         raise InputError(f"model {name}: the name {model.names[start:end]!r} is not UTF-8; save the file so") from None
     if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_IPC):
         raise InputError(f"model {name}: the flag 'ipc' keeps a state that no log shows; disable it")
+    if not one_command_each(model):
+        wide = next(
+            n
+            for n, c, f in zip(names(model).actuators, model.actuator_ctrlnum, model.actuator_outnum, strict=True)
+            if c > 1 or f > 1
+        )
+        raise InputError(
+            f"model {name}: the actuator {wide!r} has several commands or forces (`pid`, `orientation`), and a log one "
+            "of each; put a `position` servo or motors in its place"
+        )
     for owner, before in ((model.opt, "option "), (model, "")):
         for field in dir(owner):
             value = getattr(owner, field) if not field.startswith("_") else None

@@ -20,7 +20,7 @@ from nfc_gym.measured.start_checks import unmeasured
 from nfc_gym.measured.stiffness import stiffness_findings
 from nfc_gym.measured.yaml_marks import suggest
 from nfc_gym.physics.activations import integrators, on_servos
-from nfc_gym.physics.effects.drive import command_unit
+from nfc_gym.physics.effects.drive import command_unit, plain
 from nfc_gym.physics.effects.lookup import actuator_names
 from nfc_gym.physics.fields import ModelFields, names_of
 from nfc_gym.physics.parameters import COMPOUND, Parameter, ParameterSpace, resolve, split_field
@@ -69,6 +69,7 @@ def model_findings(mapping: Mapping, spec: mujoco.MjSpec, model: mujoco.MjModel)
         )
     yield from _unused(mapping)
     yield from _integrating(mapping, model)
+    yield from _strange(model)
     if mapping.segments.mode == "rollout":
         yield from stiffness_findings(_nominal(mapping, model), float(mapping.segments.timestep or model.opt.timestep))
 
@@ -219,6 +220,14 @@ def _integrating(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:
             message = f"the actuator integrates its command: what it had gathered is taken to be 0 {begin}"
             advice = "log what it has gathered, and make that the command of an actuator without dynamics"
             yield Finding("warning", where, message, advice)
+
+
+def _strange(model: mujoco.MjModel) -> Iterator[Finding]:
+    """Actuators whose force is none of a motor or a servo: what may be wrong with it the library does not know."""
+    known = plain(model)
+    if odd := [repr(n) for n in actuator_names(model) if n not in known]:
+        message = f"the force of {', '.join(odd)} is none of a motor or a servo: what it may lack is not looked for"
+        yield Finding("note", "model", message, "only whether its command comes late")
 
 
 def _compared(mapping: Mapping, model: mujoco.MjModel) -> Iterator[Finding]:

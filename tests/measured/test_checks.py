@@ -334,6 +334,16 @@ def test_a_drive_whose_state_no_command_tells_is_told_of(build: Build, machine: 
         map(str, check(build(None, ("{column: goal, unit: rad}", "{column: goal, unit: 1}"), model=model)))
     )
     assert "dynamics 'muscle'" in said
+    assert "the force of 'servo' is none of a motor or a servo" in said
+
+
+@pytest.mark.parametrize("actuator", ["pid joint='hinge'", "orientation joint='free_ball'"])
+def test_an_actuator_with_several_commands_is_refused(build: Build, machine: str, actuator: str) -> None:
+    model = re.sub(r'<position name="servo"[^>]*/>', f"<{actuator} name='servo'/>", machine)
+    model = model.replace(
+        "</worldbody>", "<body pos='0 0 3'><joint name='free_ball' type='ball'/><geom size='.1'/></body></worldbody>"
+    )
+    assert any("'servo' has several commands" in e for e in errors(build(None, model=model)))
 
 
 def test_a_models_step_longer_than_the_shortest_horizon(build: Build, machine: str) -> None:
