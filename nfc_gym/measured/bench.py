@@ -13,13 +13,14 @@ from nfc_gym.core.log import Log
 from nfc_gym.measured import foresight
 from nfc_gym.measured.belief import Belief
 from nfc_gym.measured.buffers import make_room, set_step
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.findings import Finding
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.model import bare, compile_model, read_spec, registered
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.segments import Layout, served, servos
+from nfc_gym.measured.segments import served, servos
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, estimate_states
 from nfc_gym.measured.suspects import Witness

@@ -12,11 +12,12 @@ from nfc_gym.core.files import replacing, require_writable
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench, make_bench
 from nfc_gym.measured.checks import require
+from nfc_gym.measured.cuts import Cut, Layout
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.export import unpack
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
-from nfc_gym.measured.segments import Cut, Layout, servos
+from nfc_gym.measured.segments import servos
 from nfc_gym.measured.shooting import RolloutProblem, interpolate
 from nfc_gym.physics.quiet import no_warnings
 from nfc_gym.physics.rollout import Plant

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.log import Log
 from nfc_gym.measured.buffers import require_room
+from nfc_gym.measured.cuts import Cut, Layout, cut
 from nfc_gym.measured.draws import across
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.recent import Recent
-from nfc_gym.measured.segments import Cut, Layout, cut, lay, pick, refine, repeat
+from nfc_gym.measured.segments import lay, pick, refine, repeat
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import overrides
 from nfc_gym.physics.rollout import Plant

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+POINTS = 7  # samples in each local fit that tells a state
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Local:
     misfit: Array
 
 
-def local_polynomial(time: Array, values: Array, at: Array, points: int = 7, degree: int = 3) -> Local:
+def local_polynomial(time: Array, values: Array, at: Array, points: int = POINTS, degree: int = 3) -> Local:
     """Fit a polynomial to the `points` samples nearest each time of `at`.
 
     Args:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.log import Channel, Log
 from nfc_gym.measured.channels import parse_channel
-from nfc_gym.measured.smoothing import Local, centred_average, estimate_noise, fresh_samples, local_polynomial
+from nfc_gym.measured.smoothing import POINTS, Local, centred_average, estimate_noise, fresh_samples, local_polynomial
 from nfc_gym.physics.effects.sensors import RATES, SPEEDS
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back, vector_to_quat
 
@@ -184,7 +184,7 @@ class _Builder:
         self.qacc[:, v + 3 : v + 6] = fit.curvature
 
 
-def estimate_states(model: mujoco.MjModel, log: Log, points: int = 7, raw: bool = False) -> States:
+def estimate_states(model: mujoco.MjModel, log: Log, points: int = POINTS, raw: bool = False) -> States:
     """States along a log by local cubic fits to the channels that measure them.
 
     Args:

@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.arena import Arena
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.fit import fit
 from nfc_gym.measured.owned import Data
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states

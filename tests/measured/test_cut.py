@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, InputError, Log
-from nfc_gym.measured.segments import Layout, commanded, cut
+from nfc_gym.measured.cuts import Layout, cut
+from nfc_gym.measured.segments import commanded
 from nfc_gym.measured.states import estimate_states
 
 LAYOUT = Layout(0.4, 0.0, (0.05, 0.1, 0.2, 0.4), 0.4, 0.005)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.fit import Fit, box, differs, fit, fit_last, jacobian, uncertainty
 from nfc_gym.measured.metric import Metric, loss, metric
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build as build_effect

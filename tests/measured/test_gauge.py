@@ -9,10 +9,10 @@ import pytest
 
 from nfc_gym.core.log import Channel, Log
 from nfc_gym.measured import gauge
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.remarks import on_parameters
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.parameters import Parameter, ParameterSpace

@@ -7,10 +7,10 @@ import pytest
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import clusters
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.fit import fit, uncertainty
 from nfc_gym.measured.halved import artefacts, step_error
 from nfc_gym.measured.owned import Data
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.shooting import RolloutProblem, finer
 from nfc_gym.measured.states import estimate_states

@@ -8,10 +8,10 @@ import pytest
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured import segments
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.instant import track
 from nfc_gym.measured.inverse import actuator_forces
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build

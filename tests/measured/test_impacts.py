@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.metric import metric
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem, finer
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.parameters import Parameter, ParameterSpace

@@ -6,12 +6,12 @@ import pytest
 from hidden_laws import CRAFT, STEP, WHEEL, Machine, hover, nothing, record, swing
 
 from nfc_gym.core.log import Channel, Log
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.impulse import Tensor, impulse
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.metric import Metric, metric
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, estimate_states
 from nfc_gym.physics.effects import Scales, propose

@@ -11,10 +11,10 @@ import pytest
 from hidden_laws import BLOCK, CRAFT, STEP, WHEEL, Machine, Push, hover, nothing, record, slide, swing
 
 from nfc_gym.measured.arena import Arena
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.remainder import LawSearch, Remainder
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.settle import settle
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states

@@ -9,10 +9,11 @@ import pytest
 from mujoco.batch import Batch
 
 from nfc_gym.core import Channel, InputError, Log
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.metric import metric
-from nfc_gym.measured.segments import Layout, Segments
+from nfc_gym.measured.segments import Segments
 from nfc_gym.measured.shooting import RolloutProblem, finer, interpolate
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import FAMILIES, build

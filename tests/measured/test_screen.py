@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.fisher import Lens, repeated
 from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.lookout import Lookout, _pursued
 from nfc_gym.measured.metric import loss, metric
 from nfc_gym.measured.screen import Screen, answer, ladder
-from nfc_gym.measured.segments import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import FAMILIES, build

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
-from nfc_gym.measured.segments import Layout, cut, lay, pick, repeat
+from nfc_gym.measured.cuts import Layout, cut
+from nfc_gym.measured.segments import lay, pick, repeat
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.base import Array, Effect

@@ -10,7 +10,7 @@ import pytest
 
 from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.core.files import require_writable
-from nfc_gym.measured.segments import Layout
+from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.measured.verdict import Models, taken_away, verify
