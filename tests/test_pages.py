@@ -64,3 +64,21 @@ def test_what_the_readme_counts() -> None:
     listed = re.findall(r"^\| `(\w+)\(env", README, re.MULTILINE)
     assert len(listed) == 9
     assert set(listed) == {name for name in wrappers.__all__ if f"Vector{name}" in wrappers.__all__}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tables_fit_a_screen(page: Path) -> None:
+    rules = re.findall(r"^\|(?:\s*:?-+:?\s*\|)+$", FENCED.sub("", page.read_text(encoding="utf-8")), re.MULTILINE)
+    assert max((rule.count("|") - 1 for rule in rules), default=0) <= 8
+
+
+def test_what_is_to_be_expected_is_what_was_measured() -> None:
+    """The table that inference.md begins with says again what posteriors.md and README.md have."""
+    said, measured = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("inference.md", "posteriors.md"))
+    (flat,) = re.findall(r"^\| a minute of training on a GPU \|(.*)\|$", said, re.MULTILINE)
+    (refined,) = re.findall(r"^\| refined for one window \|(.*)\|$", said, re.MULTILINE)
+    robots = ("Jackal", "Ant", "Quadruped", "Humanoid", "Quadcopter")
+    for robot, gain, after in zip(robots, flat.split("|"), refined.split("|"), strict=True):
+        assert re.search(rf"^\| {robot} Flat \| \d+ 000 \|.*\*\*{gain.strip()}\*\* \|$", measured, re.MULTILINE), robot
+        assert re.search(rf"^\| {robot} \| [\d.]+ \| \*\*{after.strip()}\*\* \|", measured, re.MULTILINE), robot
+        assert f" {gain.strip()} / " in README, robot
