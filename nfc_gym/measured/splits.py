@@ -240,7 +240,7 @@ def _dealt(units: Sequence[str], days: Dict[str, frozenset[str]], counts: Dict[S
     shares = {day: len(own) / len(units) for day, own in left.items()}
     given: Counter[tuple[Split, frozenset[str]]] = Counter()
     out: dict[str, Split] = {}
-    turns = [(split, (k + 0.5) / count) for split, count in counts.items() for k in range(count)]
+    turns: list[tuple[Split, float]] = [(s, (k + 0.5) / count) for s, count in counts.items() for k in range(count)]
     if len(left) > 1:  # one after the other in turn, that none takes all that a condition can spare
         turns.sort(key=lambda turn: turn[1])
     for split, _ in turns:
@@ -249,7 +249,8 @@ def _dealt(units: Sequence[str], days: Dict[str, frozenset[str]], counts: Dict[S
         day = max(wants, key=lambda d: (round(wants[d], 9), len(left[d])))
         given[split, day] += 1
         out[left[day].pop(0)] = split
-    return out | {unit: "fit" for own in left.values() for unit in own}
+    fitted: dict[str, Split] = {unit: "fit" for own in left.values() for unit in own}
+    return out | fitted
 
 
 def _by_time(log: Log, rule: SplitRule) -> dict[Split, Log]:
