@@ -80,10 +80,15 @@ class Choice:
     def _equivalents(
         self, judged: Sequence[Judged], best: Judged, leading: Judged, *, priced: bool = True
     ) -> list[str]:
-        """Ids of what explains the data as well as the law that is accepted, see `Arena.ties`."""
+        """Ids of what explains the data as well as the law that is accepted, see `Arena.ties`.
+
+        Without prices: a load that gains as much as the shift that it is in truth costs one number more, which beside a
+        small gain is much.
+        """
         arena, chosen = self.arena, self.arena.new(best)
         ids = [e.id for e in chosen]
-        rivals = [j for j in judged if j.total > NEARLY * best.total and arena.label(j) not in ids]
+        enough = NEARLY * (best.total if priced else best.drop)
+        rivals = [j for j in judged if (j.total if priced else j.drop) > enough and arena.label(j) not in ids]
         rivals = [j for j in rivals if arena.ties(leading, j, priced=priced)]
         # Nor is one thing that two bodies could carry, hung on the one farther away.
         rivals = [j for j in rivals if not any(arena.nearer(k, j) for k in (best, *rivals))]

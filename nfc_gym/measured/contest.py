@@ -68,6 +68,11 @@ class Judged:
         """Drop of the surprise over the selection logs."""
         return float(self.gains.sum())
 
+    @property
+    def drop(self) -> float:
+        """Drop of the surprise over both sets of logs, whatever the parameters cost."""
+        return float(self.gains.sum()) + float(self.fit_gains.sum())
+
 
 def losses(problem: Problem, metric: Metric, fitted: Fit) -> Array:
     """(S,) loss of each block of a problem under a fitted model."""

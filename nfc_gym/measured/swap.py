@@ -73,7 +73,7 @@ def swapped(
                 say(f"{pick.effect.id} in place of {effect.id}: together they explain more")
                 return Swap(rival.fitted, alike)
             # What has the law as its special case is no alternative to it.
-            if rival.total <= NEARLY * kept.total or contains(pick.effect, effect):
+            if rival.drop <= NEARLY * kept.drop or contains(pick.effect, effect):
                 continue
             # The law itself was fitted more than once.
             if without.ties(kept, rival, priced=False) or without.ties(kept, without.enter_again(rival), priced=False):

@@ -227,3 +227,25 @@ def test_one_lump_on_either_of_two_bodies_is_one_equivalent() -> None:
     )
     choice = Choice(found, 0.02, {}, lambda _: pytest.fail("nothing to look at"))
     assert choice.alike(laws, laws[0], laws[0]) == ["shift:a", "lump:a"]
+
+
+@pytest.mark.parametrize(("drop", "listed"), [(14.9, True), (13.0, False)])
+def test_what_gains_as_much_for_more_numbers_is_an_equivalent_however_little_that_is(drop: float, listed: bool) -> None:
+    """Where a shift gains little, the price of the number more that a load has is a large part of it."""
+    shift, load = (
+        SimpleNamespace(id=i, family=i.partition(":")[0], where=("a",), simpler=(), covers=())
+        for i in ("shift:a", "load:a")
+    )
+    best, rival = (
+        SimpleNamespace(law=law, total=total, drop=d) for law, total, d in ((shift, 9.0, 15.0), (load, 5.0, drop))
+    )
+    found: Any = SimpleNamespace(
+        new=lambda j: [j.law],
+        label=lambda j: j.law.id,
+        ties=lambda best, other, *, priced: True,
+        nearer=lambda one, other: False,
+    )
+    choice = Choice(found, 0.02, {}, lambda _: pytest.fail("nothing to look at"))
+    laws: Any = [best, rival]
+    assert choice.alike(laws, laws[0], laws[0]) == ["shift:a"]
+    assert choice.alike(laws, laws[0], laws[0], priced=False) == ["shift:a", *["load:a"] * listed]
