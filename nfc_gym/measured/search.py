@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.arena import Arena, alternatives
+from nfc_gym.measured.arena import Arena, alternatives, contains
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.doubt import doubted
 from nfc_gym.measured.fit import Fit, fit
@@ -267,9 +267,22 @@ class Search:
         while (found := sparser(arena, self.named, self.options.worth)) is not None:
             law, plainer = found
             self.say(f"plain laws in place of {law.id}: fewer numbers do as well")
-            rounds.append(self._exchanged(arena.current, plainer.fitted, "with fewer numbers"))
+            told = self._exchanged(arena.current, plainer.fitted, "with fewer numbers")
+            self._inherit(told, law.id, rounds)
+            rounds.append(told)
             arena = self._confirmed(self.settle(plainer.fitted.plant, plainer.fitted.x), rounds)
         return arena
+
+    def _inherit(self, told: Round, before: str, rounds: Sequence[Round]) -> None:
+        """What does as well as a law does as well as the plain one that says the same in its place."""
+        known = {e.id: e for e in self.named}
+        plain = known.get(told.accepted[0]) if len(told.accepted) == 1 else None
+        rivals = [i for r in rounds if before in r.accepted for i in r.rivals(before)]
+        if plain is None or not rivals:
+            return
+        own, named = told.rivals(plain.id), [(i, known.get(i.removesuffix(":each"))) for i in rivals]
+        apart = [i for i, law in named if law is None or not contains(law, plain)]
+        own[:] = alternatives(plain, [*own, *apart], self.named)
 
     def _merged(self, arena: Arena, rounds: list[Round]) -> Arena:
         """The arena with one law in place of two, as often as that does better with no more numbers."""

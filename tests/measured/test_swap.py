@@ -123,6 +123,20 @@ def test_fewer_numbers_are_asked_of_what_is_confirmed_alone(monkeypatch: pytest.
     assert [r.accepted for r in rounds] == [["plain"]]
 
 
+def test_what_does_as_well_as_a_law_does_as_well_as_the_plain_one_in_its_place() -> None:
+    """But for what contains the plain one."""
+    search: Any = object.__new__(Search)
+    dry, stribeck, viscous = (FAMILIES[f](("knee",)) for f in ("coulomb", "stribeck", "damping_poly"))
+    directional = FAMILIES["directional_friction"](("hip", "knee"))
+    search.named = [dry, stribeck, viscous, directional]
+    before = Round(["coulomb:hip+knee:each"], 0.5, equivalents=[stribeck.id, viscous.id, f"{directional.id}:each"])
+    after = Round([dry.id], 0.0)
+    search._inherit(after, "coulomb:hip+knee:each", [before])
+    assert after.equivalents == [viscous.id]
+    search._inherit(two := Round(["a", "b"], 0.0), "coulomb:hip+knee:each", [before])
+    assert not two.equivalents
+
+
 def test_what_the_last_law_met() -> None:
     one, two = Round(["a:x"], 0.5, [{"id": "b:x"}]), Round(["a:x", "b:x"], 0.5, [{"id": "c:x"}])
     none = Round([], 0.0, [{"id": "d:x"}])
