@@ -1,10 +1,7 @@
 """Train one method on one set, within a number of epochs and perhaps of seconds."""
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from copy import deepcopy
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +19,6 @@ from posteriors.methods import METHODS, network_config
 from posteriors.sets import Held
 
 HELD_OUT = 0.05  # of the training windows, to compare epochs by
-_WARM, _TIMED = 5, 25  # steps that are not timed, then those that tell how long an epoch takes
 _SAVE = 30.0  # seconds between saved states
 
 
@@ -77,10 +73,10 @@ def fit_network(
     network = Network(config, sizes, prior, seed).to(device)
     first, held_out = windows.split(HELD_OUT)
     training = TrainConfig(
-        epochs=plan.epochs, batch=plan.batch, rate=plan.rate, seed=seed, save_every=_SAVE, mixed=config.elevation
-    )
+        epochs=plan.epochs, batch=plan.batch, rate=plan.rate, seed=seed, save_every=_SAVE, mixed=config.elevation,
+        budget=plan.budget,
+    )  # fmt: skip
     with rounded(device):
-        training = replace(training, epochs=affordable(network, first, held_out, training, plan.budget, folder, device))
         outcome = train(network, first, held_out, training, folder=folder, device=device, report=report)
     checkpoint.save(folder / "posterior.safetensors", network)
     return Cell(Ours(network), outcome, training.epochs)
@@ -97,30 +93,3 @@ def rounded(device: torch.device) -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
-
-
-def affordable(
-    network: Network, windows: Held, held_out: Held, training: TrainConfig, budget: float, folder: Path,
-    device: torch.device,
-) -> int:  # fmt: skip
-    """Epochs that fit into the budget: the step size must know beforehand where it ends.
-
-    A short training of a copy is timed; the number is kept in the folder, so that a run that goes on keeps to it.
-    """
-    kept = folder / "epochs"
-    if kept.is_file():
-        return int(kept.read_text())
-    epochs = training.epochs
-    if budget:
-        copy = deepcopy(network)
-
-        def seconds(steps: int) -> float:
-            """Of an epoch of that many steps with its share of held-out windows, made of the set's first ones."""
-            some = windows.first(steps * training.batch)
-            few = held_out.first(math.ceil(len(some) * HELD_OUT))
-            return train(copy, some, few, replace(training, epochs=1), device=device).seconds / len(some)
-
-        seconds(_WARM)
-        epochs = max(1, min(epochs, int(budget / max(seconds(_TIMED) * len(windows), 1e-6))))
-    kept.write_text(str(epochs))
-    return epochs

@@ -26,6 +26,8 @@ Batch = dict[str, Tensor]
 _AXES = {"states": 3, "actions": 3, "psi": 2, "delta_s": 2, "delta_e": 3, "map": 3, "family": 1}
 _MAPS = ("map", "delta_e")
 _APART = 3  # stream of random numbers
+_READ = 4096  # windows that are read from disk at once
+_ROOM = 0.4  # of a GPU's free memory, which windows may take
 
 
 class WindowSet(Protocol):
@@ -56,7 +58,8 @@ class TensorWindows:
       manifest: what is known of them.
       told: plain values, by name, in which training from other windows would be another training; without them it is
         by their `contents` that a saved state of training tells these windows from others.
-      noise: (H+1, s) standard deviation of what is added to the states anew in each pass; None adds nothing.
+      noise: (H+1, s), or (s,) for all times, standard deviation of what is added to the states anew in each pass; None
+        adds nothing.
 
     Raises:
       InputError: a tensor has another number of axes or windows, states and actions do not belong together, or a
@@ -164,6 +167,20 @@ class StoredWindows:
         for arrays in self.stored.batches(size, 0 if seed is None else seed, self.rows, self.names, self.noise):
             yield {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
 
+    def first(self) -> Batch:
+        """The first window alone, without noise."""
+        return next(iter(self._of(self.rows[:1], 0.0).batches(1, None)))
+
+    def held(self, device: str | torch.device) -> TensorWindows:
+        """All of them in the memory of a device, to which noise like the stored set's is added in each pass."""
+        tensors, at = {k: t.new_empty((len(self), *t.shape[1:]), device=device) for k, t in self.first().items()}, 0
+        for part in self._of(self.rows, 0.0).batches(_READ, None):
+            for name, tensor in part.items():
+                tensors[name][at : at + len(tensor)] = tensor
+            at += len(part["psi"])
+        noise = self.noise * torch.tensor(self.manifest.state_noise, dtype=torch.float32)
+        return TensorWindows(tensors, told=self.told, noise=noise.to(device) if noise.any() else None)
+
     def split(self, share: float) -> tuple["StoredWindows", "StoredWindows"]:
         """The first windows, and the last `share` of them: to train on and to hold out; errors as of `cut_at`."""
         cut = cut_at(len(self), share)
@@ -175,8 +192,27 @@ class StoredWindows:
         drawn[np.random.default_rng([seed, _APART]).choice(len(self), n, replace=False)] = True
         return self._of(self.rows[~drawn]), self._of(self.rows[drawn])
 
-    def _of(self, rows: NDArray[np.integer]) -> "StoredWindows":
-        return StoredWindows(self.stored, rows, self.maps, self.noise)
+    def _of(self, rows: NDArray[np.integer], noise: float | None = None) -> "StoredWindows":
+        return StoredWindows(self.stored, rows, self.maps, self.noise if noise is None else noise)
+
+
+def resident(windows: WindowSet, device: torch.device) -> WindowSet:
+    """The same windows in a GPU's memory, where there is room for them; elsewhere, and on a processor, as they are.
+
+    Those on disk then get their sensors' noise from torch's generator in place of numpy's, and another order.
+    """
+    if device.type != "cuda":
+        return windows
+    if type(windows) is TensorWindows:
+        return windows.to(device) if _fits(windows.tensors, 1, device) else windows
+    if type(windows) is StoredWindows and _fits(windows.first(), 1 / len(windows), device):
+        return windows.held(device)
+    return windows
+
+
+def _fits(tensors: Batch, share: float, device: torch.device) -> bool:
+    """Whether there is room for windows of which these are a share."""
+    return sum(t.nbytes for t in tensors.values()) / share <= _ROOM * torch.cuda.mem_get_info(device)[0]
 
 
 def cut_at(windows: int, share: float) -> int:

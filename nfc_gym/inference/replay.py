@@ -40,16 +40,17 @@ class Replayed:
     Args:
       function: tensors to a tuple of tensors, all on one CUDA device.
       arguments: the first values.
+      warm: calls before the capture; 0 where the function has been called with such values.
     """
 
-    def __init__(self, function: Pass, *arguments: Tensor) -> None:
+    def __init__(self, function: Pass, *arguments: Tensor, warm: int = _WARM) -> None:
         self.inputs = [a.clone() for a in arguments]
         self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.device(arguments[0].device), seeded(0, arguments[0].device):
             side = torch.cuda.Stream()
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
-                for _ in range(_WARM):
+                for _ in range(warm):
                     function(*self.inputs)
             torch.cuda.current_stream().wait_stream(side)
             with torch.cuda.graph(self.graph):

@@ -190,3 +190,38 @@ def test_noise_is_drawn_anew_with_each_pass_and_the_same_for_a_seed() -> None:
     assert float(first[..., 0].std()) == pytest.approx(0.5, rel=0.2)
     train, judge = held.split(0.25)
     assert (len(train), len(judge)) == (30, 10)
+
+
+@pytest.mark.parametrize("method", ["sde-nn", "mdn-rff"])
+def test_each_method_has_the_seconds_of_the_budget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    import importlib
+
+    from posteriors.fit import Plan, fit
+    from posteriors.sets import Held
+
+    from nfc_gym.inference.progress import quiet
+    from nfc_gym.inference.space import PriorBox
+
+    chance = np.random.default_rng(0)
+    sizes = {"states": (400, 6, 2), "actions": (400, 5, 1), "psi": (400, 2), "delta_s": (400, 2), "family": (400,)}
+    tensors = {k: torch.as_tensor(chance.uniform(size=s), dtype=torch.float32) for k, s in sizes.items()}
+
+    class Slow(Held):
+        """Each step takes a second, and five once others work on the machine too."""
+
+        def batches(self, size: int, seed: int | None):  # type: ignore[no-untyped-def]
+            for batch in super().batches(size, seed):
+                clock[0] += 1 if clock[0] < 12 else 5
+                yield batch
+
+    clock = [0.0]
+    monkeypatch.setattr(importlib.import_module("nfc_gym.inference.train"), "monotonic", lambda: clock[0])
+    monkeypatch.setattr("posteriors.sets.Held", Slow)  # as `split` makes them
+    windows = Slow(tensors, torch.zeros(2), ("qpos", "qvel"))
+    prior = PriorBox("toy", ("a", "b"), ("1", "1"), (0.0, 0.0), (1.0, 1.0))
+    plan = Plan(epochs=1000, budget=60.0, batch=64, rate=1e-3, draws=1, small=True)
+    found = fit(method, "window", windows, prior, plan, 0, tmp_path, torch.device("cpu"), quiet)
+    assert found.outcome.stopped == "budget"
+    assert 60 <= found.outcome.seconds <= 65 + 5  # the held-out windows of the last epoch come on top
