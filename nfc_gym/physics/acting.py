@@ -46,6 +46,9 @@ class Acting:
       fields: the model fields of the simulation.
       engine: the simulation.
       dt: physics step, s.
+
+    Raises:
+      InputError: an effect could do nothing, whatever its size.
     """
 
     def __init__(
@@ -58,6 +61,8 @@ class Acting:
         dt: float,
     ) -> None:
         self.model, self.fields, self.engine, self.dt = model, fields, engine, dt
+        for effect in effects:
+            effect.require_use(model, effects)
         pairs = list(zip(effects, thetas, strict=True))
         self.commanding = [(e, theta) for e, theta in pairs if overrides(e, "action")]
         self.rubbing = [(e, theta) for e, theta in pairs if overrides(e, "friction")]

@@ -519,6 +519,15 @@ def test_a_limit_that_is_none_gives_a_motor_no_torque_speed_line() -> None:
     np.testing.assert_array_equal(*moved)
 
 
+def test_a_torque_speed_line_of_a_motor_without_a_limit_is_refused() -> None:
+    """It would do nothing, without a word; with a limit of the model or of an effect beside it it does."""
+    effect, theta = build("torque_speed", "push", {"fall": 0.5})
+    with pytest.raises(InputError, match="nothing limits the force of 'push'"):
+        run(_with('<motor name="push" joint="rail"/>'), effect, theta, 3)
+    run(_with('<motor name="push" joint="rail" forcerange="-1 1"/>'), effect, theta, 3)
+    run(_with('<motor name="push" joint="rail" ctrlrange="-1 1"/>'), effect, theta, 3)
+
+
 MUSCLE = """
 <mujoco><option timestep=".002" gravity="0 0 0"/><worldbody><body>
 <joint name="knee" axis="0 1 0" range="-1 1" limited="true" damping="20"/>

@@ -235,6 +235,9 @@ class Effect(ABC):
                     f"(a fit goes from {p.low:g} to {p.high:g})"
                 )
 
+    def require_use(self, model: mujoco.MjModel, beside: Sequence["Effect"]) -> None:  # noqa: B027
+        """Refuse an effect that could do nothing in a model, whatever its size, beside the other effects on it."""
+
     # ---- hooks ----------------------------------------------------------------------------------------------------
 
     def spec(self, spec: mujoco.MjSpec, theta: Array) -> bool:

@@ -244,6 +244,16 @@ class TorqueSpeed(Effect):
         self.joints = self.arms * self.alone[:, None]
         self.reach = np.array([_reach(model, int(r)) for r in self.rows])
 
+    def require_use(self, model: mujoco.MjModel, beside: Sequence[Effect]) -> None:
+        peaks = _peak(partial(getattr, model), self.rows, self.reach)
+        given = {name for e in beside if e.family == "saturation" for name in e.where}
+        for name, peak in zip(self.where, peaks, strict=True):
+            if peak == 0 and name not in given:
+                raise InputError(
+                    f"torque_speed: nothing limits the force of {name!r}, so that no limit of it falls with speed; "
+                    "give the actuator a forcerange, or a motor a ctrlrange, or put `saturation` beside it"
+                )
+
     def marks(self, model: mujoco.MjModel) -> dict[str, Array]:
         ends = (_reach(model, int(r)) for r in actuator_ids(model, self.where))
         return {_reach_mark(n): np.array([end]) for n, end in zip(self.where, ends, strict=True) if end > 0}
