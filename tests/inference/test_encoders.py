@@ -1,6 +1,7 @@
 """Encoders: causality, scales, closed forms of the kernels and of the regressions."""
 
 import math
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from nfc_gym.inference.encoders import ENCODERS, Joined, Regressions, Summaries
 from nfc_gym.inference.encoders.base import Tamed
 from nfc_gym.inference.encoders.kernels import FKS, RFF, chi_quantiles
 from nfc_gym.inference.encoders.resnet import ResNet18
-from nfc_gym.inference.encoders.tcn import TCN
+from nfc_gym.inference.encoders.tcn import TCN, Reached
 
 S, A, H = 3, 2, 8
 
@@ -63,6 +64,19 @@ def test_the_tcn_is_causal_and_its_last_step_sees_all() -> None:
     x.grad = None
     tcn.embed(x).view(16, 51)[:, 50].sum().backward()
     assert (x.grad[0].abs().sum(1) > 0).all()  # type: ignore[index]
+
+
+@pytest.mark.parametrize(("width", "dilation", "length"), [(3, 1, 7), (3, 2, 7), (3, 4, 7), (2, 8, 5), (1, 3, 4)])
+def test_causal_convolutions_and_their_slopes_are_torchs(width: int, dilation: int, length: int) -> None:
+    conv = torch.nn.Conv1d(4, 5, width, dilation=dilation).double()
+    x = torch.randn(2, length, 4, dtype=torch.float64, requires_grad=True)
+    laid = cast(torch.Tensor, Reached.apply(x, width, dilation))
+    found = torch.nn.functional.linear(laid, conv.weight.mT.flatten(1), conv.bias)
+    expected = conv(torch.nn.functional.pad(x.mT, ((width - 1) * dilation, 0))).mT
+    torch.testing.assert_close(found, expected)
+    along = torch.randn_like(expected)
+    ours, theirs = (torch.autograd.grad(y, x, along, retain_graph=True)[0] for y in (found, expected))
+    torch.testing.assert_close(ours, theirs)
 
 
 @pytest.mark.parametrize("kind", [RFF, FKS])

@@ -1,6 +1,6 @@
 """Causal temporal convolutions: what the paper encodes windows with."""
 
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -8,6 +8,32 @@ from torch import Tensor, nn
 from nfc_gym.inference.encoders.base import SignalEncoder
 
 CHANNELS = (256, 128, 64, 16)  # paper, appendix "Network Architecture"
+
+
+class Reached(torch.autograd.Function):
+    """What a causal convolution sees at each time, side by side: x (B, T, c) -> (B, T, k c), 0 before the beginning.
+
+    The k times lie `dilation` apart and end with the present one. The derivative is torch's own, which would fill and
+    add an array as large as x for each of them: an eighth of a training step on a GPU.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, width: int, dilation: int) -> Tensor:
+        """See above; k is `width`."""
+        ctx.width, ctx.dilation = width, dilation
+        past = nn.functional.pad(x, (0, 0, (width - 1) * dilation, 0))
+        return torch.cat([past[:, k * dilation : k * dilation + x.shape[1]] for k in range(width)], -1)
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        """Each time's slopes, gathered from the times that saw it."""
+        *early, now = slope.chunk(ctx.width, -1)
+        found, length = now.clone(memory_format=torch.contiguous_format), slope.shape[1]
+        for k, part in enumerate(early):
+            away = (ctx.width - 1 - k) * ctx.dilation
+            if away < length:
+                found[:, : length - away] += part[:, away:]
+        return found, None, None
 
 
 class CausalBlock(nn.Module):
@@ -20,18 +46,15 @@ class CausalBlock(nn.Module):
 
     def __init__(self, inside: int, outside: int, dilation: int, width: int) -> None:
         super().__init__()
-        self.reach = (width - 1) * dilation
         self.norms = nn.ModuleList([nn.LayerNorm(inside), nn.LayerNorm(outside)])
         self.convs = nn.ModuleList([nn.Conv1d(c, outside, width, dilation=dilation) for c in (inside, outside)])
         self.short = nn.Conv1d(inside, outside, 1) if inside != outside else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, T, inside) -> (B, T, outside); time t sees times up to t."""
-        y, length = x, x.shape[1]
+        y = x
         for norm, conv in zip(self.norms, map(_conv, self.convs), strict=True):
-            past = nn.functional.pad(norm(y), (0, 0, self.reach, 0))
-            starts = range(0, self.reach + 1, conv.dilation[0])
-            y = torch.cat([past[:, i : i + length] for i in starts], -1)
+            y = cast(Tensor, Reached.apply(norm(y), conv.kernel_size[0], conv.dilation[0]))
             y = nn.functional.gelu(nn.functional.linear(y, conv.weight.mT.flatten(1), conv.bias))
         return y + (x if isinstance(self.short, nn.Identity) else _pointwise(_conv(self.short), x))
 
