@@ -9,7 +9,8 @@
 Windows are simulated once into DIR and used by every method; a cell (robot, ground, method, inputs, seed) that is
 finished is kept in DIR/cells, and one that was interrupted goes on from its last saved state, so that the same
 command may be given again and again until all is there. `--budget` is the training time of a cell by the clock:
-the step size of ours falls to 0 as it is used up, sbi's stop after the epoch in which it is. `--stop SECONDS` begins no new cell after that time.
+the step size of ours falls to 0 as it is used up, sbi's stop after the epoch in which it is. `--stop SECONDS` begins
+no new cell after that time.
 DIR/table.md is written anew after every cell from all that there are; several of these commands may work on one DIR
 at the same time, as `posterior_queue.py` has them do. `--quick` is a toy in a temporary folder, whose figures mean
 nothing.
