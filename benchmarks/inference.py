@@ -2,7 +2,7 @@
 
     python benchmarks/inference.py [--quick] [--tasks linear_gaussian two_moons slcp] [--densities score mixture flow]
                                    [--seeds 0 1 2] [--simulations N] [--observations N] [--samples N] [--json FILE]
-                                   [--no-latency] [--clock wall|cpu] [--device cpu|cuda]
+                                   [--no-latency] [--steps] [--clock wall|cpu] [--device cpu|cuda]
 
 C2ST is the accuracy of a classifier between posterior draws and exact ones, 0.5 being perfect; its baseline column is
 the same classifier between two sets of exact draws. Every seed is a network and simulations of its own,
@@ -13,6 +13,7 @@ import argparse
 import os
 import statistics
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 
@@ -31,7 +32,7 @@ from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
-from nfc_gym.inference.progress import Spoken, quiet
+from nfc_gym.inference.progress import Quiet, Spoken, quiet
 from nfc_gym.inference.random import mixed
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
@@ -41,6 +42,7 @@ GOALS = {"linear_gaussian_5": 0.52, "linear_gaussian_10": 0.52, "two_moons": 0.5
 NETWORK = NetworkConfig(encoder="nn", width=128, features=0, hidden=128, depth=4, draws=2)
 TRAINING = TrainConfig(epochs=100, batch=128, rate=1e-3, patience=25)
 STEPS = 20  # of the score model's sampler
+TIMED = {"cpu": 4, "cuda": 64}  # training steps an epoch, of which the first epoch is not timed
 
 
 def windows_of(task: Task, n: int, seed: int) -> TensorWindows:
@@ -127,6 +129,41 @@ def latency(table: Table, turns: int, clock: str, device: str) -> None:
         table.add(what, 1e3 * seconds, "ms", at_most=goal if "score" in name else None)
 
 
+class Ends(Quiet):
+    """When epochs ended."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+
+    def epoch(self, done: int, of: int, train: float, held_out: float) -> None:
+        """Another one."""
+        self.seconds.append(time.perf_counter())
+
+
+def steps(table: Table, device: str, batches: list[int], epochs: int = 4) -> None:
+    """Training steps on random windows of a Jackal's size, with CUDA graphs and without; median of the epochs."""
+    names = tuple(f"p{i}" for i in range(17))
+    box = PriorBox("steps", names, ("1",) * 17, (0.0,) * 17, (1.0,) * 17)
+    place = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
+    for size in batches:
+        each, chance = TIMED[torch.device(device).type], torch.Generator().manual_seed(0)
+        shapes = {"states": (51, 15), "actions": (50, 2), "psi": (17,)}
+        drawn = {k: torch.rand((each + 1) * size, *s, generator=chance) for k, s in shapes.items()}
+        held_out, windows = (TensorWindows({k: t[part] for k, t in drawn.items()})
+                             for part in (slice(size), slice(size, None)))  # fmt: skip
+        for config in (NetworkConfig(summaries=True), NetworkConfig(density="mixture"), NetworkConfig(density="flow")):
+            found = {}
+            for graph in (False, True) if device != "cpu" else (False,):
+                training, ends = TrainConfig(epochs=epochs, batch=size, mixed=False, graph=graph), Ends()
+                network = Network(config, Sizes.of(windows.tensors), box)
+                train(network, windows, held_out, training, device=device, report=ends)
+                found[graph] = 1e3 / each * statistics.median(np.diff(ends.seconds))
+            what = (
+                f"{config.encoder}{' + summaries' if config.summaries else ''}, {config.density}, batch {size}, {place}"
+            )
+            table.add(f"training step, {what}", found[max(found)], "ms", baseline=found[False])
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -145,9 +182,11 @@ def main() -> None:
     add("--epochs", type=count(1), default=TRAINING.epochs,
         help="passes over the simulations at most (default %(default)s)")  # fmt: skip
     add("--latency", action=argparse.BooleanOptionalAction, default=True, help="time a window of a Jackal's size too")
+    add("--steps", nargs="*", type=count(1), metavar="BATCH",
+        help="time training steps of so many windows too, with CUDA graphs and without; none is 256 1024")  # fmt: skip
     add("--clock", choices=("wall", "cpu"), default="wall",
         help="of the latency; cpu on a busy machine (default %(default)s)")  # fmt: skip
-    parser.add_argument("--device", default="cpu", help="of the latency (default cpu)")
+    parser.add_argument("--device", default="cpu", help="of the latency and of training steps (default cpu)")
     parser.add_argument("--quick", action="store_true", help="one seed, few simulations and observations: a minute")
     parser.add_argument(
         "--json",
@@ -169,6 +208,8 @@ def main() -> None:
                     known(table, task, density, linear, args)
     if args.latency:
         latency(table, 3 if args.quick else 25, args.clock, args.device)
+    if args.steps is not None:
+        steps(table, args.device, args.steps or [256, 1024], 2 if args.quick else 4)
     if args.json:
         write_json(args.json, [asdict(r) for r in table.rows])
 
