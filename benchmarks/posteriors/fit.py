@@ -27,7 +27,7 @@ class Plan(NamedTuple):
 
     Attributes:
       epochs: at most.
-      budget: seconds of training a cell; 0 sets none.
+      budget: seconds of training a cell, which are used up; 0 sets none, and training ends where it no longer helps.
       batch: windows a step.
       rate: step size.
       draws: of noise a window and step, of score models.
@@ -74,7 +74,7 @@ def fit_network(
     first, held_out = windows.split(HELD_OUT)
     training = TrainConfig(
         epochs=plan.epochs, batch=plan.batch, rate=plan.rate, seed=seed, save_every=_SAVE, mixed=config.elevation,
-        budget=plan.budget,
+        budget=plan.budget, patience=plan.epochs if plan.budget else TrainConfig.patience,
     )  # fmt: skip
     with rounded(device):
         outcome = train(network, first, held_out, training, folder=folder, device=device, report=report)
