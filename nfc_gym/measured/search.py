@@ -108,6 +108,8 @@ class Found:
 class Search:
     """One greedy search on fit and selection problems."""
 
+    _thinned = False  # whether laws have left the model that the round at hand starts from
+
     def __init__(
         self,
         fit_data: Data,
@@ -304,7 +306,9 @@ class Search:
         """A model in which another law took the place of an earlier one, if that is clearly better."""
         if sum(bool(r.exchanged) for r in rounds) >= self.options.swaps:
             return None
-        swap = swapped(arena, self.lookout, self.named, self.options.worth, self.say, _met(rounds))
+        # What an accepted law met it met beside what was there: where some of that has left, it is asked anew.
+        met = None if self._thinned else _met(rounds)
+        swap = swapped(arena, self.lookout, self.named, self.options.worth, self.say, met)
         if (found := swap.better) is None:
             laws = {e.id: e for e in arena.current.plant.effects}
             for r in rounds:
@@ -342,6 +346,7 @@ class Search:
             return Arena(data, self.select, current, under, extra, self.rng, self.say)
         arena = self.settle(state.plant, state.x)
         current = self._prune(arena)
+        self._thinned = current is not arena.current
         return arena if current is arena.current else self.settle(current.plant, current.x, polished=True)
 
     def _prune(self, arena: Arena) -> Fit:

@@ -5,7 +5,7 @@ may do better than both. When nothing more is accepted, each earlier law is ther
 then be accepted in its place must not be clearly better. What does as well there is an equivalent of the law, though
 it may have done worse while what came later was missing. The law accepted last met its rivals beside all the others;
 only its own family's other places, of which a round's shortlist has few, are asked again, unless it stands alone. Of
-two laws that were accepted at once neither has met any.
+two laws that were accepted at once neither has met any, and what one met beside laws that have left since says nothing.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -50,7 +50,8 @@ def swapped(
       lookout: which screens.
       pool: candidates.
       worth: share of the misfit that a law must explain to be named.
-      met: ids of what the law accepted last was compared with in its round; None where it was accepted with another.
+      met: ids of what the law accepted last was compared with in its round; None where it was accepted with another, or
+        where laws that were there then have left.
     """
     alike: dict[str, list[str]] = {}
     effects = arena.current.plant.effects
@@ -88,6 +89,10 @@ def _picked(
     found = lookout.screen(screen, others)
     found = lookout.closer(screen, found) if leading else found
     picks = shortlist(found, _RIVALS) if leading else []
+    if leading:  # straight lines may not show the likeness of laws that are kin
+        known, kin = {s.effect.id: s for s in found}, {f"{family}:{effect.place}" for family in effect.kin}
+        kin -= {s.effect.id for s in picks}
+        picks += [known.get(e.id) or screen.try_one(e) for e in others if e.id in kin]
     # Many places of one family may look better than the one where it does what the law does.
-    rest = [s for s in found if not any(s is p for p in picks)]
+    rest = [s for s in found if not any(s.effect is p.effect for p in picks)]
     return [*picks, *mimics(screen.try_one(effect), rest, screen.projected)]

@@ -9,8 +9,8 @@ from hinge import DRY, FRICTION, LAGGING, SCALES, SPRING, VISCOUS, arena, given,
 
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.ranking import Round
-from nfc_gym.measured.search import Options, Search, _met
-from nfc_gym.measured.swap import Swap, swapped
+from nfc_gym.measured.search import Options, Search, State, _met
+from nfc_gym.measured.swap import Swap, _picked, swapped
 from nfc_gym.physics.effects import FAMILIES, build
 from nfc_gym.physics.effects.joint import DampingPoly
 
@@ -106,6 +106,35 @@ def test_a_law_that_stands_alone_met_its_kind_in_its_round() -> None:
     lookout: Any = None
     assert swapped(contest, lookout, pool(), 0.02, lambda text: None) == Swap()
     assert not asked
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_what_a_law_met_beside_laws_that_have_left_is_asked_anew(left: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shifted centre of mass came beside two gains, which it made superfluous; a load was fitted beside these."""
+    asked: list[Any] = []
+    monkeypatch.setattr("nfc_gym.measured.search.swapped", lambda *args: asked.append(args[-1]) or Swap())
+    last: Any = SimpleNamespace(plant="two", x=None)
+    search: Any = object.__new__(Search)
+    search.options, search.lookout, search.named, search.say = Options(), SimpleNamespace(), [], None
+    search.settle = lambda plant, x, polished=False: SimpleNamespace(current=last, plant=plant, x=x)
+    search._prune = lambda arena: SimpleNamespace(plant="one", x=None) if left else last
+    law = SimpleNamespace(effects=[SimpleNamespace(id="a:x")])
+    rounds = (Round(["a:x"], 0.5, [{"id": "b:x"}]),)
+    begun = search._begin(State(None, None, rounds))  # type: ignore[arg-type]
+    assert begun.plant == ("one" if left else None)
+    search._exchange(SimpleNamespace(current=SimpleNamespace(plant=law)), list(rounds))
+    assert asked == [None if left else {"b:x"}]
+
+
+def test_a_load_is_asked_in_a_shifts_place_whatever_screening_says() -> None:
+    shift, load, other = (FAMILIES[f](("torso",)) for f in ("com_shift", "payload", "drag_linear"))
+    found: Any = [SimpleNamespace(effect=other, gain=1.0, columns=np.zeros((4, 0)))]
+    lookout: Any = SimpleNamespace(screen=lambda screen, others: found, closer=lambda screen, found: found)
+    screen: Any = SimpleNamespace(
+        projected=np.zeros(4), try_one=lambda e: SimpleNamespace(effect=e, gain=0.0, columns=np.zeros((4, 0)))
+    )
+    assert [s.effect.id for s in _picked(lookout, screen, shift, [load, other], True)] == [other.id, load.id]
+    assert [s.effect.id for s in _picked(lookout, screen, shift, [load, other], False)] == []
 
 
 def test_fewer_numbers_are_asked_of_what_is_confirmed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
