@@ -98,6 +98,10 @@ class Held:
         """All of them, once, with one draw of noise."""
         return next(self.batches(len(self), None if seed == 0 else seed))
 
+    def first(self, count: int) -> "Held":
+        """The first windows, at most all."""
+        return Held({k: t[:count] for k, t in self.tensors.items()}, self.noise, self.names)
+
     def split(self, share: float) -> tuple["Held", "Held"]:
         """The first windows, and the last `share` of them."""
         cut = len(self) - max(1, round(share * len(self)))

@@ -209,14 +209,15 @@ def test_each_method_has_the_seconds_of_the_budget(
     tensors = {k: torch.as_tensor(chance.uniform(size=s), dtype=torch.float32) for k, s in sizes.items()}
 
     class Slow(Held):
-        """Each step takes a quarter of a second, and a whole one once others work on the machine too."""
+        """Each step takes a quarter of a second, a whole one once others work too; the first ones more."""
 
         def batches(self, size: int, seed: int | None):  # type: ignore[no-untyped-def]
             for batch in super().batches(size, seed):
-                clock[0] += 0.25 if clock[0] < 30 else 1
+                clock[0] += 20 if len(steps) < 3 else 0.25 if len(steps) < 130 else 1
+                steps.append(clock[0])
                 yield batch
 
-    clock = [0.0]
+    clock, steps = [0.0], []
     monkeypatch.setattr(importlib.import_module("nfc_gym.inference.train"), "monotonic", lambda: clock[0])
     monkeypatch.setattr("posteriors.sets.Held", Slow)  # as `split` makes them
     windows = Slow(tensors, torch.zeros(2), ("qpos", "qvel"))
@@ -224,4 +225,5 @@ def test_each_method_has_the_seconds_of_the_budget(
     plan = Plan(epochs=1000, budget=60.0, batch=64, rate=1e-3, draws=1, small=True)
     found = fit(method, "window", windows, prior, plan, 0, tmp_path, torch.device("cpu"), quiet)
     assert found.outcome.stopped == "budget"  # and not "patience"
+    assert len(steps) > 140  # those of a fast start, which what is loaded first takes nothing of
     assert 60 <= found.outcome.seconds <= 62  # the held-out windows of the last epoch come on top
