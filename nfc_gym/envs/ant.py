@@ -4,6 +4,7 @@ import mujoco
 from numpy.typing import NDArray
 
 from nfc_gym.envs.components import joints, observed, torso
+from nfc_gym.envs.mirror import Signed
 from nfc_gym.envs.runner import Runner, Weights
 from nfc_gym.envs.view import View
 
@@ -30,6 +31,10 @@ class Ant(Runner):
     def components(self, model: mujoco.MjModel) -> list[str]:
         """See `Robot`."""
         return [*torso(model), *joints(model, "pos"), *joints(model, "vel"), *observed(24)]
+
+    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+        """See `Robot`."""
+        return [self.torso_reflected, self.feet_reflected(model)], self.motors_reflected(model)
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Torso 12, joint positions 8 (rad), joint velocities 8 (rad/s), force and torque of each foot 24 (N, N m)."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.components import base, observed
+from nfc_gym.envs.mirror import Signed, fixed
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, axes, to_robot, turned
@@ -142,6 +143,10 @@ class Jackal(Robot):
         """See `Robot`."""
         motion = [*base(model, "quat", "wxyz"), *base(model, "linvel@body"), *base(model, "angvel@body")]
         return [*motion, *base(model, "pos"), *observed(2)]
+
+    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+        """See `Robot`."""
+        return [fixed(1, -1)], fixed(1, -1)  # forward speed and yaw rate
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Quaternion, velocity and rates in the rover's own frame, position, last action."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.components import base, joints, observed
+from nfc_gym.envs.mirror import Signed, fixed, opposite
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, at_least, at_most, axes, turned
@@ -135,6 +136,12 @@ class Quadcopter(Robot):
         """See `Robot`."""
         pose = [*observed(3), *base(model, "quat", "wxyz")]
         return [*pose, *base(model, "linvel"), *base(model, "angvel@body"), *joints(model, "pos")]
+
+    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+        """See `Robot`."""
+        rotors = [model.actuator(i).name for i in range(model.nu)]
+        action = Signed(np.array([rotors.index(opposite(name)) for name in rotors]), np.ones(len(rotors)))
+        return [fixed(1, -1, 1)], action  # offset to the goal
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Goal offset (world), then `_motion`."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nfc_gym import assets
 from nfc_gym.envs import scene
 from nfc_gym.envs.components import observed
+from nfc_gym.envs.mirror import Signed
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import Parameter, ParameterSpace, parameters_from_toml
 from nfc_gym.terrain import Heightfield
@@ -157,6 +158,10 @@ class Robot(ABC):
     def components(self, model: mujoco.MjModel) -> list[str]:
         """What each entry of `proprio` is, see `nfc_gym.envs.components`; without more, none is known to be state."""
         return observed(self.proprio_size)
+
+    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+        """In a mirror: the parts of `proprio` that `components` calls observed, in their order; and the action."""
+        raise NotImplementedError
 
     def goal(self, view: View) -> NDArray:
         """(*B, goal_size) the command in the robot's frame, where it is not part of `proprio`."""

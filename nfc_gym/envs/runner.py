@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.envs.mirror import Signed, fixed, jointwise, sensorwise
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, at_most, axes, in_robot, some
 from nfc_gym.envs.spawn import place, spread, underside
@@ -151,6 +152,17 @@ class Runner(Robot):
     def terminated(self, view: View) -> NDArray[np.bool_]:
         """The torso is down."""
         return view.now.height < self.lowest
+
+    torso_reflected: ClassVar[Signed] = fixed(-1, -1, -1, 1, 1)  # of `torso`, from the yaw on
+
+    def feet_reflected(self, model: mujoco.MjModel) -> Signed:
+        """Forces and torques of the feet in a mirror."""
+        return sensorwise(model, [f"{foot}_{what}" for foot in self.feet for what in ("force", "torque")])
+
+    @staticmethod
+    def motors_reflected(model: mujoco.MjModel) -> Signed:
+        """Torques of the motors in a mirror, each named as its joint."""
+        return jointwise(model, [model.actuator(i).name for i in range(model.nu)])
 
     def torso(self, view: View) -> NDArray:
         """The twelve numbers that both robots' proprio begins with, (*B, 12).

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs.contract import robot_class
+from nfc_gym.envs.mirror import Mirror, mirror
 from nfc_gym.envs.registry import ROBOTS, register
 from nfc_gym.envs.robot import DT, Array
 from nfc_gym.envs.runner import Runner
@@ -125,6 +126,12 @@ class Machine:
         if self.kind.name == "jackal":
             return ("forward", "turn")
         return tuple(self.model.actuator(i).name for i in range(self.kind.action_size))
+
+    @cached_property
+    def mirror(self) -> Mirror:
+        """How its windows look in a mirror."""
+        parts, actions = self.settings.robot(self.model).reflected(self.model)
+        return mirror(self.state_names, self.space.names, parts, actions, self.model)
 
     @cached_property
     def noise(self) -> Array:
