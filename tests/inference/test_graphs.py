@@ -22,6 +22,7 @@ from nfc_gym.inference.train import TrainConfig, train
 module = importlib.import_module("nfc_gym.inference.train")  # the package has a function of that name
 QUICK = TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.98)
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+DEVICES = ["cpu", pytest.param("cuda", marks=CUDA)]
 
 
 def by_hand(net: torch.nn.Module, windows: TensorWindows, config: TrainConfig) -> tuple[list[float], torch.nn.Module]:
@@ -250,6 +251,32 @@ def test_replayed_steps_are_those_that_are_told_kernel_by_kernel(config: dict[st
         found.append(run.outcome)
     assert found[0].train == pytest.approx(found[1].train, rel=1e-3)
     assert found[0].held_out == pytest.approx(found[1].held_out, rel=1e-3)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_what_goes_on_in_the_middle_of_an_epoch_ends_as_an_unbroken_run(device: str, tmp_path: Path) -> None:
+    """On a GPU both runs replay: the second captures its own graphs, from where the first one's state was saved."""
+    windows, held_out = linear_windows(2200).split(0.1)
+    config = replace(QUICK, epochs=4, save_every=0.0, mixed=False)
+
+    class Killed(TensorWindows):
+        left = 1 + 31 + 25  # the scales, an epoch, and most of another
+
+        def batches(self, size: int, seed: int | None) -> Iterator[dict[str, torch.Tensor]]:
+            for batch in super().batches(size, seed):
+                Killed.left -= 1
+                if not Killed.left:
+                    raise KeyboardInterrupt
+                yield batch
+
+    whole, again = network(windows), network(windows, seed=5)
+    expected = train(whole, windows, held_out, config, device=device)
+    with pytest.raises(KeyboardInterrupt):
+        train(network(windows), Killed(windows.tensors), held_out, config, folder=tmp_path, device=device)
+    out = train(again, windows, held_out, config, folder=tmp_path, device=device)
+    assert out.train == pytest.approx(expected.train, rel=1e-6)
+    for name, tensor in whole.state_dict().items():
+        torch.testing.assert_close(tensor, again.state_dict()[name], msg=name)
 
 
 @CUDA
