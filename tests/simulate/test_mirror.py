@@ -1,4 +1,4 @@
-"""A window in a mirror is what the simulator makes of psi whose sides are changed: each robot is its own mirror image."""
+"""A window in a mirror is what the simulator makes of psi with its sides changed: robots are their own mirror image."""
 
 import mujoco
 import numpy as np
