@@ -117,7 +117,7 @@ def run(args: argparse.Namespace, place: str, name: str, flags: list[str], gpu: 
     command = [
         sys.executable, str(TABLE), "--robots", robot, "--terrain", terrain, "--windows",
         str(args.windows.get(place, args.residual_windows)), "--device", device, "--stop", f"{left:.0f}", *flags,
-        "--seeds", *map(str, args.seeds), *(["--small"] if args.small else []),
+        "--seeds", *map(str, args.seeds), *(["--small"] if args.small else []), *(["--mirror"] if args.mirror else []),
     ]  # fmt: skip
     command += [part for name in PASSED for part in (f"--{name}", str(getattr(args, name.replace("-", "_"))))]
     env = os.environ | ({} if gpu in (None, "cpu") else {"CUDA_VISIBLE_DEVICES": gpu})
@@ -282,6 +282,7 @@ def _arguments() -> argparse.Namespace:
         help="windows that are replayed, or whose maps are drawn (default %(default)s)")  # fmt: skip
     add("--ceiling-windows", type=count(1), default=8, help="that a ceiling is the mean of (default %(default)s)")
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
+    parser.add_argument("--mirror", action="store_true", help="show half of the windows of each step in a mirror")
     args = parser.parse_args()
     if args.quick:
         args.windows, args.methods, args.inputs, args.gpus = ["JackalFlat=256"], ["mdn-rff"], ["summaries"], ["cpu"]

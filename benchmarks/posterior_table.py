@@ -92,8 +92,8 @@ def main() -> None:
         args.data = args.data or args.out
         device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device
                               if args.device != "auto" else "cpu")  # fmt: skip
-        plan = Plan(args.epochs, args.budget, args.batch, args.rate, args.draws, args.small)
-        kept = Kept(args.out, {"judges": args.judges, "samples": args.samples, **plan._asdict()})
+        plan = Plan(args.epochs, args.budget, args.batch, args.rate, args.draws, args.small, args.mirror)
+        kept = Kept(args.out, {"judges": args.judges, "samples": args.samples, **plan.settings})
         run = Run(args, kept, plan, device, time.monotonic() + args.stop if args.stop else float("inf"))
         print(f"torch {torch.__version__} on {device}, {torch.get_num_threads()} threads, {args.out}", flush=True)
         for robot in args.robots:
@@ -226,6 +226,11 @@ def _arguments() -> argparse.Namespace:
         help="of noise a window and training step, of score models (default %(default)s)",
     )
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
+    parser.add_argument(
+        "--mirror",
+        action="store_true",
+        help="show half of the windows of each step in a mirror; sbi's methods see none",
+    )
     parser.add_argument(
         "--jobs", type=count(0), default=0, help="processes of the simulation; default 0 takes all cores"
     )

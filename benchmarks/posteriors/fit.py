@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -12,11 +12,13 @@ from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Report
+from nfc_gym.inference.reflection import Reflection
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
+from nfc_gym.simulate.machine import Machine
 from posteriors.fitted import Fitted, Ours
 from posteriors.methods import METHODS, network_config
-from posteriors.sets import Held
+from posteriors.sets import Held, environment
 
 HELD_OUT = 0.05  # of the training windows, to compare epochs by
 _SAVE = 30.0  # seconds between saved states
@@ -33,6 +35,7 @@ class Plan(NamedTuple):
       rate: step size.
       draws: of noise a window and step, of score models.
       small: networks of a toy's size.
+      mirror: whether half of the windows of each step are shown in a mirror; no peer's are, and none with maps.
     """
 
     epochs: int
@@ -41,6 +44,12 @@ class Plan(NamedTuple):
     rate: float
     draws: int
     small: bool
+    mirror: bool = False
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a finished cell depends on; a mirror that is not there is not named, as by earlier versions."""
+        return {name: value for name, value in self._asdict().items() if name != "mirror" or value}
 
 
 class Cell(NamedTuple):
@@ -78,11 +87,17 @@ def fit_network(
         epochs=plan.epochs, batch=plan.batch, rate=plan.rate, seed=seed, save_every=_SAVE, mixed=config.elevation,
         budget=plan.budget, patience=plan.epochs if plan.budget else TrainConfig.patience,
     )  # fmt: skip
+    mirror = _mirror(prior) if plan.mirror and not config.elevation else None
     warm(config, windows, prior, plan, device)
     with rounded(device):
-        outcome = train(network, first, held_out, training, folder=folder, device=device, report=report)
+        outcome = train(network, first, held_out, training, folder=folder, device=device, report=report, mirror=mirror)
     checkpoint.save(folder / "posterior.safetensors", network)
     return Cell(Ours(network), outcome, training.epochs)
+
+
+def _mirror(prior: PriorBox) -> Reflection:
+    """Of the robot that psi belongs to; the ground does not matter."""
+    return Reflection(*Machine(environment(prior.robot.capitalize(), "Flat")).mirror)
 
 
 def warm(config: NetworkConfig, windows: Held, prior: PriorBox, plan: Plan, device: torch.device) -> None:

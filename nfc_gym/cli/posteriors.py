@@ -18,8 +18,8 @@ from nfc_gym.core.files import require_writable
 if TYPE_CHECKING:
     from nfc_gym.inference.jobs import Told
     from nfc_gym.inference.posterior import Window
-    from nfc_gym.inference.space import PriorBox
     from nfc_gym.inference.train import Outcome
+    from nfc_gym.simulate.machine import Machine
     from nfc_gym.simulate.policy import Perceptron
 
 
@@ -132,6 +132,10 @@ def train(
         bool,
         typer.Option("--structure", help="In place of a posterior: a head for close-loop, which family it lacks."),
     ] = False,
+    mirror: Annotated[
+        bool,
+        typer.Option(help="Show half of the windows in a mirror, as if they were twice as many; not with --maps."),
+    ] = True,
     noise: Annotated[
         float, typer.Option(metavar="FACTOR", min=0, help="Times the sensor noise that the windows' manifest assumes.")
     ] = 1.0,
@@ -159,27 +163,31 @@ def train(
     Example: nfc-gym train windows/jackal --out jackal.safetensors
     """
     with outcome(ctx, resumes=True):
-        of_posteriors = _asked(ctx, "encoder", "density", "delta_s", "maps")
+        of_posteriors = _asked(ctx, "encoder", "density", "delta_s", "maps", "mirror")
         _require_used(not structure, "for a posterior: give it without --structure", **of_posteriors)
         kinds.require_kind(out, kinds.STRUCTURE if structure else kinds.POSTERIOR)
         require_writable(out.absolute().parent)
         jobs = _learning()
         from nfc_gym.inference.config import NetworkConfig
         from nfc_gym.inference.progress import Spoken
+        from nfc_gym.inference.reflection import Reflection
+        from nfc_gym.inference.space import PriorBox
         from nfc_gym.inference.train import TrainConfig
         from nfc_gym.simulate.teach import TRAINING, train_structure
 
         training = TRAINING if structure else TrainConfig()
         training = replace(training, epochs=epochs or training.epochs, batch=batch, seed=seed)
         how = {"report": Spoken(), "noise": noise}
-        prior = _prior(windows)
+        machine = _machine(windows)
         if structure:
             done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
         else:
             config = NetworkConfig(
                 encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
             )
-            done = jobs.train_posterior(windows, prior, out, config, training, device=device, **how)
+            prior = PriorBox.of(machine.space, machine.kind.name)
+            image = Reflection(*machine.mirror) if mirror else None
+            done = jobs.train_posterior(windows, prior, out, config, training, device=device, mirror=image, **how)
         say_written(out, f"{_learned(done)} ({done.seconds:.0f} s){'' if structure else _told(out)}")
 
 
@@ -194,14 +202,12 @@ def _learning() -> ModuleType:
     return jobs
 
 
-def _prior(windows: Path) -> "PriorBox":
-    """Psi's box of the robot that windows are of."""
-    from nfc_gym.inference.space import PriorBox
+def _machine(windows: Path) -> "Machine":
+    """The robot that windows are of."""
     from nfc_gym.inference.windows import Manifest
     from nfc_gym.simulate.machine import Machine
 
-    machine = Machine(Manifest.read(windows).environment)
-    return PriorBox.of(machine.space, machine.kind.name)
+    return Machine(Manifest.read(windows).environment)
 
 
 def _learned(done: "Outcome") -> str:

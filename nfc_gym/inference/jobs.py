@@ -23,6 +23,7 @@ from nfc_gym.inference.gains import gains
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 from nfc_gym.inference.progress import Report, quiet
+from nfc_gym.inference.reflection import Reflection
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
 from nfc_gym.inference.windows import Windows
@@ -83,7 +84,7 @@ def judges(windows: int) -> int:
 
 def train_posterior(
     folder: Path, prior: PriorBox, out: Path, config: NetworkConfig, training: TrainConfig, *, device: str = "auto",
-    report: Report = quiet, noise: float = 1.0,
+    report: Report = quiet, noise: float = 1.0, mirror: Reflection | None = None,
 ) -> Outcome:  # fmt: skip
     """Train a network on a folder of windows into a checkpoint; a run that was stopped goes on.
 
@@ -100,6 +101,8 @@ def train_posterior(
       device: `auto`, `cpu`, `cuda`.
       report: is told of the progress.
       noise: what multiplies the sensor noise that the windows' manifest assumes, for sensors that are better or worse.
+      mirror: of the windows' robot, which half of the windows of each step are shown in; None shows all as they are. So
+        are windows with maps, and those of a proposal, whose mirror images nobody proposed.
 
     Raises:
       InputError: no such windows, windows of another prior or without maps where the network needs them, a name of
@@ -125,7 +128,12 @@ def train_posterior(
     first, held_out = rest.split(HELD_OUT)
     state = out.with_name(out.name + ".training")
     state.mkdir(parents=True, exist_ok=True)
-    outcome = train(network, first, held_out, training, folder=state, device=device_of(device), report=report)
+    proposed = any(part.settings.get("proposal") is not None for part in stored.manifests)
+    if config.elevation or proposed:
+        mirror = None
+    outcome = train(
+        network, first, held_out, training, folder=state, device=device_of(device), report=report, mirror=mirror
+    )
     notes = {
         "environment": about.environment, "states": list(about.state_names), "windows": len(stored),
         "best": outcome.best, "stopped": outcome.stopped,

@@ -18,6 +18,7 @@ from nfc_gym.inference.graphs import Graphs
 from nfc_gym.inference.learner import Learner
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.random import mixed, seeded
+from nfc_gym.inference.reflection import Reflection
 from nfc_gym.inference.state import load_state, save_state
 
 _SCALE_WINDOWS, _SCALE_MAPS = 16384, 1024  # windows from which scales are taken, without maps (64 kB each) and with
@@ -94,6 +95,7 @@ class Outcome:
 def train(
     network: Learner, windows: WindowSet, held_out: WindowSet, config: TrainConfig | None = None, *,
     folder: Path | None = None, device: str | torch.device = "cpu", report: Report = quiet, scales: bool = True,
+    mirror: Reflection | None = None,
 ) -> Outcome:  # fmt: skip
     """Train a network in place; it ends with the averaged weights of the best epoch.
 
@@ -108,15 +110,17 @@ def train(
       report: is told of the progress.
       scales: whether those of the inputs are taken from `windows` first; a network that was trained before on other
         windows keeps its own, which its weights are made for.
+      mirror: shows half of the windows of each step in a mirror; None shows all as they are.
 
     Raises:
-      InputError: windows that are not the network's, no memory for the batch, or a saved state of something else.
+      InputError: windows that are not the network's, or that have maps where there is a mirror, no memory for the
+        batch, or a saved state of something else.
     """
     config = config or TrainConfig()
     device = torch.device(device)
     if scales:
         _fit_scales(network, windows, config.seed)
-    run = _Run(network, windows, held_out, config, device)
+    run = _Run(network, windows, held_out, config, device, mirror)
     file = None if folder is None else folder / "training.safetensors"
     if file is not None and file.is_file():
         load_state(file, run, run.describe())
@@ -152,11 +156,13 @@ class _Run:
     """
 
     def __init__(
-        self, network: Learner, windows: WindowSet, held_out: WindowSet, config: TrainConfig, device: torch.device
+        self, network: Learner, windows: WindowSet, held_out: WindowSet, config: TrainConfig, device: torch.device,
+        mirror: Reflection | None = None,
     ) -> None:  # fmt: skip
         if not len(windows) or not len(held_out):
             raise InputError(f"training: {len(windows)} windows to train on and {len(held_out)} held out; want both")
         self.given, self.config, self.device = windows, config, device
+        self.mirror = None if mirror is None else mirror.to(device)
         self.windows, self.held_out = (resident(w, device) for w in (windows, held_out))
         self.epoch_steps = math.ceil(len(windows) / config.batch)
         self.total = self.epoch_steps * config.epochs
@@ -185,6 +191,8 @@ class _Run:
             del config["budget"]
         if not told and isinstance(self.given, TensorWindows):
             told = {"contents of the windows": self.given.contents}
+        if self.mirror is not None:
+            config["mirror"] = True
         return {
             "config": config, "network": self.network.config.to_dict(), "prior": self.network.prior.to_dict(),
             "windows": len(self.given), "held_out": len(self.held_out), "of": told,
@@ -242,7 +250,7 @@ class _Run:
 
     def update(self, batch: Batch) -> None:
         """The law of a step; after a loss or a gradient that was not finite it changes nothing."""
-        loss = self.loss(self.network, batch)
+        loss = self.loss(self.network, batch if self.mirror is None else self.mirror(batch))
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
