@@ -27,7 +27,7 @@ from nfc_gym.measured.screen import Screen, Screened
 from nfc_gym.measured.settle import settle, slack
 from nfc_gym.measured.sparser import sparser
 from nfc_gym.measured.suspects import Suspects
-from nfc_gym.measured.swap import swapped
+from nfc_gym.measured.swap import join_kin, swapped
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.law import Law
 from nfc_gym.physics.rollout import Plant
@@ -160,6 +160,7 @@ class Search:
         mended = self._mended(arena, rounds)
         if mended is not arena:
             arena, screen = mended, Screen(self.fit_data.problem, mended.under, mended.current)
+        join_kin(arena, rounds, self.named)
         return self._concluded(arena, screen, screened, outcome, rounds, calibrated)
 
     def _mended(self, arena: Arena, rounds: list[Round]) -> Arena:
@@ -306,8 +307,7 @@ class Search:
         """A model in which another law took the place of an earlier one, if that is clearly better."""
         if sum(bool(r.exchanged) for r in rounds) >= self.options.swaps:
             return None
-        # What an accepted law met it met beside what was there: where some of that has left, it is asked anew.
-        met = None if self._thinned else _met(rounds)
+        met = None if self._thinned else _met(rounds)  # what it met beside laws that have left says nothing
         swap = swapped(arena, self.lookout, self.named, self.options.worth, self.say, met)
         if (found := swap.better) is None:
             laws = {e.id: e for e in arena.current.plant.effects}

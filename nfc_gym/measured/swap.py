@@ -16,6 +16,7 @@ from nfc_gym.measured.choice import NEARLY
 from nfc_gym.measured.contest import shortlist
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.lookout import Lookout
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.screen import Screen, Screened, mimics
 from nfc_gym.physics.effects.base import Effect
 
@@ -80,6 +81,35 @@ def swapped(
             if without.ties(kept, rival, priced=False) or without.ties(kept, without.enter_again(rival), priced=False):
                 alike.setdefault(effect.id, []).append(pick.effect.id)
     return Swap(alike=alike)
+
+
+def join_kin(arena: Arena, rounds: Sequence[Round], pool: Sequence[Effect]) -> None:
+    """Kin of the laws that stand in the end, fitted in their place, join their equivalents where they do as well.
+
+    A load that was fitted while wrong laws stood beside the shift of a centre of mass may have ended in a hollow, and
+    these laws have been dropped since.
+
+    Args:
+      arena: whose model to beat has the laws.
+      rounds: of the search; those that accepted the laws are added to.
+      pool: candidates.
+    """
+    known = {e.id: e for e in pool}
+    for effect in arena.current.plant.effects:
+        told = next((r for r in reversed(rounds) if effect.id in r.accepted), None)
+        kin = [known[i] for family in effect.kin if (i := f"{family}:{effect.place}") in known]
+        rivals = [] if told is None else told.rivals(effect.id)
+        kin = [e for e in kin if e.id not in rivals and e not in arena.current.plant.effects]
+        if told is None or not kin:
+            continue
+        without = arena.without(effect)
+        kept = without.judge(arena.current)
+        screen = Screen(without.fit_data.problem, without.under, without.current)
+        for law in kin:
+            rival = without.enter([screen.try_one(law)])
+            as_well = rival.drop > NEARLY * kept.drop and without.ties(kept, rival, priced=False)
+            if as_well and without.plausible(rival):
+                rivals.append(law.id)
 
 
 def _picked(

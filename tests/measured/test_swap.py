@@ -10,7 +10,7 @@ from hinge import DRY, FRICTION, LAGGING, SCALES, SPRING, VISCOUS, arena, given,
 from nfc_gym.measured.lookout import Lookout
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.search import Options, Search, State, _met
-from nfc_gym.measured.swap import Swap, _picked, swapped
+from nfc_gym.measured.swap import Swap, _picked, join_kin, swapped
 from nfc_gym.physics.effects import FAMILIES, build
 from nfc_gym.physics.effects.joint import DampingPoly
 
@@ -172,3 +172,33 @@ def test_what_the_last_law_met() -> None:
     assert _met([two, one, none]) == {"b:x"}
     assert _met([one, two, none]) is None
     assert _met([none]) == set()
+
+
+@pytest.mark.parametrize(
+    ("drop", "ties", "plausible", "listed"),
+    [(99.0, True, True, True), (90.0, True, True, False), (99.0, False, True, False), (99.0, True, False, False)],
+)
+def test_a_load_that_does_as_well_in_the_end_is_an_equivalent_of_the_shift(
+    drop: float, ties: bool, plausible: bool, listed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shift, load, elsewhere = (
+        FAMILIES[f]((b,)) for f, b in (("com_shift", "torso"), ("payload", "torso"), ("payload", "leg"))
+    )
+    monkeypatch.setattr("nfc_gym.measured.swap.Screen", lambda *_: SimpleNamespace(try_one=lambda e: e))
+    asked: list[str] = []
+    bare = SimpleNamespace(
+        fit_data=SimpleNamespace(problem=None), under=None, current=None,
+        judge=lambda fitted: SimpleNamespace(drop=100.0),
+        enter=lambda picks: asked.append(picks[0].id) or SimpleNamespace(drop=drop),
+        ties=lambda best, other, *, priced: ties and not priced,
+        plausible=lambda rival: plausible,
+    )  # fmt: skip
+    current = SimpleNamespace(plant=SimpleNamespace(effects=[shift]))
+    last: Any = SimpleNamespace(current=current, without=lambda effect: bare)
+    rounds = [Round([shift.id], 0.5), Round([], 0.0)]
+    join_kin(last, rounds, [shift, load, elsewhere])
+    assert asked == [load.id]
+    assert rounds[0].equivalents == [load.id] * listed
+    if listed:
+        join_kin(last, rounds, [shift, load, elsewhere])
+        assert asked == [load.id], "one that is known is not asked again"
