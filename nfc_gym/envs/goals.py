@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,9 +43,10 @@ def _fact(info: Any, key: str) -> Any:
     raise TypeError(f"info is {type(info).__name__}, want the dict of a step or a sequence of such")
 
 
-class GoalRobotEnv(Goals, RobotEnv):
+# Gymnasium's classes are named again: see `RobotVectorEnv`.
+class GoalRobotEnv(Goals, RobotEnv, gymnasium.Env):
     """A `RobotEnv` whose observation holds `observation`, `achieved_goal`, `desired_goal` (and the context)."""
 
 
-class GoalRobotVectorEnv(Goals, RobotVectorEnv):
+class GoalRobotVectorEnv(Goals, RobotVectorEnv, gymnasium.vector.VectorEnv):
     """A `RobotVectorEnv` whose observation holds `observation`, `achieved_goal`, `desired_goal` (and the context)."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.envs.forking import require_graphics
 from nfc_gym.physics.parameters import numbers
 
 Camera = str | Mapping[str, Any]
@@ -105,10 +106,11 @@ class Pictures:
       width, height: of the picture in pixels.
 
     Raises:
-      InputError: a picture larger than the graphics library draws.
+      InputError: a picture larger than the graphics library draws, or the process cannot draw (`require_graphics`).
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        require_graphics()
         self._size = (height, width, 3)
         self._gl = _context(width, height)
         self._gl.make_current()
@@ -136,6 +138,7 @@ class Pictures:
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> NDArray[np.uint8]:
         """(height, width, 3) picture of a simulation of the scene."""
+        require_graphics()
         self._gl.make_current()
         for k in self._shown.changed(model):
             mujoco.mjr_uploadHField(model, self._context, k)

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from mujoco.batch import SimulationError
 from numpy.typing import NDArray
@@ -41,7 +41,8 @@ from nfc_gym.physics.fields import ModelFields
 from nfc_gym.terrain import Heightfield
 
 
-class RobotVectorEnv(ReadableVectorEnv):
+# Named though a base has it: learners (skrl) look for Gymnasium's among the direct bases to tell what they are given.
+class RobotVectorEnv(ReadableVectorEnv, VectorEnv):
     """Robots on flat ground or rough terrain, stepped together.
 
     Args:

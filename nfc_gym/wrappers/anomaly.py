@@ -139,14 +139,15 @@ class MonitorAnomaly(EnvWrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         self.detector.reset()
         self._last = observation
-        return observation, {**info, "anomaly": np.bool_(False), "anomaly_score": np.float64(0.0)}
+        return observation, {**info, "anomaly": np.array(False), "anomaly_score": np.float64(0.0)}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and score the transition."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         score = scored(self.env, self.detector, self._last, action, observation)[()]
         self._last = observation
-        info = {**info, "anomaly": np.bool_(score >= self.threshold), "anomaly_score": score}
+        # An array of shape (): Gymnasium's vectors make a mask of bools of it, and one of objects of a scalar.
+        info = {**info, "anomaly": np.asarray(score >= self.threshold), "anomaly_score": score}
         return observation, reward, terminated, truncated, info
 
 

@@ -102,6 +102,14 @@ def test_gymnasium_robotics_takes_it_for_a_goal_environment(name: str) -> None:
         assert callable(getattr(env, method))
 
 
+@pytest.mark.parametrize("goals", [False, True])
+def test_gymnasium_is_a_direct_base_of_what_is_made(goals: bool) -> None:
+    """By which skrl's `wrap_env` knows what it was given, looking at the outermost and the bare environment."""
+    for made_by in (gym.make, gym.make_vec):
+        bare = made_by(JACKAL, goal_conditioned=goals, context=["psi"]).unwrapped
+        assert any(base.__module__.startswith("gymnasium.") for base in type(bare).__bases__)
+
+
 # ---- Stable-Baselines3 ----------------------------------------------------------------------------------------------
 
 

@@ -41,8 +41,15 @@ def test_transitions_scores_and_threshold() -> None:
     assert [float(i["anomaly_score"]) for i in infos] == [0, 1, 1, 5, 1]
     assert [bool(i["anomaly"]) for i in infos] == [False, False, False, True, False]
     assert detector.seen == [("reset", None), (0, 0, 1), (1, 1, 2), (2, 2, 7), (7, 3, 8)]
-    assert all(isinstance(v, np.generic) for i in infos for v in i.values())
+    assert all(isinstance(v, np.generic | np.ndarray) and v.shape == () for i in infos for v in i.values())
     assert MonitorAnomaly(Leaping(), Jump(), threshold=9.0).threshold == 9.0
+
+
+def test_vectors_of_monitored_environments_have_masks_of_bools() -> None:
+    envs = gym.vector.SyncVectorEnv([lambda: MonitorAnomaly(Leaping(), Jump())] * 2)
+    for info in (envs.reset()[1], envs.step(np.zeros((2, 1)))[4]):
+        assert info["anomaly"].dtype == bool
+        assert info["anomaly_score"].dtype == float
 
 
 def test_nothing_else_changes() -> None:
