@@ -21,6 +21,7 @@ from nfc_gym.measured.screen import Screen, Screened, mimics
 from nfc_gym.physics.effects.base import Effect
 
 _RIVALS = 3  # refitted in place of each law
+_AGAIN = 3  # times that the fit of kin goes on while it comes near the law and does not do as well
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,10 @@ def join_kin(arena: Arena, rounds: Sequence[Round], pool: Sequence[Effect]) -> N
         screen = Screen(without.fit_data.problem, without.under, without.current)
         for law in kin:
             rival = without.enter([screen.try_one(law)])
+            for _ in range(_AGAIN):  # beside a large misfit one fit ends on the way along a narrow valley
+                if rival.drop <= NEARLY * kept.drop or without.ties(kept, rival, priced=False):
+                    break
+                rival = without.enter_again(rival)
             as_well = rival.drop > NEARLY * kept.drop and without.ties(kept, rival, priced=False)
             if as_well and without.plausible(rival):
                 rivals.append(law.id)

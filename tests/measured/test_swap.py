@@ -176,10 +176,16 @@ def test_what_the_last_law_met() -> None:
 
 @pytest.mark.parametrize(
     ("drop", "ties", "plausible", "listed"),
-    [(99.0, True, True, True), (90.0, True, True, False), (99.0, False, True, False), (99.0, True, False, False)],
+    [
+        (99.0, 0, True, True),
+        (99.0, 2, True, True),
+        (90.0, 0, True, False),
+        (99.0, 9, True, False),
+        (99.0, 0, False, False),
+    ],
 )
 def test_a_load_that_does_as_well_in_the_end_is_an_equivalent_of_the_shift(
-    drop: float, ties: bool, plausible: bool, listed: bool, monkeypatch: pytest.MonkeyPatch
+    drop: float, ties: int, plausible: bool, listed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shift, load, elsewhere = (
         FAMILIES[f]((b,)) for f, b in (("com_shift", "torso"), ("payload", "torso"), ("payload", "leg"))
@@ -189,8 +195,9 @@ def test_a_load_that_does_as_well_in_the_end_is_an_equivalent_of_the_shift(
     bare = SimpleNamespace(
         fit_data=SimpleNamespace(problem=None), under=None, current=None,
         judge=lambda fitted: SimpleNamespace(drop=100.0),
-        enter=lambda picks: asked.append(picks[0].id) or SimpleNamespace(drop=drop),
-        ties=lambda best, other, *, priced: ties and not priced,
+        enter=lambda picks: asked.append(picks[0].id) or SimpleNamespace(drop=drop, fits=0),
+        ties=lambda best, other, *, priced: other.fits >= ties and not priced,
+        enter_again=lambda rival: SimpleNamespace(drop=drop, fits=rival.fits + 1),
         plausible=lambda rival: plausible,
     )  # fmt: skip
     current = SimpleNamespace(plant=SimpleNamespace(effects=[shift]))
