@@ -177,7 +177,7 @@ class _Alike:
     def enter(self, picks: list) -> Any:
         plant = SimpleNamespace(effects=(picks[0].effect,))
         return SimpleNamespace(
-            fitted=SimpleNamespace(plant=plant, x=np.zeros(1)), total=1.0, gain=1.0, fit_gains=np.ones(1)
+            fitted=SimpleNamespace(plant=plant, x=np.zeros(1)), total=1.0, drop=2.0, gain=1.0, fit_gains=np.ones(1)
         )
 
     def new(self, j: Any) -> list:
