@@ -77,6 +77,20 @@ def test_gymnasiums_vector_wrappers_and_vectorisations() -> None:
     parallel.close()
 
 
+def test_flat_observations_have_one_order_in_every_form() -> None:
+    """Also through normalisation, as single-file code stacks it, one environment and the batch."""
+    one = gym.wrappers.FlattenObservation(made(BASE, context=["psi"]))
+    envs = gym.make_vec(BASE, num_envs=2, context=["psi"], nthread=1, terrain_pool=2)
+    many = gym.wrappers.vector.FlattenObservation(envs)
+    parts = one.env.reset(seed=3)[0]
+    flat = np.concatenate([parts[key] for key in sorted(parts)])
+    same(one.reset(seed=3)[0], flat)
+    same(many.reset(seed=3)[0][0], flat)
+    normal = gym.wrappers.vector.NormalizeObservation(many)
+    normal.reset(seed=3)
+    assert normal.step(np.zeros((2, 2), np.float32))[0] in normal.observation_space
+
+
 def test_videos_are_recorded(tmp_path: Path) -> None:
     pytest.importorskip("moviepy", reason="Gymnasium's RecordVideo needs moviepy: pip install 'nfc_gym[test]'")
     env: Any = made("nfc_gym/AntRough-v0", render_mode="rgb_array", width=64, height=64, max_episode_steps=3)
