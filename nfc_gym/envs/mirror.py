@@ -8,6 +8,7 @@ the two sides are called alike, and from the model: joints' axes and the frames 
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
@@ -26,7 +27,8 @@ _SIGNS = {
 }
 
 
-class Signed(NamedTuple):
+@dataclass(frozen=True)
+class Signed:
     """Entries that change places and signs.
 
     Attributes:
