@@ -48,5 +48,5 @@ class GoalRobotEnv(Goals, RobotEnv, gymnasium.Env):
     """A `RobotEnv` whose observation holds `observation`, `achieved_goal`, `desired_goal` (and the context)."""
 
 
-class GoalRobotVectorEnv(Goals, RobotVectorEnv, gymnasium.vector.VectorEnv):
+class GoalRobotVectorEnv(Goals, RobotVectorEnv, gymnasium.vector.VectorEnv):  # type: ignore[override]
     """A `RobotVectorEnv` whose observation holds `observation`, `achieved_goal`, `desired_goal` (and the context)."""

@@ -42,7 +42,7 @@ from nfc_gym.terrain import Heightfield
 
 
 # Named though a base has it: learners (skrl) look for Gymnasium's among the direct bases to tell what they are given.
-class RobotVectorEnv(ReadableVectorEnv, VectorEnv):
+class RobotVectorEnv(ReadableVectorEnv, VectorEnv):  # type: ignore[override]
     """Robots on flat ground or rough terrain, stepped together.
 
     Args:
