@@ -84,6 +84,7 @@ class ModelFields:
         self._arrays: dict[str, NDArray] = {}
         self._scalars: set[str] = set()  # options of one model that are plain numbers: written back at `commit`
         self._dirty = False
+        self._scratch: mujoco.MjData | None = None
 
     @property
     def count(self) -> int | None:
@@ -140,7 +141,10 @@ class ModelFields:
         if isinstance(self._target, Batch):
             self._target.set_const()
         else:
-            mujoco.mj_setConst(self._target, mujoco.MjData(self._target))
+            if self._scratch is None:  # made once: that takes longer than all else here
+                self._scratch = mujoco.MjData(self._target)
+            mujoco.mj_resetData(self._target, self._scratch)
+            mujoco.mj_setConst(self._target, self._scratch)
         self._dirty = False
 
     def rows(self, ids: NDArray[np.intp]) -> "RowFields":
