@@ -6,7 +6,6 @@ may learn from the other. How entries go over into one another follows from thei
 the two sides are called alike, and from the model: joints' axes and the frames of sensors.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -89,7 +88,7 @@ def mirror(
 
 def opposite(name: str) -> str:
     """What the part of that name is called on the other side; one in the middle is its own opposite."""
-    return "_".join(_SIDES.get(word, word) for word in re.split("_", name))
+    return "_".join(_SIDES.get(word, word) for word in name.split("_"))
 
 
 def fixed(*signs: int) -> Signed:
