@@ -2,10 +2,10 @@
 
     python .ci/pieces.py [NAME ...]
 
-A name is a folder of tests/, `tests` for what lies in none, a benchmark's, or `check`. Each piece of Python runs in a
-fork of this process, which has the large libraries loaded: to load torch and torchrl takes longer than most of the
-pieces do. A piece's output is shown when it is over, with its seconds and those of the processor, which other work on
-the machine changes less. Exits with 1 where one fails, after all have run.
+A name is a folder of tests (`tests/core`), `tests` for what lies in none, a benchmark (`benchmarks/anomaly`), `check`.
+Each piece of Python runs in a fork of this process, which has the large libraries loaded: to load torch and torchrl
+takes longer than most of the pieces do. A piece's output is shown when it is over, with its seconds and those of the
+processor, which other work on the machine changes less. Exits with 1 where one fails, after all have run.
 """
 
 import atexit
@@ -32,7 +32,10 @@ HEAVY = (
 ROOT = Path(__file__).parents[1]
 AT_ONCE = 2
 # Those that take longest, in order: begun last, they would be waited for.
-LONGEST = ("measured", "adaptation", "conformance", "check", "simulate", "inference", "benchmarks", "wrappers")
+LONGEST = (
+    "tests/measured", "tests/adaptation", "tests/benchmarks", "tests/simulate", "tests/conformance", "check",
+    "tests/inference", "tests/wrappers", "tests/physics",
+)  # fmt: skip
 
 Piece = Callable[[], int | str | None]  # what `sys.exit` takes
 
@@ -66,11 +69,12 @@ def check() -> int:
 
 def pieces() -> dict[str, Piece]:
     """All by name, in the order in which they begin; a folder or benchmark that is new is found."""
-    folders = sorted(p.parent for p in ROOT.glob("tests/*/test_*.py"))
+    folders = sorted({p.parent for p in ROOT.glob("tests/*/test_*.py")})
+    scripts = sorted(ROOT.glob("benchmarks/*.py"))
     found: dict[str, Piece] = {"check": check}
-    found |= {folder.name: partial(tests, f"tests/{folder.name}") for folder in dict.fromkeys(folders)}
-    found["tests"] = partial(tests, *(str(p.relative_to(ROOT)) for p in sorted(ROOT.glob("tests/test_*.py"))))
-    found |= {path.stem: partial(benchmark, path) for path in sorted(ROOT.glob("benchmarks/*.py"))}
+    found |= {f"tests/{folder.name}": partial(tests, f"tests/{folder.name}") for folder in folders}
+    found["tests"] = partial(tests, *(f"tests/{path.name}" for path in sorted(ROOT.glob("tests/test_*.py"))))
+    found |= {f"benchmarks/{path.stem}": partial(benchmark, path) for path in scripts}
     return {name: found[name] for name in dict.fromkeys([*LONGEST, *found])}
 
 

@@ -1,5 +1,7 @@
 """A problem in closed form, as windows: x = A z + noise, one state a window and no action."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -60,6 +62,22 @@ def motion_windows(n: int, seed: int = 0, **more: Tensor) -> TensorWindows:
         "states": torch.stack(states, 1), "actions": actions, "psi": u, "delta_s": delta,
         "family": family.to(torch.int16), **more,
     })  # fmt: skip
+
+
+def killed(windows: TensorWindows, at: int) -> TensorWindows:
+    """The same windows; reading their `at`-th batch, counted from 1 over all epochs, stops everything."""
+    left = at
+
+    class Killed(type(windows)):  # type: ignore[misc]
+        def batches(self, size: int, seed: int | None) -> Iterator[dict[str, Tensor]]:
+            nonlocal left
+            for batch in super().batches(size, seed):
+                left -= 1
+                if not left:
+                    raise KeyboardInterrupt
+                yield batch
+
+    return Killed(windows.tensors)
 
 
 def network(windows: TensorWindows, prior: PriorBox | None = None, seed: int = 0, **config: object) -> Network:

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from problems import linear_windows, motion_windows, network
+from problems import killed, linear_windows, motion_windows, network
 
 from nfc_gym.core import InputError
 from nfc_gym.inference.data import StoredWindows, TensorWindows, resident
@@ -22,7 +22,6 @@ from nfc_gym.inference.train import TrainConfig, train
 module = importlib.import_module("nfc_gym.inference.train")  # the package has a function of that name
 QUICK = TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, average=0.98)
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
-DEVICES = ["cpu", pytest.param("cuda", marks=CUDA)]
 
 
 def by_hand(net: torch.nn.Module, windows: TensorWindows, config: TrainConfig) -> tuple[list[float], torch.nn.Module]:
@@ -162,19 +161,8 @@ def test_a_budget_counts_the_time_before_an_interruption(monkeypatch: pytest.Mon
     windows, held_out = linear_windows(1000).split(0.1)
     clock = Clock(monkeypatch)
     config = replace(QUICK, epochs=100, budget=60, save_every=0.0)
-
-    class Killed(type(clock.timed(windows))):  # type: ignore[misc]
-        left = 41
-
-        def batches(self, size: int, seed: int | None) -> Iterator[dict[str, torch.Tensor]]:
-            for batch in super().batches(size, seed):
-                Killed.left -= 1
-                if not Killed.left:
-                    raise KeyboardInterrupt
-                yield batch
-
     with pytest.raises(KeyboardInterrupt):  # reading the scales took one of the forty that were read
-        train(network(windows), Killed(windows.tensors), held_out, config, folder=tmp_path)
+        train(network(windows), killed(clock.timed(windows), 41), held_out, config, folder=tmp_path)
     clock.now += 10_000  # until somebody looked
     out = train(network(windows), clock.timed(windows), held_out, config, folder=tmp_path)
     assert out.stopped == "budget"
@@ -253,26 +241,19 @@ def test_replayed_steps_are_those_that_are_told_kernel_by_kernel(config: dict[st
     assert found[0].held_out == pytest.approx(found[1].held_out, rel=1e-3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_what_goes_on_in_the_middle_of_an_epoch_ends_as_an_unbroken_run(device: str, tmp_path: Path) -> None:
-    """On a GPU both runs replay: the second captures its own graphs, from where the first one's state was saved."""
+@CUDA
+def test_what_goes_on_in_the_middle_of_an_epoch_ends_as_an_unbroken_run(tmp_path: Path) -> None:
+    """Both runs replay: the second captures its own graphs, from where the first one's state was saved.
+
+    On a processor, see `test_a_killed_run_ends_as_an_unbroken_one`.
+    """
     windows, held_out = linear_windows(2200).split(0.1)
-    config = replace(QUICK, epochs=4, save_every=0.0, mixed=False)
-
-    class Killed(TensorWindows):
-        left = 1 + 31 + 25  # the scales, an epoch, and most of another
-
-        def batches(self, size: int, seed: int | None) -> Iterator[dict[str, torch.Tensor]]:
-            for batch in super().batches(size, seed):
-                Killed.left -= 1
-                if not Killed.left:
-                    raise KeyboardInterrupt
-                yield batch
-
+    config, device = replace(QUICK, epochs=4, save_every=0.0, mixed=False), "cuda"
     whole, again = network(windows), network(windows, seed=5)
     expected = train(whole, windows, held_out, config, device=device)
+    at = 1 + 31 + 25  # the scales, an epoch, and most of another
     with pytest.raises(KeyboardInterrupt):
-        train(network(windows), Killed(windows.tensors), held_out, config, folder=tmp_path, device=device)
+        train(network(windows), killed(windows, at), held_out, config, folder=tmp_path, device=device)
     out = train(again, windows, held_out, config, folder=tmp_path, device=device)
     assert out.train == pytest.approx(expected.train, rel=1e-6)
     for name, tensor in whole.state_dict().items():

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from problems import box, gaussian, linear_windows, motion_windows, network
+from problems import box, gaussian, killed, linear_windows, motion_windows, network
 from safetensors.torch import save_file
 
 from nfc_gym.core import InputError
@@ -52,25 +52,13 @@ def test_on_the_linear_base_it_is_the_closed_form() -> None:
 
 
 def test_a_killed_run_ends_as_an_unbroken_one(tmp_path: Path) -> None:
-    class Killed(TensorWindows):
-        """Stops everything in the middle of an epoch."""
-
-        left = 27
-
-        def batches(self, size: int, seed: int | None) -> Iterator[dict[str, torch.Tensor]]:
-            for batch in super().batches(size, seed):
-                Killed.left -= 1
-                if Killed.left == 0:
-                    raise KeyboardInterrupt
-                yield batch
-
     windows, held_out = linear_windows(1000).split(0.1)
     config = replace(QUICK, save_every=0.0)  # a state after every step
     whole = network(windows, dropout=0.1)
     expected = train(whole, windows, held_out, config)
     broken = network(windows, dropout=0.1)
     with pytest.raises(KeyboardInterrupt):
-        train(broken, Killed(windows.tensors), held_out, config, folder=tmp_path)
+        train(broken, killed(windows, 27), held_out, config, folder=tmp_path)
     again = network(windows, dropout=0.1, seed=5)  # a new process: weights of its own
     out = train(again, windows, held_out, config, folder=tmp_path)
     assert (out.train, out.held_out, out.best) == (expected.train, expected.held_out, expected.best)
