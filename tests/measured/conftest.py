@@ -3,9 +3,13 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from arm import Closed
 
 sys.path.insert(0, str(Path(__file__).parent))  # `writers`, `rotor`, ...: importlib mode does not add the folder
 
@@ -80,6 +84,14 @@ def columns(seed: int = 0, seconds: float = 4.0, rate: float = 100.0) -> dict[st
 def machine() -> str:
     """The model."""
     return MODEL
+
+
+@pytest.fixture(scope="session")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> "Closed":
+    """A finished run on the machine of `arm`; read, never written to."""
+    from arm import close
+
+    return close(tmp_path_factory.mktemp("arm"))
 
 
 Spoil = Callable[[dict[str, np.ndarray]], None]

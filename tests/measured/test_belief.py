@@ -1,11 +1,12 @@
 """A run that starts from a posterior: the same answer as without, what it inferred beside it, wrong files refused."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_loop import DAMPING, machine
+from arm import DAMPING, GIVEN, Closed, claims, machine
 
 from nfc_gym.core import InputError
 from nfc_gym.core.fidelity import Fidelity
@@ -23,15 +24,10 @@ def draws(path: Path, middle: float, spread: float, extra: int = 0) -> Path:
     return path
 
 
-def claims(report: dict) -> tuple:
-    return report["verdict"], [e["id"] for e in report["effects"]], [p["id"] for p in report["proposals"]]
-
-
-def test_a_posterior_changes_the_start_and_not_the_answer(tmp_path: Path) -> None:
-    mapping = machine(tmp_path)
-    alone = close_loop(mapping, tmp_path / "alone", seed=3, jobs=1)
+def test_a_posterior_changes_the_start_and_not_the_answer(closed: Closed, tmp_path: Path) -> None:
+    alone = closed.report
     file = draws(tmp_path / "psi.npz", DAMPING, 0.01)
-    report = close_loop(mapping, tmp_path / "out", seed=3, jobs=1, posterior=file, compare=True)
+    report = close_loop(closed.mapping, tmp_path / "out", seed=3, jobs=1, posterior=file, compare=True)
     assert claims(report) == claims(alone)
     one, other = (r["parameters"][0]["estimate"] for r in (report, alone))
     assert one == pytest.approx(other, rel=1e-2)
@@ -49,22 +45,29 @@ def test_a_posterior_changes_the_start_and_not_the_answer(tmp_path: Path) -> Non
     assert json.loads((tmp_path / "out" / "report.json").read_text())["posterior"] == said
     page = (tmp_path / "out" / "report.html").read_text()
     assert "What the posterior had inferred" in page
-    assert "What the posterior had inferred" not in (tmp_path / "alone" / "report.html").read_text()
+    assert "What the posterior had inferred" not in (closed.out / "report.html").read_text()
 
 
-def test_other_draws_make_another_run(tmp_path: Path) -> None:
+def test_other_draws_make_another_run(closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What lies in the folder of a run that was interrupted belongs to its posterior."""
-    mapping = machine(tmp_path)
-    file = draws(tmp_path / "psi.npz", DAMPING, 0.01)
-    close_loop(mapping, tmp_path / "out", seed=3, jobs=1, posterior=file)
-    with pytest.raises(InputError, match="holds the report of a finished run"):
-        close_loop(mapping, tmp_path / "out", seed=3, jobs=1)
+    one, other = draws(tmp_path / "one.npz", DAMPING, 0.01), draws(tmp_path / "other.npz", DAMPING, 0.02)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nfc_gym.measured.loop.calibrate", interrupted)
+    run = partial(close_loop, closed.mapping, tmp_path / "out", seed=3, jobs=1)
+    for _ in range(2):  # the second goes on
+        with pytest.raises(KeyboardInterrupt):
+            run(posterior=one)
+    for posterior in (other, None):
+        with pytest.raises(InputError, match="holds an unfinished run on other inputs"):
+            run(posterior=posterior)
 
 
 def hinge() -> ParameterSpace:
     """The test machine's one parameter."""
     import mujoco
-    from test_loop import GIVEN
 
     parameter = Parameter("damping", "dof_damping", ("hinge",), "N m s/rad", 0.0, 0.4)
     return ParameterSpace(mujoco.MjModel.from_xml_string(GIVEN), [parameter])
