@@ -261,7 +261,7 @@ def _arguments() -> argparse.Namespace:
     args = parser.parse_args()
     if args.quick:
         args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 10, 10, 2
-        args.training, args.epochs, args.effects, args.draws, args.levels = 64, 1, 1, 4, 50
+        args.training, args.epochs, args.effects, args.draws, args.levels = 64, 1, 1, 2, 50
         args.lessons = 50
     return args
 

@@ -207,7 +207,7 @@ def main() -> None:
                 for linear in {"linear": (True,), "prior": (False,), "both": (True, False)}[args.base]:
                     known(table, task, density, linear, args)
     if args.latency:
-        latency(table, 3 if args.quick else 25, args.clock, args.device)
+        latency(table, 1 if args.quick else 25, args.clock, args.device)
     if args.steps is not None:
         steps(table, args.device, args.steps or [256, 1024], 2 if args.quick else 4)
     if args.json:

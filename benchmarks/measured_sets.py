@@ -11,16 +11,23 @@ the way through works.
 """
 
 import argparse
+import io
 import json
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import redirect_stdout
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 
+import numpy as np
 from options import count, ended, json_file, write_json
 
+from nfc_gym.cli import app
 from nfc_gym.measured.dataset import load
 
 HERE = Path(__file__).resolve().parent
@@ -46,53 +53,56 @@ QUICK = ("coulomb", "lag")  # families that a quick run looks among
 STAGES = ("nominal", "calibrated", "extended")
 
 
-def command(*words: object) -> list[str]:
-    """`nfc-gym ...` with this interpreter."""
-    return [sys.executable, "-c", "from nfc_gym.cli import main; main()", *map(str, words)]
+def nfc_gym(*words: object, here: bool = False) -> None:
+    """`nfc-gym ...` with this interpreter; `here` in this process, which has loaded the libraries already."""
+    line = [str(word) for word in words]
+    if not here:
+        subprocess.run([sys.executable, "-c", "from nfc_gym.cli import main; main()", *line], check=True)
+    elif code := app(line, standalone_mode=False):
+        sys.exit(code)
 
 
-def prepare(data: Path, work: Path) -> None:
-    """Write the prepared logs of all sets, and each set's mapping and model beside them; loops that were run stay."""
-    subprocess.run(
-        [sys.executable, data / "score" / "recordings.py", "prepare", work / "prepared"],
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
-    for name in SETS:
+def recordings(data: Path) -> ModuleType:
+    """The scorer: its `SETS` read the recordings, its `main` prepares them, its `score` judges."""
+    spec = spec_from_file_location("recordings", data / "score" / "recordings.py")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def prepare(scorer: ModuleType, sets: Sequence[str], work: Path) -> None:
+    """Write the prepared logs of sets, and each set's mapping and model beside them; loops that were run stay."""
+    scorer.SETS = {name: scorer.SETS[name] for name in sets}
+    with redirect_stdout(io.StringIO()):
+        scorer.main(["prepare", str(work / "prepared")])
+    for name in sets:
         folder = work / name
         shutil.rmtree(folder / "logs", ignore_errors=True)
         shutil.copytree(HERE / "measured" / name, folder, dirs_exist_ok=True)
         shutil.move(work / "prepared" / name, folder / "logs")
 
 
-def run_set(name: str, args: argparse.Namespace) -> dict[str, list[float]]:
+def run_set(scorer: ModuleType, name: str, args: argparse.Namespace) -> dict[str, list[float]]:
     """Close the loop on a set and score each stage's predictions: stage -> the figures that the goals are about."""
-    data, work = args.data, args.work
+    work = args.work
     mapping, out = work / name / "mapping.yaml", work / name / "loop"
-    close = command("close-loop", mapping, "--out", out, "--jobs", args.jobs, "--seed", args.seed)
+    close = ("close-loop", mapping, "--out", out, "--jobs", args.jobs, "--seed", args.seed)
     if (out / "report.json").exists():
         shutil.rmtree(out)
     folds = [f.name for f in load(mapping).folds]
     if args.at_once > 1 and len(folds) > 1:  # the whole run finds them done
         folds = [name for name in folds if not (out / name / "report.json").exists()]
         with ThreadPoolExecutor(args.at_once) as pool:
-            list(pool.map(lambda fold: subprocess.run([*close, "--fold", fold], check=True), folds))
-    subprocess.run(close, check=True)
+            list(pool.map(lambda fold: nfc_gym(*close, "--fold", fold), folds))
+    nfc_gym(*close, here=args.quick)
     figures = {}
     for stage in STAGES:
         file = work / name / f"{stage}.npz"
-        subprocess.run(
-            command("predict", mapping, "--fit", out, "--mode", SETS[name][0], "--stage", stage, "--out", file),
-            check=True,
-        )
-        text = subprocess.run(
-            [sys.executable, data / "score" / "recordings.py", "score", name, file],
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout
-        values = [float(line.rpartition(":")[2]) for line in text.strip().splitlines()]
-        figures[stage] = values[-len(SETS[name][3]) :]
+        told = ("--fit", out, "--mode", SETS[name][0], "--stage", stage, "--out", file)
+        nfc_gym("predict", mapping, *told, here=args.quick)
+        with np.load(file) as predicted:
+            values = list(scorer.score(name, dict(predicted)).values())
+        figures[stage] = [round(float(v), 4) for v in values[-len(SETS[name][3]) :]]
     return figures
 
 
@@ -125,15 +135,16 @@ def main() -> None:
         print(f"measured_sets: skipped, the recordings are not at {args.data} (say --data FOLDER)")
         return
     args.work.mkdir(parents=True, exist_ok=True)
-    prepare(args.data, args.work)
-    rows = []
+    scorer, rows = recordings(args.data), []
     if args.quick:
         args.sets, args.jobs = ["emps"], 1
+    prepare(scorer, args.sets, args.work)
+    if args.quick:
         with open(args.work / "emps" / "mapping.yaml", "a", encoding="utf-8") as mapping:
             mapping.write(f"effects: {{only: [{', '.join(QUICK)}]}}\n")
     for name in args.sets:
         began = time.monotonic()
-        figures = run_set(name, args)
+        figures = run_set(scorer, name, args)
         seconds = time.monotonic() - began
         if args.figures:
             from measured.figure import draw  # matplotlib, of which nothing else here knows

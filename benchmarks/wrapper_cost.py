@@ -155,7 +155,7 @@ def main() -> None:
     rows = "rows {name, value, unit, baseline, goal, holds, seeds}"
     parser.add_argument("--json", type=json_file, metavar="FILE", help=rows)
     args = parser.parse_args()
-    count, turns = (200, 7) if args.quick else (500, 15)
+    count, turns = (50, 2) if args.quick else (500, 15)
     names = ["Ant-v5", "nfc_gym/JackalFlat-v0"] + ([] if args.quick else ["nfc_gym/AntFlat-v0"])
     table = Table()
     with tempfile.TemporaryDirectory() as folder:
