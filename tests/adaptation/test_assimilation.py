@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from rounds import fewer
 
 from nfc_gym import InputError
 from nfc_gym.adaptation.assimilated import Box
@@ -61,7 +62,8 @@ def driven_in(env: Any, psi: dict[str, float], steps: int, seed: int = 1) -> Tra
     return Trajectory(*parts)
 
 
-def test_a_heavy_rover_with_a_lost_axle_is_found_out() -> None:
+def test_a_heavy_rover_with_a_lost_axle_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    fewer(monkeypatch, 0.4, 0.4, 0.2, 0.05)
     truth = {"base_mass": 28.0, "front_left_wheel_damping": 0.0}
     q = Assimilation("nfc_gym/JackalFlat-v0", effects=False)
     belief = q.infer(driven(truth, 160))
@@ -117,8 +119,9 @@ def test_of_a_robot_that_fell_at_once_the_prior_is_believed() -> None:
     assert belief.noise is None
 
 
-def test_what_is_too_short_to_be_replayed_changes_no_belief() -> None:
+def test_what_is_too_short_to_be_replayed_changes_no_belief(monkeypatch: pytest.MonkeyPatch) -> None:
+    fewer(monkeypatch, 0.4)
     infers = Assimilation("JackalFlat", delta_s=False, effects=False)
-    whole, fell = driven({"base_mass": 25.0}), driven({}, 6)
+    whole, fell = driven({"base_mass": 25.0}, 40), driven({}, 6)
     want = infers.infer(whole)
     np.testing.assert_array_equal(infers.updated(fell, want).infer(whole).mean, want.mean)

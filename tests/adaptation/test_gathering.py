@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from nfc_gym import InputError
 from nfc_gym.adaptation import AdaptConfig, adapt, load_policy, ppo_agent, pretrain
@@ -23,6 +22,7 @@ from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portabl
 from nfc_gym.adaptation.record import Episodes
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.worlds import training_env, vector_env
+from nfc_gym.cli import app
 from nfc_gym.core import MissingExtra, NfcError
 from nfc_gym.core.fidelity import Fidelity
 
@@ -263,10 +263,10 @@ def test_episodes_that_begin_anew_are_not_counted_on() -> None:
 
 
 def test_the_command_speaks_of_it() -> None:
-    call = [sys.executable, "-c", "from nfc_gym.cli import main; main()", "pretrain", "JackalFlat", "--steps", "10"]
-    done = subprocess.run([*call, "--out", "p.safetensors", "--workers", "2"], capture_output=True, text=True)
-    assert done.returncode == 2
-    assert "give --ray too" in done.stderr
+    call = ["pretrain", "JackalFlat", "--steps", "10", "--out", "p.safetensors", "--workers", "2"]
+    done = CliRunner().invoke(app, call)
+    assert done.exit_code == 2
+    assert "give --ray too" in done.output
 
 
 def test_the_template_is_small() -> None:

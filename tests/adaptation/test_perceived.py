@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from rounds import fewer
 
 from nfc_gym import InputError
 from nfc_gym.adaptation.assimilation import Assimilation
@@ -79,9 +80,9 @@ def test_noise_of_the_maps_is_averaged_and_told(driven: tuple[Trajectory, Height
 def test_the_belief_is_as_with_the_true_ground(
     driven: tuple[Trajectory, Heightfield], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nfc_gym.adaptation.assimilation.SEGMENTS", 7)
-    monkeypatch.setattr("nfc_gym.adaptation.assimilation._NEAR", (0.4, 0.4))
-    trajectory, true = driven
+    """Heights that are 5 mm off, or a map that is four cells off, would be seen."""
+    fewer(monkeypatch, 0.4, 0.4, draws=40)
+    trajectory, true = driven[0].until_alarm(), driven[1]
     perceived, given = (
         Assimilation(ROUGH, ground=g, delta_s=False, effects=False).infer(trajectory) for g in (None, true)
     )

@@ -1,6 +1,8 @@
 """Other packages' checks, wrappers and algorithms on the environments, bare and wrapped."""
 
+import multiprocessing
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -196,9 +198,8 @@ def test_torchrls_specs_of_wrapped_vectors(mode: str, torchrl: Any) -> None:
 
 
 def test_torchrls_workers_and_collector(torch: Any, torchrl: Any) -> None:
-    """Workers are spawned, import the package by the id's prefix, and step as an environment in this process does."""
-    from functools import partial
-
+    """Workers know nothing, import the package by the id's prefix, and step as an environment in this process does."""
+    multiprocessing.set_forkserver_preload(["torchrl.envs"])  # once for both, and none of this package
     make = partial(torchrl.envs.GymEnv, f"nfc_gym:{JACKAL}", context=["psi"])
 
     def rolled(env: Any) -> tuple[Any, Any]:
@@ -212,7 +213,7 @@ def test_torchrls_workers_and_collector(torch: Any, torchrl: Any) -> None:
         return torch.stack(seen), torch.stack(rewards)
 
     one, reward = rolled(make())
-    workers = torchrl.envs.ParallelEnv(2, make, mp_start_method="spawn")
+    workers = torchrl.envs.ParallelEnv(2, make, mp_start_method="forkserver")
     try:
         many, theirs = rolled(workers)
         for row in range(2):

@@ -20,7 +20,7 @@ SIZES = {
     "Quadcopter": (21, 0, 9, 4),
     "Jackal": (15, 2, 17, 2),
 }
-RESETS = 250
+RESETS = 100
 
 
 def test_ten_ids() -> None:

@@ -31,7 +31,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-N, END, RESETS = 2, 6, 250
+N, END, RESETS = 2, 6, 100
 # Around every other: a stack of all nine, in an order that is allowed.
 STACK = [
     "ResidualTerrain",

@@ -111,9 +111,9 @@ def test_a_coarse_step_sees_past_jumps() -> None:
 def test_a_polish_is_never_worse_and_mends_a_poor_start(seed: int) -> None:
     problem, under, flat = rugged()
     poor = fit(problem, under, flat, np.array([-1.5, 1.5]), 0)
-    better = polish(problem, under, poor, 120, seed)
-    assert loss(better.white).sum() <= loss(poor.white).sum()
-    np.testing.assert_allclose(better.x, [0.6, -0.4], atol=0.05)
+    better = polish(problem, under, flat, poor.x, 120, seed)
+    assert loss(under.whiten(problem.residual(flat, better[None]))).sum() <= loss(poor.white).sum()
+    np.testing.assert_allclose(better, [0.6, -0.4], atol=0.05)
 
 
 def test_places_with_values_of_their_own_are_probed_at_one_shape() -> None:
