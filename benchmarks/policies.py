@@ -14,8 +14,8 @@ none. What is hidden is drawn from `--seed`, itself drawn once and kept.
 Pretrained policies are those that `pretrain.py --out DIR` made, else the package's; posteriors (also .npz) and
 detectors are `<place>.safetensors` in their folders; so are TD-MPC2's world models, which `tdmpc2_pretrain.py` makes.
 The control rate is that of one robot's decisions on this machine.
---quick pretrains a toy Jackal first, tries most methods in Table II alone, TD-MPC2 in neither, and ends within two
-minutes; its figures mean nothing.
+--quick adapts the package's policy of the Jackal for a moment, tries most methods in Table II alone, TD-MPC2 in
+neither, and ends within two minutes; its figures mean nothing.
 """
 
 import argparse
@@ -114,18 +114,15 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def toy(args: argparse.Namespace, out: Path) -> None:
-    """Settings of a minute, and a policy that was hardly trained."""
-    from nfc_gym.adaptation.pretraining import pretrain
-
+    """Settings of a minute, and a posterior that knows no more than the prior."""
     args.places, args.grounds, args.seeds = ["JackalFlat"], ["Flat"], [0]
     args.methods = [m for m in args.methods if m in ("random", "unadapted", "nfc", "oracle", "falco")]
     args.episodes, args.envs, args.steps, args.budget, args.executed, args.scenarios = 2, 16, 2_000, 1.0, 1, ["axle"]
     args.threads = 1
-    args.policies = args.posteriors = out / "toys"
-    args.policies.mkdir(exist_ok=True)
-    pretrain("JackalFlat", args.policies / "JackalFlat.safetensors", steps=2_000, envs=16, threads=1)
+    args.posteriors = out / "toys"
+    args.posteriors.mkdir(exist_ok=True)
     space = nominal_space(ROBOTS["jackal"])
-    psi = np.random.default_rng(0).uniform(space.low, space.high, (64, len(space)))  # it knows no more than the prior
+    psi = np.random.default_rng(0).uniform(space.low, space.high, (64, len(space)))
     np.savez(args.posteriors / "JackalFlat.npz", psi=psi)
 
 
@@ -167,7 +164,7 @@ def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tab
     cells = tables.Cells()
     points, judged = (2, 2) if args.quick else (10, 32)
     budget = Budget(args.envs, args.steps, args.budget, args.executed, judged, points, args.threads, args.device,
-                    args.ratio)  # fmt: skip
+                    args.ratio, 40 if args.quick else Budget.home)  # fmt: skip
     for table, world, task, seed in asked(args):
         left_out = REFERENCES if args.beside else (*ADAPTED, "oracle") if args.quick and table == "III" else ()
         for method in [m for m in args.methods if m not in left_out]:

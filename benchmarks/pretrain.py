@@ -16,6 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,7 @@ from nfc_gym.adaptation import load_policy
 from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.network import NETS
 from nfc_gym.adaptation.worlds import vector_env
+from nfc_gym.cli import app
 
 ROBOTS = ("Humanoid", "Quadruped", "Quadcopter", "Ant", "Jackal")
 IDS = [f"{robot}{ground}" for robot in ROBOTS for ground in ("Rough", "Flat")]
@@ -42,21 +45,27 @@ def threads(ids: list[str], cores: int) -> dict[str, int]:
     return {name: max(1, min(cores, round(4 / 3 * cores * c / whole))) for name, c in cost.items()}
 
 
-def start(name: str, share: int, place: int, args: argparse.Namespace) -> subprocess.Popen:
-    """One process; where there are several GPUs they are taken in turns."""
+def start(name: str, share: int, place: int, args: argparse.Namespace) -> Callable[[], int]:
+    """One process, and how to wait for its exit code; where there are several GPUs they are taken in turns."""
     gpus = len([g for g in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if g]) or visible_gpus()
     env = {**os.environ, "OMP_NUM_THREADS": str(share), "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
     if gpus > 1:
         env["CUDA_VISIBLE_DEVICES"] = str(place % gpus)
-    command = [
-        sys.executable, "-c", MAIN, "pretrain", name, "--out", str(args.out / f"{name}-v0.safetensors"),
+    words = [
+        "pretrain", name, "--out", str(args.out / f"{name}-v0.safetensors"),
         "--steps", str(args.steps), "--seconds", str(args.seconds), "--threads", str(share), "--envs", str(args.envs),
         "--net", args.net, "--seed", str(args.seed),
     ]  # fmt: skip
     if args.start is not None and (first := first_weights(name, args.start)) is not None:
-        command += ["--start", str(first)]
+        words += ["--start", str(first)]
     with open(args.out / f"{name}.txt", "a", encoding="utf-8") as log:
-        return subprocess.Popen(command, env=env, stdout=log, stderr=subprocess.STDOUT)
+        if args.quick:  # one alone, which need not load the libraries again
+            with redirect_stdout(log), redirect_stderr(log):
+                code = app(words, standalone_mode=False) or 0
+            return lambda: code
+        return subprocess.Popen(
+            [sys.executable, "-c", MAIN, *words], env=env, stdout=log, stderr=subprocess.STDOUT
+        ).wait
 
 
 def first_weights(name: str, folder: Path) -> Path | None:
@@ -129,7 +138,7 @@ def trained(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     shares, began = threads(args.only, args.cores), time.monotonic()
     running = {name: start(name, shares[name], k, args) for k, name in enumerate(args.only)}
-    codes = {name: process.wait() for name, process in running.items()}
+    codes = {name: wait() for name, wait in running.items()}
     print(f"{time.monotonic() - began:.0f} s, cores: {args.cores}, GPUs: {visible_gpus()}")
     rows = []
     for name in args.only:

@@ -102,7 +102,8 @@ def cell(kept: Kept, method: str, place: str, seed: int, args: argparse.Namespac
     name = f"{method}_{place}_{seed}"
 
     def made() -> dict[str, Any]:
-        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        # What a fork knows already, a toy need not load again.
+        with ProcessPoolExecutor(1, get_context("fork" if args.quick else "spawn")) as pool:
             if method == "pretrain":
                 return pool.submit(ours, place, seed, args.steps, args.envs).result()
             return pool.submit(theirs, place, seed, args.steps, args.script).result()

@@ -37,6 +37,7 @@ class Budget:
       threads: of the physics.
       device: of the networks.
       ratio: updates of TD-MPC2 a control step in the true world; the published one is 1.
+      home: episodes at home, by which it is known what the policy earned before.
     """
 
     envs: int = 1024
@@ -48,6 +49,7 @@ class Budget:
     threads: int = 0
     device: str = "cpu"
     ratio: float = 1.0
+    home: int = 64
 
 
 @dataclass

@@ -177,7 +177,9 @@ def nfc(**config: Any) -> Make:
         posterior = inference(job)
         policy, budget = opened(job.nominal, job.budget.device), job.budget
         detector = job.detector or watcher(policy, job.world, job.seed, nthread=job.budget.threads, **job.settings)
-        home = earned_at_home(policy, job.world, job.seed, EPISODE, nthread=job.budget.threads, **job.settings)
+        home = earned_at_home(
+            policy, job.world, job.seed, budget.home, EPISODE, nthread=job.budget.threads, **job.settings
+        )
         context = ["psi", "elevation"] if job.world.ground == "Rough" else ["psi"]
         given = AdaptConfig(missions=budget.executed, worlds=budget.envs, steps=budget.steps // budget.executed,
                             episode=EPISODE, judged=min(budget.judged, AdaptConfig.judged), seed=job.seed,

@@ -150,7 +150,9 @@ def watcher(policy: Policy, world: World, seed: int, **settings: Any) -> Lasting
     return lasting
 
 
-def earned_at_home(policy: Policy, world: World, seed: int, episode: int, **settings: Any) -> list[float]:
+def earned_at_home(
+    policy: Policy, world: World, seed: int, episodes: int, episode: int, **settings: Any
+) -> list[float]:
     """Returns at home, where nothing is hidden but the sensors' noise, of episodes of so many control steps at most."""
     at_home = World(world.place, "nominal", world.seed, engine=world.engine)
-    return play(policy, at_home, ROBOTS // 2, seed, max_episode_steps=episode, **settings).returns
+    return play(policy, at_home, episodes, seed, max_episode_steps=episode, **settings).returns

@@ -32,10 +32,21 @@ def job(tmp_path: Path, **change: Any) -> Any:
     from worlds.methods import Job
     from worlds.world import World
 
-    budget = Budget(envs=4, steps=800, seconds=5.0, executed=1, judged=2, points=1, threads=1)
+    budget = Budget(envs=4, steps=800, seconds=60.0, executed=1, judged=2, points=1, threads=1, home=40)
     given = {"world": World("JackalFlat", "axle", 0), "seed": 0, "nominal": untrained(tmp_path), "posterior": None,
              "detector": None, "budget": budget, "task": None, "folder": tmp_path / "states"}  # fmt: skip
     return Job(**{**given, **change})
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Control steps of an episode: fewer than elsewhere."""
+    from worlds import learning
+    from worlds.world import World
+
+    monkeypatch.setitem(World.make.__kwdefaults__, "max_episode_steps", 200)
+    monkeypatch.setattr(learning, "EPISODE", 200)
+    return 200
 
 
 def test_a_curve_has_levelled_where_its_last_quarter_hardly_rises() -> None:
@@ -56,15 +67,15 @@ def test_what_is_missing_is_said_and_not_counted(tmp_path: Path) -> None:
     assert "Jackal" in run("falco", job(tmp_path, world=World("AntFlat", "psi", 0)), 2)["missing"]
 
 
-def test_without_nfc_no_more_is_learned_from_than_was_executed(tmp_path: Path) -> None:
+def test_without_nfc_no_more_is_learned_from_than_was_executed(tmp_path: Path, short: int) -> None:
     from worlds.methods import METHODS
 
     found = METHODS["no_nfc"].make(job(tmp_path))
-    assert found.notes["steps"] == 1000  # one episode's
-    assert [s for s, _ in found.curve] == [0, 1000]
+    assert found.notes["steps"] == short  # one episode's
+    assert [s for s, _ in found.curve] == [0, short]
 
 
-def test_an_oracle_learns_in_the_true_world_and_the_nominal_policy_is_left_alone(tmp_path: Path) -> None:
+def test_an_oracle_learns_in_the_true_world_and_the_nominal_policy_is_left_alone(tmp_path: Path, short: int) -> None:
     from worlds.methods import METHODS, run
 
     plain = job(tmp_path)
@@ -129,7 +140,7 @@ def test_robots_that_crash_at_once_leave_a_watcher_enough_others(
     assert seeds == [7, 7 + watching.ROBOTS]
 
 
-def test_algorithm_one_runs_in_a_hidden_world(tmp_path: Path) -> None:
+def test_algorithm_one_runs_in_a_hidden_world(tmp_path: Path, short: int) -> None:
     from worlds.machines import ROBOTS, nominal_space
     from worlds.methods import run
 
