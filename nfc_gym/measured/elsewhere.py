@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.box import Box, box
-from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.fit import Fit, fit, fitted
 from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.race import lost
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -22,7 +23,6 @@ _AWAY = 0.3  # standard deviation of the starts about a fit, in scaled parameter
 _ROUNDS = 10  # iterations of each fit
 _SAME = 3.0  # standard errors, root mean square over the parameters, within which two fits ended in one hollow
 _THIN, _ENOUGH = 3, 12  # hollows race on every third block, where so many are left
-_BEHIND = 3.0  # standard errors that a hollow is behind there to be lost, and one number so many deviations off
 _DEEPER = 10.0  # loss by which a fit from another size must be better
 _SETTLED = 2  # fits in a row that end where others have: more of them would too
 
@@ -74,7 +74,7 @@ def hollows(
     ends, apart, quiet = [found.x], [found.x], 0
     for number, start in enumerate([*others, *limits.x(z, found.x)], 1):
         tick(number)
-        ends.append(fit(problem, under, plant, start, _ROUNDS).x)
+        ends.append(fitted(problem, under, plant, start, _ROUNDS))
         new = all(_errors_between(found, limits, ends[-1], x) > _SAME for x in apart)
         quiet = 0 if new else quiet + 1
         if new:
@@ -123,17 +123,15 @@ def _errors_between(found: Fit, limits: Box, a: Array, b: Array) -> float:
 
 
 def _race(problem: Problem, extra: Array, plant: Plant, ends: list[Array]) -> list[Array]:
-    """Ends (size,) that may be the likeliest, as far as some of the blocks tell (Maron and Moore, 1994).
+    """Ends (size,) that may be the likeliest, as far as some of the blocks tell (`race`).
 
     What a model expects takes some fifty roll-outs of every block; who is far behind on a few need not be asked of all.
     """
     if len(ends) == 1 or len(problem) < _THIN * _ENOUGH:
         return ends
-    part = problem.take(np.arange(0, len(problem), _THIN))
+    part = problem.part(np.arange(0, len(problem), _THIN))
     told = np.stack([surprises(part, part.covariance(plant, x), extra, plant, x) for x in ends])
-    behind = told - told[told.sum(1).argmin()]
-    sure = behind.sum(1) > np.maximum(_BEHIND * np.sqrt(len(part)) * behind.std(1), _BEHIND**2)
-    return [x for x, lost in zip(ends, sure, strict=True) if not lost]
+    return [x for x, out in zip(ends, lost(told), strict=True) if not out]
 
 
 def surprises(problem: Problem, sigma: Array, extra: Array, plant: Plant, x: Array) -> Array:

@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 COARSE, FINE, TINY = 1e-1, 2e-4, 1e-5
 _UNSEEN = 1e-8  # of the largest column's norm: what the differences' own rounding makes of one that is zero
 _SPREAD = 0.3  # of a polish's first draws, in scaled parameters
+_RENEWED = 2  # iterations of a rough fit that take slopes anew once; in between these turn with the step (Broyden)
 _PARTS, _RIDGE = np.array([1.0, 0.5, 0.2, 0.05]), 0.01  # of a step that are tried; of a Hessian's diagonal
 
 
@@ -91,9 +92,27 @@ def fit(
       The fit; never worse than the start under the loss.
     """
     ask = _Asked(problem, metric, plant, start, known, tick)
-    limits = ask.limits
+    x = _descended(ask, rounds)
+    found = ask.slopes(x, COARSE) if problem.rough and len(ask.limits.scale) else ask.jacobian
+    x = _quieted(ask, x, found)
+    return Fit(plant, x, ask.white(x), found)
+
+
+def fitted(problem: Problem, metric: Metric, plant: Plant, start: Array, rounds: int = 15) -> Array:
+    """The same where the parameters (size,) alone are wanted: slopes at the end are spared."""
+    ask = _Asked(problem, metric, plant, start, None, lambda: None)
+    x = _descended(ask, rounds)
+    found = ask.jacobian
+    if problem.rough and not found.any((0, 1)).all():  # what tiny steps do not show larger ones may
+        found = ask.slopes(x, COARSE)
+    return _quieted(ask, x, found)
+
+
+def _descended(ask: "_Asked", rounds: int) -> Array:
+    """(size,) where least squares end after so many iterations at most."""
+    limits, problem = ask.limits, ask.problem
     room = 1e-6 * (limits.roof - limits.floor)
-    x = start.copy()
+    x = ask.start.copy()
     stages = ((COARSE, rounds // 2), (TINY, rounds - rounds // 2)) if problem.rough else ((FINE, rounds),)
     for size, share in stages if len(limits.scale) else ():
         solved = least_squares(
@@ -102,16 +121,19 @@ def fit(
             (limits.floor, limits.roof), loss="soft_l1", f_scale=TURN, x_scale="jac",
             max_nfev=max(share, 1), ftol=1e-5, xtol=1e-5, gtol=1e-8,
         )  # fmt: skip
-        x = limits.x(solved.x, start)
-    found = ask.slopes(x, COARSE) if problem.rough and len(limits.scale) else ask.jacobian
-    base, unseen = ask.white(x), ~found.any((0, 1))
-    if unseen.any():
-        # What the data say nothing of stays at null, unless that would change the motion after all.
-        quiet = limits.x(np.where(unseen, limits.centre, limits.at(x)), start)
-        moved = ask.white(quiet)
-        if loss(moved).sum() <= loss(base).sum() * (1 + 1e-9):
-            x, base = quiet, moved
-    return Fit(plant, x, base, found)
+        x = limits.x(solved.x, ask.start)
+    return x
+
+
+def _quieted(ask: "_Asked", x: Array, found: Array) -> Array:
+    """(size,) the same, but what slopes (S, m, f) say nothing of stays at null, unless that would change the motion."""
+    unseen = ~found.any((0, 1))
+    if not unseen.any():
+        return x
+    limits = ask.limits
+    quiet = limits.x(np.where(unseen, limits.centre, limits.at(x)), ask.start)
+    stays = loss(ask.white(quiet)).sum() <= loss(ask.white(x)).sum() * (1 + 1e-9)
+    return quiet if stays else x
 
 
 def fit_last(problem: Problem, metric: Metric, plant: Plant, start: Array, count: int, rounds: int = 4) -> Array:
@@ -158,6 +180,8 @@ class _Asked:
         self.fresh = np.arange(0 if known is None else known.shape[-1], len(self.limits.scale))
         self.jacobian = np.zeros((*problem.mask.shape, 0))
         self._last: tuple[Array, Array] | None = None
+        self._sloped: tuple[Array, Array, float] | None = None  # where the slopes are from, and by which difference
+        self._age = 0  # iterations since they were taken anew
 
     def white(self, x: Array) -> Array:
         """(S, m) whitened residual; the optimiser asks for slopes where it has just asked for the residual."""
@@ -171,10 +195,28 @@ class _Asked:
         return np.concatenate([white.ravel(), (z - self.limits.centre) * self.limits.pull])
 
     def derivative(self, z: Array, size: float) -> Array:
-        """(S m + f, f) its slopes, by differences of that size."""
+        """(S m + f, f) its slopes, by differences of that size.
+
+        Where bodies touch those of a model with effects are renewed at every other iteration. One in between takes from
+        the step that led to it what slopes along it are (Broyden 1965), at no cost: beside the jumps there, that is as
+        good as a difference. Psi alone has few of them, and what it is still short of would be an effect's to claim.
+        """
         self.tick()
-        self.jacobian = self.slopes(self.limits.x(z, self.start), size)
+        x = self.limits.x(z, self.start)
+        turned = self._turned(z, x, size) if self.problem.rough and self.plant.effects else None
+        self._age = 1 if turned is None else self._age + 1
+        self.jacobian = self.slopes(x, size) if turned is None else turned
+        self._sloped = z.copy(), self.white(x), size
         return np.concatenate([self.jacobian.reshape(-1, len(z)), np.diag(self.limits.pull)])
+
+    def _turned(self, z: Array, x: Array, size: float) -> Array | None:
+        """(S, m, f) the slopes at hand, turned to explain the step to z; None where they are to be taken anew."""
+        if self._sloped is None or self._sloped[2] != size or self._age >= _RENEWED or not len(self.fresh):
+            return None
+        step = z - self._sloped[0]
+        missed = self.white(x) - self._sloped[1] - self.jacobian @ step
+        length = float(step @ step)
+        return self.jacobian + missed[..., None] * step / length if length > 0 else None
 
     def slopes(self, x: Array, size: float) -> Array:
         """(S, m, f) of the whitened residual; those that are known are not taken anew."""
@@ -190,8 +232,8 @@ def stand(problem: Problem, metric: Metric, plant: Plant, x: Array) -> Fit:
     return Fit(plant, x, base, jacobian(problem, metric, limits, x, base, np.arange(len(limits.scale)), step))
 
 
-def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed: int) -> Fit:
-    """Go on without derivatives (CMA-ES, Hansen 2001) from a fit in which roughness may have stopped them.
+def polish(problem: Problem, metric: Metric, plant: Plant, x: Array, evaluations: int, seed: int) -> Array:
+    """Go on without derivatives (CMA-ES, Hansen 2001) from a fit (size,) in which roughness may have stopped them.
 
     Args:
       evaluations: parameter vectors to try.
@@ -200,13 +242,13 @@ def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed:
     Returns:
       The better of both.
     """
-    limits = box(found.plant)
+    limits = box(plant)
     if not len(limits.scale):
-        return found
-    z = np.clip(limits.at(found.x), limits.floor, limits.roof)
+        return x
+    z = np.clip(limits.at(x), limits.floor, limits.roof)
     if len(z) == 1:  # CMA-ES wants two dimensions: a scan does for one
         draws = np.linspace(limits.floor, limits.roof, evaluations)
-        values = objective(problem, metric, limits, draws, found.x)
+        values = objective(problem, metric, limits, draws, x)
         best, value = draws[values.argmin()], float(values.min())
     else:
         import cma  # where it is used: it imports matplotlib, a second that few commands need
@@ -216,11 +258,11 @@ def polish(problem: Problem, metric: Metric, found: Fit, evaluations: int, seed:
         search = cma.CMAEvolutionStrategy(z, _SPREAD, options)
         while not search.stop():
             draws = np.array(search.ask())
-            search.tell(list(draws), objective(problem, metric, limits, draws, found.x).tolist())
+            search.tell(list(draws), objective(problem, metric, limits, draws, x).tolist())
         best, value = np.asarray(search.result.xbest), float(search.result.fbest)
-    if value >= objective(problem, metric, limits, z[None], found.x)[0]:
-        return found
-    return fit(problem, metric, found.plant, limits.x(best, found.x), 4)
+    if value >= objective(problem, metric, limits, z[None], x)[0]:
+        return x
+    return fitted(problem, metric, plant, limits.x(best, x), 4)
 
 
 def objective(problem: Problem, metric: Metric, limits: Box, z: Array, around: Array) -> Array:

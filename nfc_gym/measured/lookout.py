@@ -117,7 +117,7 @@ class Lookout:
         if self.problem.costly:
             index = np.union1d(index, np.argsort(current.losses)[-_WORST:])
         part = Fit(current.plant, current.x, current.white[index], current.jacobian[index])
-        return Screen(self.problem.take(index), screen.metric.take(index), part)
+        return Screen(self.problem.part(index), screen.metric.take(index), part)
 
     def _promising(self, screen: Screen, pool: list[Effect], field: int) -> list[Effect]:
         """Of a large pool, those that do best on some of the blocks, and the best of each family that does anything."""

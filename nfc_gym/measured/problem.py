@@ -64,6 +64,10 @@ class Problem(ABC):
     def take(self, index: NDArray[np.intp]) -> "Problem":
         """The problem of some of the blocks."""
 
+    def part(self, index: NDArray[np.intp]) -> "Problem":
+        """The same, for who asks both it and the whole: what one of them knows the other need not work out."""
+        return self.take(index)
+
     @abstractmethod
     def synthetic(self, plant: Plant, x: Array, rng: np.random.Generator) -> "Problem":
         """The same experiment as if the model at x (size,) were the machine: fresh noise, no unknown effect."""

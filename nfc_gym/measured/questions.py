@@ -16,7 +16,7 @@ from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.distances import Ask, Model
 from nfc_gym.measured.export import unpack
 from nfc_gym.measured.fisher import Lens, flat, realistic, without
-from nfc_gym.measured.fit import Fit, fit
+from nfc_gym.measured.fit import Fit, fitted
 from nfc_gym.measured.metric import loss, metric
 from nfc_gym.measured.screen import sized
 from nfc_gym.measured.search import Options
@@ -75,8 +75,8 @@ def calibrated(bench: Bench, logs: Sequence[Log], seed: int) -> tuple[Plant, Arr
     """Psi fitted to some of the logs' segments, without any effect."""
     problem = bench.rollouts(logs, [bench.states[log.name] for log in logs], most=_LOOK)
     plant = bench.plant
-    fitted, _, _ = settle(problem, problem.covariance(plant, plant.null), plant, plant.null, seed, rounds=8)
-    return plant, fitted.x
+    found, _, _ = settle(problem, problem.covariance(plant, plant.null), plant, plant.null, seed, rounds=8)
+    return plant, found.x
 
 
 def reported(bench: Bench, logs: Sequence[Log], folder: Path) -> tuple[dict[str, Any], Plant, Array]:
@@ -151,8 +151,8 @@ def challenge(present: Present, effect: Effect, rival: Effect) -> Ask:
     tried = [np.clip(sized(rival, t, s), rival.low, rival.high) for t in sizes for s in _SIZES]
     starts = np.array([np.concatenate([psi, *(t for _, t in others), theta]) for theta in tried])
     white = lens.under.whiten(lens.problem.residual(plant, starts))
-    fitted = fit(lens.problem, lens.under, plant, starts[int(loss(white).sum(-1).argmin())], _ROUNDS)
-    return Ask(Model(lens.plant, lens.x), Model(plant, fitted.x), TOLD)
+    x = fitted(lens.problem, lens.under, plant, starts[int(loss(white).sum(-1).argmin())], _ROUNDS)
+    return Ask(Model(lens.plant, lens.x), Model(plant, x), TOLD)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ realistic sizes.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -16,6 +17,7 @@ from nfc_gym.measured.box import box
 from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import Metric, loss, loss_weight
 from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.race import Race
 from nfc_gym.physics.effects.base import Effect, overrides
 
 Array = NDArray[np.float64]
@@ -111,6 +113,10 @@ class Screen:
         self.basis = np.linalg.svd(tangent, full_matrices=False)[0] if tangent.size else np.zeros((len(self.target), 0))
         self.projected = self.project(self.target)
 
+    @cached_property
+    def _race(self) -> Race:
+        return Race(self.problem, self.metric)
+
     def project(self, a: Array) -> Array:
         """Remove from (n,) or (n, k) what the fitted parameters can produce."""
         return a - self.basis @ (self.basis.T @ a)
@@ -146,13 +152,13 @@ class Screen:
         here = before.at(self.current.x)
         moved = np.concatenate([before.x(here + found.shift, self.current.x), found.theta])
         rungs = [np.concatenate([self.current.x, t]) for t in (found.theta, *ladder(found.effect, found.theta))]
-        values = loss(self.metric.whiten(self.problem.residual(plant, np.stack(rungs)))).sum(-1)
+        values = self._race.losses(plant, np.stack(rungs))
         starts = [rungs[int(values.argmin())], moved]
         z = np.stack([after.at(x) for x in starts])
         around = z[rng.integers(2, size=draws)] + _SCOUT * rng.normal(size=(draws, z.shape[1]))
         z = np.clip(np.concatenate([z, around]), after.floor, after.roof)
         x = after.x(z, starts[0])
-        values = loss(self.metric.whiten(self.problem.residual(plant, x))).sum(-1)
+        values = self._race.losses(plant, x)
         best = int(values.argmin())
         gain = float(self.current.losses.sum() - values[best])
         theta = x[best, self.current.plant.size :]

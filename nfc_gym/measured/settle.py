@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.fit import Fit, fit, polish
+from nfc_gym.measured.fit import Fit, fit, fitted, polish
 from nfc_gym.measured.metric import Metric, metric, unexplained_variance
 from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.rollout import Plant
@@ -48,10 +48,10 @@ def settle(
         tick(turn)
         under = metric(problem, sigma, extra)
         # Later turns start where the first one ended.
-        found = fit(problem, under, plant, x, rounds if turn == 1 else rounds // 2)
+        x = fitted(problem, under, plant, x, rounds if turn == 1 else rounds // 2)
         if problem.rough and seed is not None and turn == 1:
-            found = polish(problem, under, found, _EVALUATIONS, seed)
-        x, before, extra = found.x, extra, slack(problem, sigma, plant, found.x)
+            x = polish(problem, under, plant, x, _EVALUATIONS, seed)
+        before, extra = extra, slack(problem, sigma, plant, x)
         if np.allclose(np.sqrt(extra + noise), np.sqrt(before + noise), rtol=_STEADY):
             break
     under = metric(problem, sigma, extra)

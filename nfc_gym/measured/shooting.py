@@ -15,7 +15,7 @@ from nfc_gym.measured.cuts import Cut, Layout, cut
 from nfc_gym.measured.draws import across
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.measured.problem import Columns, Problem
-from nfc_gym.measured.recent import Recent
+from nfc_gym.measured.recent import Blocks
 from nfc_gym.measured.segments import lay, pick, refine, repeat
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.physics.effects.base import overrides
@@ -99,7 +99,7 @@ class RolloutProblem(Problem):
         self._place(where, None)
 
     def _place(self, where: Cut, measured: list[Array] | None) -> None:
-        kit, self._recent = self._kit, Recent(_RECENT)
+        kit, self._recent, self._of = self._kit, Blocks(_RECENT, len(where.log)), np.arange(len(where.log))
         self._whole: RolloutProblem | None = None  # the same at twice the step, of a problem that was halved
         self._where, self.log_of = where, where.log
         self.time_of = np.array([kit.logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)])
@@ -217,10 +217,13 @@ class RolloutProblem(Problem):
 
     def residual(self, plant: Plant, x: Array) -> Array:
         """See `Problem`; read-only."""
-        question = plant.model, plant.space, plant.effects, x.shape, x.tobytes()
-        return self._recent(
-            question, lambda: self._compare(plant, x, self.segments, self._measured, self._where.step, self.mask)
-        )
+
+        def rolled(rows: NDArray[np.intp], blocks: NDArray[np.intp]) -> Array:
+            of = self if len(blocks) == len(self) else self.take(blocks)
+            return of._compare(plant, x[rows], of.segments, of._measured, of._where.step, of.mask)
+
+        questions = [(plant.model, plant.space, plant.effects, row.tobytes()) for row in x]
+        return self._recent(questions, self._of, rolled)
 
     def touches(self, plant: Plant, x: Array) -> bool:
         """Whether bodies touch in any roll-out at x (size,)."""
@@ -351,15 +354,24 @@ class RolloutProblem(Problem):
         """
         out = object.__new__(RolloutProblem)
         out.__dict__.update(self.__dict__)
-        out.segments, out._recent, out._whole = segments, Recent(_RECENT), None
+        out.segments, out._recent, out._of, out._whole = (
+            segments, Blocks(_RECENT, len(self)), np.arange(len(self)), None,
+        )  # fmt: skip
         if signs:
             pairs = zip(self._observers, self._measured, strict=True)
             out._measured = [m * signs[o.name] if o.name in signs else m for o, m in pairs]
         return out
 
+    def part(self, index: NDArray[np.intp]) -> "RolloutProblem":
+        """See `Problem`."""
+        out = self.take(index)
+        out._recent, out._of = self._recent, self._of[index]
+        return out
+
     def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
         """See `Problem`."""
         out, w = self.beginning(pick(self.segments, index)), self._where
+        out._recent, out._of = Blocks(_RECENT, len(index)), np.arange(len(index))
         out._where = Cut(w.log[index], w.start[index], w.samples[index], w.step[index])
         out.log_of, out.time_of = self.log_of[index], self.time_of[index]
         out._start_sd = [s[index] for s in self._start_sd]

@@ -9,7 +9,7 @@ import pytest
 
 from nfc_gym.measured.arena import alternatives, contains
 from nfc_gym.measured.box import box
-from nfc_gym.measured.fit import COARSE, fit, polish
+from nfc_gym.measured.fit import _RENEWED, COARSE, TINY, _Asked, fit, fitted, polish
 from nfc_gym.measured.metric import Metric, loss
 from nfc_gym.measured.screen import probe_sets
 from nfc_gym.physics.effects.air import DragLinear
@@ -105,6 +105,42 @@ def test_a_coarse_step_sees_past_jumps() -> None:
     np.testing.assert_allclose(found.x, [0.6, -0.4], atol=0.02)
     slopes = found.jacobian[..., 0, 0]
     assert abs(float(slopes.mean()) - 10) < 2 * 0.3 / COARSE
+
+
+@pytest.mark.parametrize("effects", [True, False])
+def test_where_bodies_touch_slopes_are_taken_anew_every_few_iterations(
+    effects: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In between they turn with the step: along it they are what the residual did. Those of psi alone are all anew."""
+    problem, under, flat = rugged()
+    flat.effects = (None,) if effects else ()
+    monkeypatch.setattr(
+        "nfc_gym.measured.fit.box", lambda plant: box(SimpleNamespace(**{**vars(plant), "effects": ()}))
+    )
+    ask = _Asked(problem, under, flat, np.zeros(2), None, lambda: None)
+    taken: list[float] = []
+    slopes = ask.slopes
+    monkeypatch.setattr(ask, "slopes", lambda x, size: taken.append(size) or slopes(x, size))
+    places, turned = np.array([[0.0, 0.0], [0.3, -0.1], [0.5, -0.3], [0.55, -0.35]]), []
+    for z in places:
+        ask.derivative(z, COARSE)
+        turned.append(ask.jacobian)
+    if not effects:
+        assert len(taken) == len(places)
+        return
+    assert len(taken) == -(-len(places) // _RENEWED)
+    moved = ask.white(ask.limits.x(places[1], ask.start)) - ask.white(ask.limits.x(places[0], ask.start))
+    np.testing.assert_allclose(turned[1] @ (places[1] - places[0]), moved, atol=1e-12)
+    ask.derivative(places[-1] + 0.01, TINY)  # differences of another size are another question
+    assert taken[-1] == TINY
+
+
+@pytest.mark.parametrize("rough", [True, False])
+def test_parameters_alone_end_where_the_fit_ends(rough: bool) -> None:
+    problem, under, flat = rugged()
+    problem.rough = rough
+    start = np.array([-1.5, 1.5])
+    np.testing.assert_array_equal(fitted(problem, under, flat, start, 8), fit(problem, under, flat, start, 8).x)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

@@ -212,6 +212,26 @@ def test_what_was_just_rolled_out_is_not_rolled_out_again(plant: Plant, monkeypa
     assert len(problem.take(np.array([3])).residual(plant, one)[0]) == 1
 
 
+def test_a_part_and_the_whole_share_what_they_know(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    rolled: list[int] = []
+    shoot = Plant.shoot
+    monkeypatch.setattr(
+        Plant,
+        "shoot",
+        lambda self, x, segments, **kw: rolled.append(len(x) * len(segments)) or shoot(self, x, segments, **kw),
+    )
+    problem, x = rollouts(plant), np.array([[0.1], [0.2]])
+    expected, index = rollouts(plant).residual(plant, x), np.array([7, 0, 31])
+    rolled.clear()
+    np.testing.assert_array_equal(problem.part(index).residual(plant, x), expected[:, index])
+    np.testing.assert_array_equal(problem.residual(plant, x), expected)
+    assert rolled == [6, 2 * (len(problem) - 3)]
+    np.testing.assert_array_equal(problem.part(index).residual(plant, x), expected[:, index])
+    assert len(rolled) == 2
+    problem.take(index).residual(plant, x)  # whoever may change what it took shares nothing
+    assert rolled[2:] == [6]
+
+
 def test_an_unstable_roll_out_has_no_residual(plant: Plant) -> None:
     problem = rollouts(plant, logs=1)
     residual = problem.residual(plant, np.array([[DAMPING], [-400.0]]))
