@@ -35,6 +35,7 @@ from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.network import ActorCritic
 from nfc_gym.adaptation.optimise import optimise
 from nfc_gym.adaptation.policy import Policy
+from nfc_gym.adaptation.ppo import ONWARD
 from nfc_gym.adaptation.sight import Sight
 from nfc_gym.adaptation.trajectory import Trajectory, execute
 from nfc_gym.core.fidelity import Fidelity
@@ -42,6 +43,7 @@ from nfc_gym.envs.single import RobotEnv
 from nfc_gym.wrappers import RandomizePsi
 
 CONFIG = AdaptConfig(missions=2, worlds=8, steps=512, episode=40, judged=0)
+ONCE = replace(ONWARD, epochs=1, minibatches=2)
 
 
 class Alarm:
@@ -135,9 +137,9 @@ def test_an_anomaly_adapts_the_policy_and_is_kept_like_the_rest(jackal: Path, ha
 
 def test_a_run_that_stopped_ends_as_one_that_did_not(jackal: Path, tmp_path: Path) -> None:
     whole, halves = load_policy(jackal), load_policy(jackal)
-    config = replace(CONFIG, missions=3, judged=2)
+    config = replace(CONFIG, judged=2)
     one = adapt(ppo_agent(whole), world(), belief(), Alarm(9), config=config, folder=tmp_path / "a", threads=1)
-    first = replace(config, missions=2)
+    first = replace(config, missions=1)
     adapt(ppo_agent(halves), world(), belief(), Alarm(9), config=first, folder=tmp_path / "b", threads=1)
     fresh = load_policy(jackal)  # another process knows only the file that it was given
     two = adapt(ppo_agent(fresh), world(), belief(), Alarm(9), config=config, folder=tmp_path / "b", threads=1)
@@ -158,7 +160,7 @@ def test_a_run_that_stopped_ends_as_one_that_did_not(jackal: Path, tmp_path: Pat
     again = adapt(
         ppo_agent(fresh), world(), shown, Alarm(9), config=config, folder=tmp_path / "b", threads=1, console=said
     )
-    assert "finished before, at mission 3 of 3" in said.export_text()
+    assert "finished before, at mission 2 of 2" in said.export_text()
     assert again.history == one.history
     assert shown.count == 1
     assert same(state(whole.network), state(fresh.network))
@@ -253,7 +255,7 @@ def test_the_best_weights_of_all_missions_are_deployed(
     policy = load_policy(jackal)
     before = state(policy.network)
     config = replace(CONFIG, judged=2, steps=3 * 1024, missions=1 + (len(judged) > 4))
-    done = adapt(ppo_agent(policy), world(), belief(), Alarm(20), config=config, threads=1)
+    done = adapt(ppo_agent(policy, ONCE), world(), belief(), Alarm(20), config=config, threads=1)
     assert same(state(policy.network), before) != changes
     assert done.history[-1]["chosen"] == max(judged[4:] or judged)
 
