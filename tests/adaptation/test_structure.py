@@ -161,7 +161,7 @@ def test_worlds_are_drawn_where_replays_do_as_was_seen(delayed: tuple[Assimilati
 
 def test_what_is_remembered_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     fewer(monkeypatch, 0.4)
-    first, second = (driven_in(late(0.08), {}, 80, seed) for seed in (3, 4))
+    first, second = (driven_in(late(0.08), {}, 120, seed) for seed in (3, 4))
     q = Assimilation(ID, delta_s=False, memory=2)
     alone = q.infer(second)
     both = q.updated(first, alone).infer(second)
