@@ -97,7 +97,7 @@ def fit_network(
 
 def _mirror(prior: PriorBox) -> Reflection:
     """Of the robot that psi belongs to; the ground does not matter."""
-    return Reflection(*Machine(environment(prior.robot.capitalize(), "Flat")).mirror)
+    return Reflection(Machine(environment(prior.robot.capitalize(), "Flat")).mirrors)
 
 
 def warm(config: NetworkConfig, windows: Held, prior: PriorBox, plan: Plan, device: torch.device) -> None:

@@ -186,7 +186,7 @@ def train(
                 encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
             )
             prior = PriorBox.of(machine.space, machine.kind.name)
-            image = Reflection(*machine.mirror) if mirror else None
+            image = Reflection(machine.mirrors) if mirror else None
             done = jobs.train_posterior(windows, prior, out, config, training, device=device, mirror=image, **how)
         say_written(out, f"{_learned(done)} ({done.seconds:.0f} s){'' if structure else _told(out)}")
 

@@ -4,7 +4,7 @@ import mujoco
 from numpy.typing import NDArray
 
 from nfc_gym.envs.components import joints, observed, torso
-from nfc_gym.envs.mirror import Signed
+from nfc_gym.envs.mirror import ENDS, SIDES, Plane, Signed
 from nfc_gym.envs.runner import Runner, Weights
 from nfc_gym.envs.view import View
 
@@ -13,6 +13,7 @@ class Ant(Runner):
     """Eight actions: torque of hip and ankle of each leg, in units of the largest, 30 N m."""
 
     name = "ant"
+    planes = (SIDES, ENDS)
     action_size, proprio_size, draws = 8, 52, 4 + 8
     reads = ("sensordata",)
     lowest = 0.26  # m: the torso, of 0.25 m radius, all but touches the ground
@@ -32,9 +33,9 @@ class Ant(Runner):
         """See `Robot`."""
         return [*torso(model), *joints(model, "pos"), *joints(model, "vel"), *observed(24)]
 
-    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+    def reflected(self, model: mujoco.MjModel, plane: Plane) -> tuple[list[Signed], Signed]:
         """See `Robot`."""
-        return [self.torso_reflected, self.feet_reflected(model)], self.motors_reflected(model)
+        return [self.torso_reflected(plane), self.feet_reflected(model, plane)], self.motors_reflected(model, plane)
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Torso 12, joint positions 8 (rad), joint velocities 8 (rad/s), force and torque of each foot 24 (N, N m)."""

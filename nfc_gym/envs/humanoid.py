@@ -4,7 +4,7 @@ import mujoco
 from numpy.typing import NDArray
 
 from nfc_gym.envs.components import joints, observed, torso
-from nfc_gym.envs.mirror import Signed
+from nfc_gym.envs.mirror import Plane, Signed
 from nfc_gym.envs.runner import Runner, Weights
 from nfc_gym.envs.view import View
 
@@ -32,10 +32,10 @@ class Humanoid(Runner):
         """See `Robot`."""
         return [*torso(model), *joints(model, "pos"), *joints(model, "vel"), *observed(21 + 12 + 21)]
 
-    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+    def reflected(self, model: mujoco.MjModel, plane: Plane) -> tuple[list[Signed], Signed]:
         """See `Robot`."""
-        motors = self.motors_reflected(model)
-        return [self.torso_reflected, motors, self.feet_reflected(model), motors], motors
+        motors = self.motors_reflected(model, plane)
+        return [self.torso_reflected(plane), motors, self.feet_reflected(model, plane), motors], motors
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Torso 12, joint positions, velocities, torques 21 each (rad, rad/s, N m), feet 12 (N, N m), action 21."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.components import base, observed
-from nfc_gym.envs.mirror import Signed, fixed
+from nfc_gym.envs.mirror import ENDS, SIDES, Plane, Signed, fixed
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, axes, to_robot, turned
@@ -59,6 +59,7 @@ class Jackal(Robot):
     """
 
     name = "jackal"
+    planes = (SIDES, ENDS)
     tasks = ("goal", "figure8")
     terrain_scale = 0.3  # steps of difficulty 0.5 are then 0.03 m, a third of a wheel's radius: what it can climb
     action_size, proprio_size, goal_size, place_size, draws = 2, 15, 2, 2, 5
@@ -144,9 +145,10 @@ class Jackal(Robot):
         motion = [*base(model, "quat", "wxyz"), *base(model, "linvel@body"), *base(model, "angvel@body")]
         return [*motion, *base(model, "pos"), *observed(2)]
 
-    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+    def reflected(self, model: mujoco.MjModel, plane: Plane) -> tuple[list[Signed], Signed]:
         """See `Robot`."""
-        return [fixed(1, -1)], fixed(1, -1)  # forward speed and yaw rate
+        action = fixed(plane.vector("x"), plane.axial("z"))  # forward speed and yaw rate
+        return [action], action
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Quaternion, velocity and rates in the rover's own frame, position, last action."""

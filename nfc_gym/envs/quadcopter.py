@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.components import base, joints, observed
-from nfc_gym.envs.mirror import Signed, fixed, opposite
+from nfc_gym.envs.mirror import ENDS, SIDES, Plane, Signed, fixed
 from nfc_gym.envs.path import figure_eight
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, at_least, at_most, axes, turned
@@ -53,6 +53,7 @@ class Quadcopter(Robot):
     """Four actions: the thrust of each rotor, -1 for none and 1 for the maximum."""
 
     name = "quadcopter"
+    planes = (SIDES, ENDS)
     tasks = ("goal", "figure8")
     terrain_kind = "obstacles"
     action_size, proprio_size, place_size, draws = 4, 21, 3, 7
@@ -137,11 +138,11 @@ class Quadcopter(Robot):
         pose = [*observed(3), *base(model, "quat", "wxyz")]
         return [*pose, *base(model, "linvel"), *base(model, "angvel@body"), *joints(model, "pos")]
 
-    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+    def reflected(self, model: mujoco.MjModel, plane: Plane) -> tuple[list[Signed], Signed]:
         """See `Robot`."""
         rotors = [model.actuator(i).name for i in range(model.nu)]
-        action = Signed(np.array([rotors.index(opposite(name)) for name in rotors]), np.ones(len(rotors)))
-        return [fixed(1, -1, 1)], action  # offset to the goal
+        action = Signed(np.array([rotors.index(plane.opposite(name)) for name in rotors]), np.ones(len(rotors)))
+        return [fixed(*map(plane.vector, "xyz"))], action  # offset to the goal
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Goal offset (world), then `_motion`."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.envs.components import base, joints, observed
-from nfc_gym.envs.mirror import Signed, fixed, jointwise
+from nfc_gym.envs.mirror import Plane, Signed, fixed, jointwise
 from nfc_gym.envs.robot import Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, axes, some, to_robot
 from nfc_gym.envs.spawn import place, spread, underside
@@ -139,10 +139,12 @@ class Quadruped(Robot):
         motion = [*base(model, "linvel@body"), *base(model, "angvel@body")]
         return [*motion, *observed(6), *joints(model, "pos"), *joints(model, "vel"), *observed(12)]
 
-    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+    def reflected(self, model: mujoco.MjModel, plane: Plane) -> tuple[list[Signed], Signed]:
         """See `Robot`."""
-        action = jointwise(model, [model.actuator(i).name for i in range(model.nu)])
-        return [fixed(1, -1, 1), fixed(1, -1, -1), action], action  # down, command, last action
+        down = fixed(*map(plane.vector, "xyz"))
+        command = fixed(plane.vector("x"), plane.vector("y"), plane.axial("z"))
+        action = jointwise(plane, model, [model.actuator(i).name for i in range(model.nu)])
+        return [down, command, action], action
 
     def proprio(self, view: View) -> tuple[NDArray, ...]:
         """Linear and angular velocity, down (own frame), command, joint positions and velocities, last action."""

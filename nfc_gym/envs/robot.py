@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nfc_gym import assets
 from nfc_gym.envs import scene
 from nfc_gym.envs.components import observed
-from nfc_gym.envs.mirror import Signed
+from nfc_gym.envs.mirror import SIDES, Plane, Signed
 from nfc_gym.envs.view import View
 from nfc_gym.physics.parameters import Parameter, ParameterSpace, parameters_from_toml
 from nfc_gym.terrain import Heightfield
@@ -68,6 +68,7 @@ class Robot(ABC):
       name: folder of its MJCF under `nfc_gym/assets`.
       tasks: what it can be asked to do; the first is the default.
       goal_size: size of the `goal` observation, 0 where `proprio` holds the command.
+      planes: of the upright mirrors in which the robot is its own image, but for psi.
       place_size: size of a goal as a place in the world (`achieved`, `desired`), 0 where the tasks have none.
       terrain_kind, terrain_scale: of the rough ground: one of `nfc_gym.terrain.KINDS`, and what multiplies its heights.
       draws: how many uniform numbers in [0, 1) an episode's start is made of.
@@ -87,6 +88,7 @@ class Robot(ABC):
     proprio_size: ClassVar[int]
     goal_size: ClassVar[int] = 0
     place_size: ClassVar[int] = 0
+    planes: ClassVar[tuple[Plane, ...]] = (SIDES,)
     terrain_kind: ClassVar[str] = "mixed"
     terrain_scale: ClassVar[float] = 1.0
     draws: ClassVar[int]
@@ -159,7 +161,7 @@ class Robot(ABC):
         """What each entry of `proprio` is, see `nfc_gym.envs.components`; without more, none is known to be state."""
         return observed(self.proprio_size)
 
-    def reflected(self, model: mujoco.MjModel) -> tuple[list[Signed], Signed]:
+    def reflected(self, model: mujoco.MjModel, plane: Plane) -> tuple[list[Signed], Signed]:
         """In a mirror: the parts of `proprio` that `components` calls observed, in their order; and the action."""
         raise NotImplementedError
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.envs.mirror import Signed, fixed, jointwise, sensorwise
+from nfc_gym.envs.mirror import Plane, Signed, fixed, jointwise, sensorwise
 from nfc_gym.envs.robot import DT, Array, Ground, Robot, Start
 from nfc_gym.envs.rotations import Axes, at_most, axes, in_robot, some
 from nfc_gym.envs.spawn import place, spread, underside
@@ -153,16 +153,22 @@ class Runner(Robot):
         """The torso is down."""
         return view.now.height < self.lowest
 
-    torso_reflected: ClassVar[Signed] = fixed(-1, -1, -1, 1, 1)  # of `torso`, from the yaw on
+    @staticmethod
+    def torso_reflected(plane: Plane) -> Signed:
+        """What `torso` has from the yaw on, in a mirror.
 
-    def feet_reflected(self, model: mujoco.MjModel) -> Signed:
+        Where front becomes rear the target goes from ahead to ahead, which the motion does not know.
+        """
+        return fixed(plane.axial("z"), plane.axial("x"), plane.axial("z"), 1, 1)
+
+    def feet_reflected(self, model: mujoco.MjModel, plane: Plane) -> Signed:
         """Forces and torques of the feet in a mirror."""
-        return sensorwise(model, [f"{foot}_{what}" for foot in self.feet for what in ("force", "torque")])
+        return sensorwise(plane, model, [f"{foot}_{what}" for foot in self.feet for what in ("force", "torque")])
 
     @staticmethod
-    def motors_reflected(model: mujoco.MjModel) -> Signed:
+    def motors_reflected(model: mujoco.MjModel, plane: Plane) -> Signed:
         """Torques of the motors in a mirror, each named as its joint."""
-        return jointwise(model, [model.actuator(i).name for i in range(model.nu)])
+        return jointwise(plane, model, [model.actuator(i).name for i in range(model.nu)])
 
     def torso(self, view: View) -> NDArray:
         """The twelve numbers that both robots' proprio begins with, (*B, 12).

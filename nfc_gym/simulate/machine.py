@@ -128,10 +128,13 @@ class Machine:
         return tuple(self.model.actuator(i).name for i in range(self.kind.action_size))
 
     @cached_property
-    def mirror(self) -> Mirror:
-        """How its windows look in a mirror."""
-        parts, actions = self.settings.robot(self.model).reflected(self.model)
-        return mirror(self.state_names, self.space.names, parts, actions, self.model)
+    def mirrors(self) -> tuple[Mirror, ...]:
+        """How its windows look in each of the mirrors in which it is its own image."""
+        robot, model = self.settings.robot(self.model), self.model
+        return tuple(
+            mirror(plane, self.state_names, self.space.names, *robot.reflected(model, plane), model)
+            for plane in self.kind.planes
+        )
 
     @cached_property
     def noise(self) -> Array:
