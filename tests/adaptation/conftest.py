@@ -2,8 +2,12 @@
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from nfc_gym.inference.detector import WindowDetector
 
 sys.path.insert(0, str(Path(__file__).parent))  # `carts`: importlib mode does not add the folder
 
@@ -15,6 +19,14 @@ torch.set_num_threads(1)
 @pytest.fixture(autouse=True)
 def _own_seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def detector() -> "WindowDetector":
+    """Of `carts`, trained and calibrated on gentle pushes; those that learn from it leave it as it is."""
+    from carts import watcher
+
+    return watcher()
 
 
 @pytest.fixture(scope="session")

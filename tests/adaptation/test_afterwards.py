@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from carts import QUICK, cart, everything, trajectory, watcher
+from carts import QUICK, cart, everything, trajectory
 
 from nfc_gym import InputError
 from nfc_gym.adaptation import afterwards, learn_from_mission, load_policy
@@ -34,11 +34,6 @@ from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
 
 JACKAL, COPTER = "nfc_gym/JackalFlat-v0", "nfc_gym/QuadcopterFlat-v0"
-
-
-@pytest.fixture(scope="module")
-def detector() -> WindowDetector:
-    return watcher()
 
 
 def test_false_alarms_on_the_missions_own_motion_fall(detector: WindowDetector, tmp_path: Path) -> None:

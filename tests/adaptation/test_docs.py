@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from rounds import fewer
 
 DOCS = (Path(__file__).resolve().parents[2] / "docs" / "adaptation.md").read_text(encoding="utf-8")
 PROGRAMS = re.findall(r"^```python\n(.*?)^```", DOCS, re.DOTALL | re.MULTILINE)
@@ -18,6 +19,7 @@ LESS = {
 
 def test_the_adaptation_runs(jackal: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    fewer(monkeypatch, 0.4)
     (program,) = (p for p in PROGRAMS if "adapt(" in p)
     for long, short in LESS.items():
         assert long in program

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from carts import cart, everything, watcher
+from carts import cart, everything
 from typer.testing import CliRunner, Result
 
 from nfc_gym import InputError
@@ -18,12 +18,13 @@ from nfc_gym.adaptation.trajectory import Dataset
 from nfc_gym.cli import app
 from nfc_gym.inference import detector_file
 from nfc_gym.inference.data import TensorWindows
+from nfc_gym.inference.detector import WindowDetector
 
 TRAJECTORIES = 16
 
 
 @pytest.fixture(scope="module")
-def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mission(tmp_path_factory: pytest.TempPathFactory, detector: WindowDetector) -> Path:
     """What `adapt` leaves of a mission of a cart that is pushed harder than the detector has seen."""
     folder = tmp_path_factory.mktemp("mission")
     dataset = Dataset(folder)
@@ -31,7 +32,7 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
         dataset.add(cart(400, 2000 + k, 4.0))
     of = {"environment": "nfc_gym/JackalFlat-v0"}
     resume.save(folder / afterwards.STATE, {"none": torch.nn.Linear(1, 1)}, None, {"t": TRAJECTORIES}, of)
-    detector_file.save(folder / "given.safetensors", watcher())
+    detector_file.save(folder / "given.safetensors", detector)
     return folder
 
 

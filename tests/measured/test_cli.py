@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from nfc_gym import InputError, __version__
-from nfc_gym.cli import app
+from nfc_gym.cli import app, main
 
 Build = Any
 
@@ -160,20 +160,31 @@ def test_predict_says_what_its_columns_and_rows_are() -> None:
     assert "is replaced" in text
 
 
+def test_what_the_entry_point_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An absent file without a traceback, the version."""
+    monkeypatch.setattr(sys, "argv", ["nfc-gym", "close-loop", str(tmp_path / "no.yaml"), "--out", str(tmp_path / "o")])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert "no such file" in said
+    assert "Traceback" not in said
+    monkeypatch.setattr(sys, "argv", ["nfc-gym", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert not ended.value.code
+    assert capsys.readouterr().out.strip() == __version__
+
+
 def test_as_a_program(tmp_path: Path) -> None:
-    """Through a real process: `--debug` after the command, an absent file, the version."""
+    """Through a real process: `--debug` after the command, and the package as a module."""
     run = [sys.executable, "-c", "from nfc_gym.cli import main; main()"]
-    absent = subprocess.run([*run, "close-loop", str(tmp_path / "no.yaml"), "--out", str(tmp_path / "o")],
-                            capture_output=True, text=True, check=False)  # fmt: skip
-    assert absent.returncode == 2
-    assert "no such file" in absent.stderr
-    assert "Traceback" not in absent.stderr
     debug = subprocess.run([*run, "close-loop", str(tmp_path / "no.yaml"), "--out", str(tmp_path / "o"), "--debug"],
                            capture_output=True, text=True, check=False)  # fmt: skip
     assert debug.returncode == 2
     assert "Traceback" in debug.stderr
-    version = subprocess.run([*run, "--version"], capture_output=True, text=True, check=True)
-    assert version.stdout.strip() == __version__
     module = [sys.executable, "-m", "nfc_gym.cli", "chek"]
     as_module = subprocess.run(module, capture_output=True, text=True, check=False)
     assert as_module.returncode == 2

@@ -14,6 +14,8 @@ from nfc_gym.measured.drowned import REASON, drowned
 from nfc_gym.measured.loop import close_loop
 from nfc_gym.measured.metric import metric
 
+ROWS = 250  # of a log: 5 s
+
 # A hull in water turns into its sideways motion: what its speed is off by turns it.
 HULL = """
 <mujoco><option timestep="{step}" integrator="implicitfast" density="1000" viscosity="0.001"/><worldbody>
@@ -53,14 +55,14 @@ def build(folder: Path, metres: float, speeds: float) -> Path:
     for k in range(4):
         rng, data, rows = np.random.default_rng(k), mujoco.MjData(model), []
         phase = rng.uniform(0, 6, 3)
-        for i in range(500):
+        for i in range(ROWS):
             t = 0.02 * i
             data.ctrl[:] = 8 * np.sin(np.array([1.3, 1.9, 2.7]) * t + phase) + [4, 4, 0]
             rows.append((t, data.ctrl.copy(), data.qpos.copy(), data.qvel.copy()))
             mujoco.mj_step(model, data, 20)
         t, u, q, v = (np.array(column) for column in zip(*rows, strict=True))
         quat = q[:, 3:].copy()
-        for row, turn in zip(quat, 0.001 * rng.standard_normal((500, 3)), strict=True):
+        for row, turn in zip(quat, 0.001 * rng.standard_normal((ROWS, 3)), strict=True):
             mujoco.mju_quatIntegrate(row, turn, 1.0)
         noisy = {name: x + sd * rng.standard_normal(x.shape) for name, x, sd in (
             ("pos", q[:, :3], metres), ("gyro", v[:, 3:], 0.003), ("speed", v[:, :3], speeds))}  # fmt: skip
