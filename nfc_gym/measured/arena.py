@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.contest import Judged
-from nfc_gym.measured.fit import Fit, fit, fit_last
+from nfc_gym.measured.fit import TURNING, Fit, fit, fit_last
 from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Problem
@@ -78,7 +78,7 @@ class Arena(Yardstick):
         (the chord method).
         """
         chord = known if quick or known.shape[-1] > _CHORD else None
-        return fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord)
+        return fit(self.fit_data.problem, self.under, plant, start, rounds, known=chord, serve=TURNING)
 
     def enter_beside(self, leader: Judged, picks: Sequence[Screened]) -> Judged:
         """Fit screened candidates in a leading one's place, also from where the leader's fit took all the rest."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.measured.box import Box, box
-from nfc_gym.measured.fit import Fit, fit, fitted
+from nfc_gym.measured.fit import TURNING, Fit, fit, fitted
 from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.race import lost
@@ -72,9 +72,10 @@ def hollows(
     around = np.random.default_rng(seed).normal(size=(starts, len(limits.scale)))
     z = np.clip(limits.at(found.x) + _AWAY * around, limits.floor, limits.roof)
     ends, apart, quiet = [found.x], [found.x], 0
+    serve = TURNING if plant.effects else 1  # what psi alone is short of would be an effect's to claim
     for number, start in enumerate([*others, *limits.x(z, found.x)], 1):
         tick(number)
-        ends.append(fitted(problem, under, plant, start, _ROUNDS))
+        ends.append(fitted(problem, under, plant, start, _ROUNDS, serve))
         new = all(_errors_between(found, limits, ends[-1], x) > _SAME for x in apart)
         quiet = 0 if new else quiet + 1
         if new:

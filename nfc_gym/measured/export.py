@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.measured import asset_files
+from nfc_gym.measured.distances import Model
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.frozen import freeze, freeze_inertia
 from nfc_gym.measured.moments import mend
@@ -33,8 +34,8 @@ _OFF = 0.1  # of the way to a parameter's highest value, for a look at whether M
 _KEPT, _ROUNDED, _HAIR = 0.01, 1e-5, 1e-9  # of a change, of a value, of what is none: it may come back so much changed
 
 
-def pack(fitted: Fit) -> dict[str, Any]:
-    """Psi and effects of a fit as JSON-able data; `unpack` reads it back."""
+def pack(fitted: Fit | Model) -> dict[str, Any]:
+    """Psi and effects of a model as JSON-able data; `unpack` reads it back."""
     psi, thetas = fitted.plant.split(fitted.x)
     return {
         "psi": dict(zip(fitted.plant.space.names, map(float, psi), strict=True)),

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 COARSE, FINE, TINY = 1e-1, 2e-4, 1e-5
 _UNSEEN = 1e-8  # of the largest column's norm: what the differences' own rounding makes of one that is zero
 _SPREAD = 0.3  # of a polish's first draws, in scaled parameters
-_RENEWED = 2  # iterations of a rough fit that take slopes anew once; in between these turn with the step (Broyden)
+TURNING = 2  # iterations of a candidate's rough fit that one set of slopes serves, turned with the step in between
 _PARTS, _RIDGE = np.array([1.0, 0.5, 0.2, 0.05]), 0.01  # of a step that are tried; of a Hessian's diagonal
 
 
@@ -78,6 +78,7 @@ def fit(
     rounds: int = 15,
     known: Array | None = None,
     tick: Callable[[], None] = lambda: None,
+    serve: int = 1,
 ) -> Fit:
     """Minimise the robust loss over free parameters within their box.
 
@@ -87,20 +88,24 @@ def fit(
       known: (S, m, j) Jacobian of the first j free parameters to reuse as it is: the chord method, for refits in which
         psi moves little.
       tick: called at every iteration.
+      serve: iterations, where bodies touch, that slopes serve before they are taken anew. In between each takes from
+        the step that led to it what slopes along it are (Broyden 1965), at no cost: beside the jumps there that is
+        nearly as good as a difference. The model to beat is to have slopes of its own at each: what it is still short
+        of would be a candidate's to claim.
 
     Returns:
       The fit; never worse than the start under the loss.
     """
-    ask = _Asked(problem, metric, plant, start, known, tick)
+    ask = _Asked(problem, metric, plant, start, known, tick, serve)
     x = _descended(ask, rounds)
     found = ask.slopes(x, COARSE) if problem.rough and len(ask.limits.scale) else ask.jacobian
     x = _quieted(ask, x, found)
     return Fit(plant, x, ask.white(x), found)
 
 
-def fitted(problem: Problem, metric: Metric, plant: Plant, start: Array, rounds: int = 15) -> Array:
+def fitted(problem: Problem, metric: Metric, plant: Plant, start: Array, rounds: int = 15, serve: int = 1) -> Array:
     """The same where the parameters (size,) alone are wanted: slopes at the end are spared."""
-    ask = _Asked(problem, metric, plant, start, None, lambda: None)
+    ask = _Asked(problem, metric, plant, start, None, lambda: None, serve)
     x = _descended(ask, rounds)
     found = ask.jacobian
     if problem.rough and not found.any((0, 1)).all():  # what tiny steps do not show larger ones may
@@ -171,11 +176,19 @@ class _Asked:
     """
 
     def __init__(
-        self, problem: Problem, metric: Metric, plant: Plant, start: Array, known: Array | None, tick: Callable
+        self,
+        problem: Problem,
+        metric: Metric,
+        plant: Plant,
+        start: Array,
+        known: Array | None,
+        tick: Callable,
+        serve: int,
     ) -> None:
         self.problem, self.metric, self.plant, self.start, self.known, self.tick = (
             problem, metric, plant, start, known, tick,
         )  # fmt: skip
+        self.serve = serve if problem.rough else 1
         self.limits = box(plant)
         self.fresh = np.arange(0 if known is None else known.shape[-1], len(self.limits.scale))
         self.jacobian = np.zeros((*problem.mask.shape, 0))
@@ -195,15 +208,10 @@ class _Asked:
         return np.concatenate([white.ravel(), (z - self.limits.centre) * self.limits.pull])
 
     def derivative(self, z: Array, size: float) -> Array:
-        """(S m + f, f) its slopes, by differences of that size.
-
-        Where bodies touch those of a model with effects are renewed at every other iteration. One in between takes from
-        the step that led to it what slopes along it are (Broyden 1965), at no cost: beside the jumps there, that is as
-        good as a difference. Psi alone has few of them, and what it is still short of would be an effect's to claim.
-        """
+        """(S m + f, f) its slopes, by differences of that size, or those of the last iteration turned (see `fit`)."""
         self.tick()
         x = self.limits.x(z, self.start)
-        turned = self._turned(z, x, size) if self.problem.rough and self.plant.effects else None
+        turned = self._turned(z, x, size)
         self._age = 1 if turned is None else self._age + 1
         self.jacobian = self.slopes(x, size) if turned is None else turned
         self._sloped = z.copy(), self.white(x), size
@@ -211,7 +219,7 @@ class _Asked:
 
     def _turned(self, z: Array, x: Array, size: float) -> Array | None:
         """(S, m, f) the slopes at hand, turned to explain the step to z; None where they are to be taken anew."""
-        if self._sloped is None or self._sloped[2] != size or self._age >= _RENEWED or not len(self.fresh):
+        if self._sloped is None or self._sloped[2] != size or self._age >= self.serve or not len(self.fresh):
             return None
         step = z - self._sloped[0]
         missed = self.white(x) - self._sloped[1] - self.jacobian @ step

@@ -2,8 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Container, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Container, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,32 +15,30 @@ from rich.text import Text
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_together
 from nfc_gym.core.log import Log
-from nfc_gym.measured import marginal
 from nfc_gym.measured.advice import advise
 from nfc_gym.measured.belief import read_belief
 from nfc_gym.measured.bench import Bench, candidates, make_bench
 from nfc_gym.measured.calibrate import calibrate, compared
 from nfc_gym.measured.checks import require
-from nfc_gym.measured.contest import clusters, dispersion
+from nfc_gym.measured.contest import dispersion
 from nfc_gym.measured.dataset import Dataset
 from nfc_gym.measured.drowned import ADVICE, REASON, drowned
-from nfc_gym.measured.elsewhere import STARTS, hollows, resized
+from nfc_gym.measured.final import final_models
 from nfc_gym.measured.fisher import Lens
-from nfc_gym.measured.fit import Fit, differs, stand
-from nfc_gym.measured.halved import step_error
+from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.identify import table
 from nfc_gym.measured.kept import pack_state, unpack_state
-from nfc_gym.measured.metric import Metric, metric
+from nfc_gym.measured.metric import metric
 from nfc_gym.measured.model import model_path
 from nfc_gym.measured.numerics import fingerprint, one_blas_thread
 from nfc_gym.measured.outcome import report, summary, write
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.questions import Present, blocks_for
-from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.report import render_summary
+from nfc_gym.measured.run import Run
 from nfc_gym.measured.search import Found, Options, Search, State
-from nfc_gym.measured.settle import settle, slack
+from nfc_gym.measured.settle import slack
 from nfc_gym.measured.splits import Fold
 from nfc_gym.measured.stages import Stages, digest, held, require_free, written_by
 from nfc_gym.measured.stakes import Stakes
@@ -54,16 +51,6 @@ from nfc_gym.physics.untimed import untimed
 Array = NDArray[np.float64]
 _WORK = 16_000  # physics steps of one pass over the fit segments that the search works with; the last fit takes all
 _SOME_LOGS = 6  # that the identifiability table of an instant problem is made from
-
-
-@dataclass
-class _Run:
-    """What the steps of one run share."""
-
-    bench: Bench
-    stages: Stages
-    seed: int
-    say: Callable[[str], None]
 
 
 def close_loop(
@@ -217,7 +204,7 @@ def _fold(
     stages = Stages(out, key, overwrite, resume)
 
     tell = teller(console, began)
-    run = _Run(bench, stages, seed, tell)
+    run = Run(bench, stages, seed, tell)
     fitting, selecting, verifying = (dataset.of(s, fold) for s in ("fit", "select", "verify"))
     if not verifying:
         raise InputError("no log verifies: give one `split: verify`, or let `split` divide them")
@@ -226,7 +213,7 @@ def _fold(
     most = max(40, int(_WORK * bench.plant.model.opt.timestep / dataset.mapping.segments.length))
     work, select = bench.searched(fitting, most), bench.searched(selecting, most)
     found = _search(run, fitting, work, select)
-    calibrated, extended, step = _final(run, found, whole)
+    calibrated, extended, step = final_models(run, found, whole)
     final = calibrated, extended
     pool = candidates(bench, [*fitting, *selecting])
     suspects = restored(stages.get("suspects"))
@@ -261,11 +248,10 @@ def _fold(
     return outcome
 
 
-_NOTHING = 0.5  # of the chance that an effect without size would seem smaller: a median one of these is no effect
 _TOLD = ("generic", "nearest", "dropped", "doubted", "misshapen")  # of `Found`, kept as it is
 
 
-def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
+def _search(run: Run, fitting: Any, work: Problem, select: Problem) -> Found:
     """Calibrate, then search; a stage after calibration and after every round. A resumed run goes on from the last."""
     bench, plant = run.bench, run.bench.plant
     reach = f" of {work.columns.horizon.max():g} s, as far as slopes can follow," if bench.short else ""
@@ -297,7 +283,7 @@ def _search(run: _Run, fitting: Any, work: Problem, select: Problem) -> Found:
     return found
 
 
-def _suspects(run: _Run, fitting: Sequence[Log], x: Array) -> Suspects | None:
+def _suspects(run: Run, fitting: Sequence[Log], x: Array) -> Suspects | None:
     """What the structure head says of the fit logs and the calibrated model, asked once a run; None without a head."""
     if run.bench.witness is None:
         return None
@@ -310,7 +296,7 @@ def _suspects(run: _Run, fitting: Sequence[Log], x: Array) -> Suspects | None:
     return restored(run.stages.get("suspects"))
 
 
-def _hunt(run: _Run, search: Search, calibrated: Fit, pool: list[Effect]) -> Found:
+def _hunt(run: Run, search: Search, calibrated: Fit, pool: list[Effect]) -> Found:
     """The search, from where it was interrupted if it was."""
     saved = run.stages.get("search")
     begun = unpack_state(saved, run.bench.plant, pool) if saved else None
@@ -325,71 +311,8 @@ def _keep_found(stages: Stages, found: Found) -> None:
     stages.put("found", pack_state(state) | {"slack": found.slack.tolist()} | names)
 
 
-def _final(run: _Run, found: Found, whole: Problem) -> tuple[Fit, Fit, Array]:
-    """Calibrated and extended model refitted on every fit segment; what step and search leave open of the latter."""
-    assert found.rest is not None
-    last = found.rest.fitted
-    effects = bool(last.plant.effects)
-    # Psi alone began its way here from several places; its intervals are asked for only where there is nothing beside.
-    calibrated = extended = _settled(run, "calibrated", found.calibrated, whole, starts=1 if effects else STARTS)
-    if effects:
-        # What psi alone went to is another place for the same psi to begin.
-        psi = calibrated.fitted.x[: len(last.plant.space)]
-        extended = _settled(run, "extended", last, whole, (np.concatenate([psi, last.x[len(psi) :]]),))
-        if gone := [e for e in last.plant.effects if not differs(extended.fitted, clusters(whole), e, _NOTHING)]:
-            why = f"dropped {', '.join(e.id for e in gone)}: on all segments together its size comes to nothing"
-            run.say(why)
-            found.rounds.insert(len(found.rounds) - 1, Round([], 0.0, reason=why))  # the last one found nothing more
-            rest = _without(extended.fitted, gone)
-            extended = _settled(run, "extended, less", rest, whole) if rest.plant.effects else calibrated
-    unsure = np.hypot(step_error(whole, extended.under, extended.fitted), extended.unsure)
-    return calibrated.fitted, extended.fitted, unsure
-
-
-def _without(fitted: Fit, gone: Sequence[Effect]) -> Fit:
-    """A model less some of its effects, the other parameters as they were; to begin a fit from."""
-    psi, thetas = fitted.plant.split(fitted.x)
-    pairs = [(e, t) for e, t in zip(fitted.plant.effects, thetas, strict=True) if not any(e is g for g in gone)]
-    plant = fitted.plant.with_effects([e for e, _ in pairs])
-    return replace(fitted, plant=plant, x=np.concatenate([psi, *(t for _, t in pairs)]))
-
-
-@dataclass(frozen=True)
-class _Settled:
-    """A model on every fit segment, its metric there, and (size,) what the search for its parameters leaves open."""
-
-    fitted: Fit
-    under: Metric
-    unsure: Array
-
-
-def _settled(
-    run: _Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = (), starts: int = STARTS
-) -> _Settled:
-    """Fit a model from where it stands and, where bodies touch, from other places (size,) or over drawn starts too."""
-    plant, stage, sigma = start.plant, f"final {name}", None
-    if run.stages.get(stage) is None:
-        run.say(f"fitting the {name} model on all {len(whole)} segments")
-        fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
-        if not whole.rough and (other := resized(whole, under, fitted)) is not fitted:
-            fitted, under, extra = settle(whole, whole.covariance(plant, other.x), plant, other.x)
-        if run.bench.short:
-            tick = lambda k: run.say(f"fitting the {name} model over drawn starts, turn {k} of {marginal.TURNS}")  # noqa: E731
-            ended = marginal.marginal(whole, under, fitted, run.seed, tick)
-        else:
-            tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
-            ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
-        run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "unsure": ended.unsure.tolist()})
-        sigma = ended.sigma
-    x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "unsure"))
-    if sigma is None:
-        sigma = whole.covariance(plant, x if whole.rough else start.x)
-    under = metric(whole, sigma, extra)
-    return _Settled(stand(whole, under, plant, x), under, unsure)
-
-
 def _identify(
-    run: _Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem], pool: Sequence[Effect]
+    run: Run, fitted: Fit, logs: Sequence[Log], searched: Sequence[Problem], pool: Sequence[Effect]
 ) -> Present:
     """The logs that the search worked with, seen from the fitted model, and what it charged."""
     bench, plant = run.bench, fitted.plant

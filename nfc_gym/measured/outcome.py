@@ -16,6 +16,7 @@ from nfc_gym.core.files import write_together
 from nfc_gym.measured import verdict as say
 from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.details import details
+from nfc_gym.measured.distances import Model
 from nfc_gym.measured.export import corrected, effects_of, pack
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.maps import maps
@@ -35,7 +36,7 @@ def report(
     bench: Bench,
     fold: Fold,
     found: Found,
-    final: tuple[Fit, Fit],
+    final: tuple[Model, Fit],
     step: Array,
     verifying: Problem,
     fitting: Problem,
@@ -179,7 +180,7 @@ def _noise(bench: Bench, fold: Fold) -> list[dict[str, Any]]:
     ]
 
 
-def write(out: Path, bench: Bench, final: tuple[Fit, Fit], report: dict[str, Any]) -> None:
+def write(out: Path, bench: Bench, final: tuple[Model, Fit], report: dict[str, Any]) -> None:
     """All outputs or none; `report.json` last, since it marks a finished run."""
     calibrated, extended = final
     firmware = [c.removeprefix("ctrl:") for c in bench.firmware]

@@ -9,7 +9,7 @@ import pytest
 
 from nfc_gym.measured.arena import alternatives, contains
 from nfc_gym.measured.box import box
-from nfc_gym.measured.fit import _RENEWED, COARSE, TINY, _Asked, fit, fitted, polish
+from nfc_gym.measured.fit import COARSE, TINY, TURNING, _Asked, fit, fitted, polish
 from nfc_gym.measured.metric import Metric, loss
 from nfc_gym.measured.screen import probe_sets
 from nfc_gym.physics.effects.air import DragLinear
@@ -107,17 +107,11 @@ def test_a_coarse_step_sees_past_jumps() -> None:
     assert abs(float(slopes.mean()) - 10) < 2 * 0.3 / COARSE
 
 
-@pytest.mark.parametrize("effects", [True, False])
-def test_where_bodies_touch_slopes_are_taken_anew_every_few_iterations(
-    effects: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In between they turn with the step: along it they are what the residual did. Those of psi alone are all anew."""
+@pytest.mark.parametrize("serve", [1, 2, 3])
+def test_where_bodies_touch_slopes_may_serve_for_some_iterations(serve: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In between they turn with the step: along it they are what the residual did."""
     problem, under, flat = rugged()
-    flat.effects = (None,) if effects else ()
-    monkeypatch.setattr(
-        "nfc_gym.measured.fit.box", lambda plant: box(SimpleNamespace(**{**vars(plant), "effects": ()}))
-    )
-    ask = _Asked(problem, under, flat, np.zeros(2), None, lambda: None)
+    ask = _Asked(problem, under, flat, np.zeros(2), None, lambda: None, serve)
     taken: list[float] = []
     slopes = ask.slopes
     monkeypatch.setattr(ask, "slopes", lambda x, size: taken.append(size) or slopes(x, size))
@@ -125,14 +119,18 @@ def test_where_bodies_touch_slopes_are_taken_anew_every_few_iterations(
     for z in places:
         ask.derivative(z, COARSE)
         turned.append(ask.jacobian)
-    if not effects:
-        assert len(taken) == len(places)
-        return
-    assert len(taken) == -(-len(places) // _RENEWED)
+    assert len(taken) == {1: 4, 2: 2, 3: 2}[serve]
     moved = ask.white(ask.limits.x(places[1], ask.start)) - ask.white(ask.limits.x(places[0], ask.start))
-    np.testing.assert_allclose(turned[1] @ (places[1] - places[0]), moved, atol=1e-12)
+    along = abs(turned[1] @ (places[1] - places[0]) - moved).max()
+    assert (along < 1e-12) == (serve > 1)
     ask.derivative(places[-1] + 0.01, TINY)  # differences of another size are another question
     assert taken[-1] == TINY
+
+
+def test_a_fit_whose_slopes_turn_ends_where_it_should() -> None:
+    problem, under, flat = rugged()
+    found = fit(problem, under, flat, np.array([-1.5, 1.5]), 12, serve=TURNING)
+    np.testing.assert_allclose(found.x, [0.6, -0.4], atol=0.02)
 
 
 @pytest.mark.parametrize("rough", [True, False])

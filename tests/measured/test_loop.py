@@ -55,7 +55,7 @@ def test_an_effect_that_comes_to_nothing_on_all_logs_is_dropped(
     closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever it gained when it was chosen; here the last test is made to say so."""
-    monkeypatch.setattr("nfc_gym.measured.loop.differs", lambda fitted, blocks, effect, level: False)
+    monkeypatch.setattr("nfc_gym.measured.final.differs", lambda fitted, blocks, effect, level: False)
     report = close_loop(closed.mapping, tmp_path / "out", seed=3, jobs=1)
     assert report["effects"] == []
     assert report["proposals"] == []

@@ -1,0 +1,111 @@
+"""The last fits of a run: the calibrated and the extended model on every segment that does not verify."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfc_gym.measured import marginal
+from nfc_gym.measured.contest import clusters
+from nfc_gym.measured.distances import Model
+from nfc_gym.measured.elsewhere import STARTS, hollows, resized
+from nfc_gym.measured.fit import Fit, differs, stand
+from nfc_gym.measured.halved import step_error
+from nfc_gym.measured.metric import Metric, metric
+from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.ranking import Round
+from nfc_gym.measured.run import Run
+from nfc_gym.measured.search import Found
+from nfc_gym.measured.settle import settle
+from nfc_gym.physics.effects.base import Effect
+from nfc_gym.physics.rollout import Plant
+
+Array = NDArray[np.float64]
+_NOTHING = 0.5  # of the chance that an effect without size would seem smaller: a median one of these is no effect
+
+
+def final_models(run: Run, found: Found, whole: Problem) -> tuple[Model, Fit, Array]:
+    """Calibrated and extended model refitted on every fit segment; what step and search leave open of the latter."""
+    assert found.rest is not None
+    last = found.rest.fitted
+    effects = bool(last.plant.effects)
+    # Psi alone began its way here from several places; its intervals are asked for only where there is nothing beside.
+    calibrated = extended = _settled(run, "calibrated", found.calibrated, whole, starts=1 if effects else STARTS)
+    if effects:
+        # What psi alone went to is another place for the same psi to begin.
+        psi = calibrated.x[: len(last.plant.space)]
+        extended = _settled(run, "extended", last, whole, (np.concatenate([psi, last.x[len(psi) :]]),))
+        if gone := [e for e in last.plant.effects if not differs(extended.fitted, clusters(whole), e, _NOTHING)]:
+            why = f"dropped {', '.join(e.id for e in gone)}: on all segments together its size comes to nothing"
+            run.say(why)
+            found.rounds.insert(len(found.rounds) - 1, Round([], 0.0, reason=why))  # the last one found nothing more
+            rest = _without(extended.fitted, gone)
+            extended = _settled(run, "extended, less", rest, whole) if rest.plant.effects else calibrated
+    unsure = np.hypot(step_error(whole, extended.under, extended.fitted), extended.unsure)
+    return Model(calibrated.plant, calibrated.x), extended.fitted, unsure
+
+
+def _without(fitted: Fit, gone: Sequence[Effect]) -> Fit:
+    """A model less some of its effects, the other parameters as they were; to begin a fit from."""
+    psi, thetas = fitted.plant.split(fitted.x)
+    pairs = [(e, t) for e, t in zip(fitted.plant.effects, thetas, strict=True) if not any(e is g for g in gone)]
+    plant = fitted.plant.with_effects([e for e, _ in pairs])
+    return replace(fitted, plant=plant, x=np.concatenate([psi, *(t for _, t in pairs)]))
+
+
+@dataclass
+class _Settled:
+    """A model on every fit segment, and (size,) what the search for its parameters leaves open.
+
+    Psi alone beside effects is asked for its parameters alone: noise and slopes are rolled out for who wants them.
+
+    Attributes:
+      whole: the segments.
+      plant, x: the model.
+      extra: (m,) slack of its metric.
+      unsure: (size,).
+      sigma: (S, m, m) noise of its metric; None: what it expects at `noisy` (size,).
+    """
+
+    whole: Problem
+    plant: Plant
+    x: Array
+    extra: Array
+    unsure: Array
+    sigma: Array | None
+    noisy: Array
+
+    @cached_property
+    def under(self) -> Metric:
+        """The metric that it was fitted under."""
+        sigma = self.whole.covariance(self.plant, self.noisy) if self.sigma is None else self.sigma
+        return metric(self.whole, sigma, self.extra)
+
+    @cached_property
+    def fitted(self) -> Fit:
+        """The model as it stands."""
+        return stand(self.whole, self.under, self.plant, self.x)
+
+
+def _settled(
+    run: Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = (), starts: int = STARTS
+) -> _Settled:
+    """Fit a model from where it stands and, where bodies touch, from other places (size,) or over drawn starts too."""
+    plant, stage, sigma = start.plant, f"final {name}", None
+    if run.stages.get(stage) is None:
+        run.say(f"fitting the {name} model on all {len(whole)} segments")
+        fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
+        if not whole.rough and (other := resized(whole, under, fitted)) is not fitted:
+            fitted, under, extra = settle(whole, whole.covariance(plant, other.x), plant, other.x)
+        if run.bench.short:
+            tick = lambda k: run.say(f"fitting the {name} model over drawn starts, turn {k} of {marginal.TURNS}")  # noqa: E731
+            ended = marginal.marginal(whole, under, fitted, run.seed, tick)
+        else:
+            tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
+            ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
+        run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "unsure": ended.unsure.tolist()})
+        sigma = ended.sigma
+    x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "unsure"))
+    return _Settled(whole, plant, x, extra, unsure, sigma, x if whole.rough else start.x)
