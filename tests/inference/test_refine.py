@@ -132,7 +132,7 @@ def test_it_is_this_windows_alone(learned: tuple[NeuralPosterior, Window, Rounds
     opened.given(window)
 
 
-def test_maps_and_residuals_are_refused() -> None:
-    window = seen([0.4, 0.55])
+def test_maps_and_residuals_are_refused(learned: tuple[NeuralPosterior, Window, Rounds]) -> None:
+    posterior, window, _ = learned
     with pytest.raises(InputError, match="it is psi that is learned anew"):
-        refine(coarse(), window, Own(window), HOW, network=replace(NETWORK, delta_s=True))
+        refine(posterior, window, Own(window), HOW, network=replace(NETWORK, delta_s=True))

@@ -34,7 +34,7 @@ def test_what_was_seen_of_one_side_is_known_of_the_other() -> None:
     told = []
     for given in (None, mirror):
         net = network(windows, density="mixture", components=2)
-        train(net, windows, held_out, TrainConfig(epochs=8, batch=64, rate=5e-3, warmup=10), mirror=given)
+        train(net, windows, held_out, TrainConfig(epochs=4, batch=64, rate=5e-3, warmup=10), mirror=given)
         told.append(float(gains(net, other).mean()))
     assert told[0] < 0 < told[1]  # without, it is sure of what it never saw
 

@@ -1,5 +1,6 @@
 """From a posterior in a file to one window's own, as `nfc-gym infer --refine` makes it."""
 
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from nfc_gym.simulate import Simulator, refined
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.repeated import Repeated
 
+refine = import_module("nfc_gym.inference.refine")  # the package has a function of that name
 ENVIRONMENT = "nfc_gym/JackalFlat-v0"
 SMALL = {"encoder": "nn", "width": 16, "features": 8, "hidden": 16, "depth": 1, "density": "mixture", "components": 2}
 
@@ -51,17 +53,17 @@ def seen() -> Window:
 
 
 def test_a_posterior_is_refined_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refined, "BEGINNINGS", 260)
+    monkeypatch.setattr(refined, "BEGINNINGS", 220)
+    monkeypatch.setattr(refine, "FRESH", 200)
     posterior, window = untrained(), seen()
     window.actions[3, 0] = 1.2  # of which the machine makes 1
     once = TrainConfig(epochs=1, batch=128, warmup=2, average=0.5)
     heard = Heard()
-    own = refined.refined(posterior, window, simulations=400, jobs=1, training=once, report=heard)
+    own = refined.refined(posterior, window, simulations=300, jobs=1, training=once, report=heard)
     told = [text for text in heard.said if text.endswith("windows simulated")]
-    assert told == [f"{130 * k} of 260 windows simulated" for k in (1, 2)] + 2 * [
-        f"{100 * k} of 200 windows simulated" for k in (1, 2)
-    ] + [f"{100 * k} of 500 windows simulated" for k in range(1, 6)]
-    assert own.notes == posterior.notes | {"refined": 400, "kept": pytest.approx(own.notes["kept"])}
+    beginnings, fresh = ([f"{n * k} of {2 * n} windows simulated" for k in (1, 2)] for n in (110, 100))
+    assert told == [*beginnings, *2 * ["150 of 150 windows simulated"], *fresh]
+    assert own.notes == posterior.notes | {"refined": 300, "kept": pytest.approx(own.notes["kept"])}
     assert 0.01 < own.notes["kept"] < 0.95  # the second of two rounds
     u = own.prior.u_of(own.sample(2000, np.random.default_rng(0)).psi)
     prior = posterior.given(window)
