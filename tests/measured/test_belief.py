@@ -52,13 +52,16 @@ def test_other_draws_make_another_run(closed: Closed, tmp_path: Path, monkeypatc
     """What lies in the folder of a run that was interrupted belongs to its posterior."""
     one, other = draws(tmp_path / "one.npz", DAMPING, 0.01), draws(tmp_path / "other.npz", DAMPING, 0.02)
 
+    class Stopped(Exception):
+        pass
+
     def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
+        raise Stopped
 
     monkeypatch.setattr("nfc_gym.measured.loop.calibrate", interrupted)
     run = partial(close_loop, closed.mapping, tmp_path / "out", seed=3, jobs=1)
     for _ in range(2):  # the second goes on
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(Stopped):
             run(posterior=one)
     for posterior in (other, None):
         with pytest.raises(InputError, match="holds an unfinished run on other inputs"):
