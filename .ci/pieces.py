@@ -33,8 +33,8 @@ ROOT = Path(__file__).parents[1]
 AT_ONCE = 2
 # Those that take longest, in order: begun last, they would be waited for.
 LONGEST = (
-    "tests/measured", "tests/adaptation", "tests/benchmarks", "tests/simulate", "tests/conformance", "check",
-    "tests/inference", "tests/wrappers", "tests/physics",
+    "tests/measured", "tests/adaptation", "tests/simulate", "tests/benchmarks", "check", "tests/inference",
+    "tests/conformance", "tests/wrappers", "tests/physics", "benchmarks/undeclared_effects", "benchmarks/anomaly",
 )  # fmt: skip
 
 Piece = Callable[[], int | str | None]  # what `sys.exit` takes
