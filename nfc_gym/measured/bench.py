@@ -20,6 +20,7 @@ from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.model import bare, compile_model, read_spec, registered
 from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.ripple import unrippled
 from nfc_gym.measured.segments import served, servos
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, estimate_states
@@ -175,7 +176,11 @@ def make_bench(dataset: Dataset, nthread: int = 0) -> Bench:
         if control.removeprefix("ctrl:") not in known:
             raise InputError(f"{control}: the model has no such actuator; it has: {', '.join(known) or 'none'}")
     plant = Plant(model, ParameterSpace(model, declared), nthread=nthread)
-    return Bench(dataset, spec, plant, {log.name: estimate_states(model, log) for log in dataset.logs})
+    states = {log.name: estimate_states(model, log) for log in dataset.logs}
+    if dataset.mapping.segments.mode == "rollout":  # which begin at a row; what a moment shows, its neighbours show too
+        laws, straight = servos(model, dataset.mapping.servo_laws), dataset.mapping.straight
+        states = {log.name: unrippled(model, log, states[log.name], laws, straight) for log in dataset.logs}
+    return Bench(dataset, spec, plant, states)
 
 
 def scales(bench: Bench, logs: Sequence[Log]) -> Scales:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core import InputError, Log
-from nfc_gym.measured.clock_checks import clock_offsets, shift_notes
+from nfc_gym.measured.clock_checks import clock_offsets, even_rows, shift_notes
 from nfc_gym.measured.dataset import Dataset, assemble, read_log
 from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order, parted
 from nfc_gym.measured.mapping import SPLITS, Mapping, load_mapping
@@ -79,7 +79,9 @@ def _logs(mapping: Mapping, path: Path, model: mujoco.MjModel | None) -> tuple[D
     whole: dict[str, str] = {}
     spoilt = 0
     for source in sources:
-        logs, defects, alignment = read_log(mapping, source)
+        logs, defects, alignment, even = read_log(mapping, source)
+        if even is not None:
+            found.append((source.name, even_rows(even)))
         if alignment is not None:
             found += [(source.name, s) for s in stream_notes(alignment)]
         for defect in defects:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.channels import parse_channel
-from nfc_gym.measured.findings import Finding
+from nfc_gym.measured.even import Evened
+from nfc_gym.measured.findings import Finding, Suspicion
 from nfc_gym.measured.offsets import Offset, clock_offset
 from nfc_gym.measured.smoothing import fresh_samples
 from nfc_gym.physics.state import quat_conjugate, quat_multiply, quat_to_vector, rotate, rotate_back
@@ -35,6 +36,15 @@ def shift_notes(shifts: Mapping[str, float]) -> Iterator[Finding]:
             way = "late" if shift > 0 else "early"
             message = f"its stamps are taken to be {1e3 * abs(shift):.4g} ms {way}, as its `shift` says"
             yield Finding("note", f"channels.{name}", message, "it is interpolated to the rows of the log")
+
+
+def even_rows(found: Evened) -> Suspicion:
+    """That stamps scatter, and what was taken for them."""
+    message = (
+        f"its stamps scatter by {1e3 * found.scatter:.2g} ms about rows {1e3 * found.interval:.4g} ms apart, and what "
+        f"was measured is {found.nearer:.2g} times nearer to smooth curves in even rows: these are taken for its times"
+    )
+    return Suspicion("note", "time", "even", message, "stamp the samples where they are taken")
 
 
 def clock_offsets(model: mujoco.MjModel | None, logs: Sequence[Log], shifts: Mapping[str, float]) -> Iterator[Finding]:

@@ -1,6 +1,7 @@
 """A mapping file and the logs it names, converted: SI units, quaternions scalar first, time from 0, splits assigned."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -13,6 +14,7 @@ from nfc_gym.measured.align import Alignment, Use, align, shifted, uses
 from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.columns import LogColumns, finite
 from nfc_gym.measured.entries import Measured, Servo
+from nfc_gym.measured.even import Evened, evened
 from nfc_gym.measured.log_time import require_no_streams, time_of
 from nfc_gym.measured.mapping import Mapping, Split, load_mapping
 from nfc_gym.measured.readers import Streams, Table, read_table
@@ -91,11 +93,13 @@ class Reading(NamedTuple):
         being used.
       defects: everything that does.
       alignment: how its streams were brought to one time; None where the file has one time for all columns.
+      evened: the even rows that were taken for its time stamps; None where these are taken as they are.
     """
 
     logs: list[tuple[Source, Log]]
     defects: list[Defect]
     alignment: Alignment | None = None
+    evened: Evened | None = None
 
 
 def load(path: Path | str) -> Dataset:
@@ -108,7 +112,7 @@ def load(path: Path | str) -> Dataset:
     mapping = load_mapping(path)
     read = []
     for source in find_logs(mapping, path.parent):
-        logs, defects, _ = read_log(mapping, source)
+        logs, defects, *_ = read_log(mapping, source)
         if defects:
             raise InputError("\n".join(f"{source.path}: {p.where}: {p.text}" for p in defects))
         read += logs
@@ -163,7 +167,10 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
         if columns.rows or _counted(columns, names):
             _parts(mapping, columns, alignment, defects)  # what is wrong with the other columns is told with it
         return Reading([], defects, alignment)
+    even = None
     if alignment is None:
+        even = _evened(mapping, columns, time)
+        time = time if even is None else even.time
         moved = _shifted(mapping, table, time, used, defects)
         if moved is None:
             return Reading([], defects)
@@ -175,7 +182,19 @@ def read_log(mapping: Mapping, source: Source) -> Reading:
     name, group, condition = source.name, source.group, source.condition
     log = defects.attempt("log", lambda: Log(name=name, time=time, group=group, condition=condition, **parts))
     logs = None if log is None else defects.attempt("time", lambda: list(stretches(mapping, source, log)))
-    return Reading(logs or [], defects, alignment)
+    return Reading(logs or [], defects, alignment, even)
+
+
+def _evened(mapping: Mapping, columns: LogColumns, time: Array) -> Evened | None:
+    """Even rows in place of scattering stamps, told by the channels that are renewed at every row."""
+    if mapping.time.interval is not None:
+        return None
+    measured = []
+    for entry in mapping.channels.values():
+        with suppress(InputError):  # what is wrong with a column is told where it is used
+            if entry.rate is None:
+                measured.append(columns.many(entry.columns))
+    return evened(time, measured)
 
 
 def _counted(columns: LogColumns, names: list[str]) -> bool:

@@ -70,18 +70,27 @@ def estimate_noise(values: Array) -> float:
     """Standard deviation of white noise on a smooth signal (N,) or (N, k), from the spread of its third differences.
 
     Third differences of white noise have 20 times its variance while a smooth signal hardly shows in them. The median
-    absolute value ignores the instants where the signal is not smooth. Never less than what a quantised signal's step
-    implies.
+    absolute value ignores the instants where the signal is not smooth. An encoder's differences are whole steps, of
+    which the median is one or the next: it lies within the step that holds it, as of grouped data. Never less than what
+    a quantised signal's step implies.
     """
     columns = values.reshape(len(values), -1)
     if len(columns) < 8:
         return 0.0
-    third = np.diff(columns, 3, axis=0)
-    noise = 1.4826 * np.median(np.abs(third)) / np.sqrt(20)
+    third = np.abs(np.diff(columns, 3, axis=0))
     steps = np.abs(np.diff(columns, axis=0))
     moved = steps[steps > 0]
-    quantum = float(moved.min()) / np.sqrt(12) if moved.size else 0.0
-    return float(max(noise, quantum))
+    quantum = float(moved.min()) if moved.size else 0.0
+    noise = 1.4826 * _grouped_median(third, quantum) / np.sqrt(20)
+    return float(max(noise, quantum / np.sqrt(12)))
+
+
+def _grouped_median(sizes: Array, width: float) -> float:
+    """Median of sizes >= 0 that were rounded to multiples of a width: where in its group half of them are reached."""
+    middle = float(np.median(sizes))
+    low, high = max(middle - width / 2, 0.0), middle + width / 2
+    below, within = float((sizes < low).mean()), float(((sizes >= low) & (sizes < high)).mean())
+    return low + (high - low) * min(max(0.5 - below, 0.0) / within, 1.0) if within > 0 else middle
 
 
 def moving_average(values: Array, samples: int, mask: NDArray[np.bool_] | None = None) -> Array:
