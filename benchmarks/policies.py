@@ -163,8 +163,9 @@ def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tab
     """All cells that there are or are asked for."""
     cells = tables.Cells()
     points, judged = (2, 2) if args.quick else (10, 32)
+    home, watched = (40, 100) if args.quick else (Budget.home, Budget.watched)
     budget = Budget(args.envs, args.steps, args.budget, args.executed, judged, points, args.threads, args.device,
-                    args.ratio, 40 if args.quick else Budget.home)  # fmt: skip
+                    args.ratio, home, watched)  # fmt: skip
     for table, world, task, seed in asked(args):
         left_out = REFERENCES if args.beside else (*ADAPTED, "oracle") if args.quick and table == "III" else ()
         for method in [m for m in args.methods if m not in left_out]:

@@ -38,6 +38,7 @@ class Budget:
       device: of the networks.
       ratio: updates of TD-MPC2 a control step in the true world; the published one is 1.
       home: episodes at home, by which it is known what the policy earned before.
+      watched: control steps of each robot at home that a detector is made of, where none is given.
     """
 
     envs: int = 1024
@@ -50,6 +51,7 @@ class Budget:
     device: str = "cpu"
     ratio: float = 1.0
     home: int = 64
+    watched: int = 750
 
 
 @dataclass

@@ -176,7 +176,9 @@ def nfc(**config: Any) -> Make:
 
         posterior = inference(job)
         policy, budget = opened(job.nominal, job.budget.device), job.budget
-        detector = job.detector or watcher(policy, job.world, job.seed, nthread=job.budget.threads, **job.settings)
+        detector = job.detector or watcher(
+            policy, job.world, job.seed, budget.watched, nthread=budget.threads, **job.settings
+        )
         home = earned_at_home(
             policy, job.world, job.seed, budget.home, EPISODE, nthread=job.budget.threads, **job.settings
         )

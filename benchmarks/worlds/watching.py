@@ -104,7 +104,7 @@ class Lasting:
 
 
 def windows(
-    policy: Policy, env: VectorEnv, size: int, seed: int, steps: int = 750
+    policy: Policy, env: VectorEnv, size: int, seed: int, steps: int
 ) -> list[tuple[Array, Array]]:  # fmt: skip
     """Of each robot's first episode the windows (n, HORIZON + 1, s) of `proprio` and (n, HORIZON, a) of actions.
 
@@ -133,13 +133,16 @@ def windows(
     return [(s, a) for s, a in found if len(s)]
 
 
-def watcher(policy: Policy, world: World, seed: int, **settings: Any) -> Lasting:
-    """A detector for a world's robot and policy; the sensors' noise is known at home, what is hidden is not."""
+def watcher(policy: Policy, world: World, seed: int, steps: int = 750, **settings: Any) -> Lasting:
+    """A detector for a world's robot and policy, of `steps` of each of some robots at home.
+
+    The sensors' noise is known at home, what is hidden is not.
+    """
     at_home = World(world.place, "nominal", world.seed, engine=world.engine)
     robots: list[tuple[Array, Array]] = []
     for k in range(ROUNDS):
         env = seen_by(policy, at_home, ROBOTS, **settings)
-        robots += windows(policy, env, world.kind.proprio_size, seed + k * ROBOTS)
+        robots += windows(policy, env, world.kind.proprio_size, seed + k * ROBOTS, steps)
         if len(robots) >= 2 * wanted(RATE):
             break
     half = min(len(robots) // 2, ROBOTS // 2)

@@ -127,7 +127,7 @@ def test_robots_that_crash_at_once_leave_a_watcher_enough_others(
 
     seeds: list[int] = []
 
-    def crashing(policy: Any, env: Any, size: int, seed: int) -> list[Any]:
+    def crashing(policy: Any, env: Any, size: int, seed: int, steps: int) -> list[Any]:
         env.close()
         seeds.append(seed)
         rng = np.random.default_rng(seed)
