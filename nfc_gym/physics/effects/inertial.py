@@ -19,14 +19,28 @@ from nfc_gym.physics.state import quat_multiply, rotate_back
 _NO_MASS = 1e-9  # kg: a lighter lump has no place
 _REACHES = (0.8, 0.4, 0.2, 0.1, 0.05)  # of the way to the edge of where a lump may lie: where fits start
 _GROWTH = (1.0, 2.0, 4.0)  # of the moments: what a straight line says of them is too little where bodies touch
+_TURNING = 1  # a simple body that may turn; of one that only slides, 2, the place of its mass does nothing
 _SWEEPS = 6  # cyclic Jacobi on 3 x 3 converges quadratically; six sweeps reach the last bit
 
 
 def complete_inertia(spec: mujoco.MjSpec) -> None:
-    """Compile all bodies of a spec without the "simple body" short cut, so that centres of mass may move afterwards."""
+    """Compile the bodies of a spec without the "simple body" short cut, so that centres of mass may move afterwards.
+
+    Those that only slide keep it: they hide where their mass is, and MuJoCo makes what touches or couples them softer
+    or harder by whether they have it (of a body that slides along one axis, it takes a third of the mobility without).
+    """
     for body in spec.bodies:
-        if body.name != "world":
+        if body.name != "world" and _turns(body):
             body.simple = 0
+
+
+def _turns(body: mujoco.MjsBody) -> bool:
+    """Whether a joint turns a body or one that carries it; so it counts, too, where none moves it."""
+    joints = []
+    while body.name != "world":
+        joints += body.joints
+        body = body.parent
+    return not joints or any(j.type != mujoco.mjtJoint.mjJNT_SLIDE for j in joints)
 
 
 def principal(matrix: Array) -> tuple[Array, Array]:
@@ -82,7 +96,7 @@ def turns(model: mujoco.MjModel, name: str) -> bool:
 def _complete(model: mujoco.MjModel) -> list[str]:
     """Moving bodies whose centre of mass may be moved (see `complete_inertia`)."""
     names = moving_bodies(model)
-    return [n for n, b in zip(names, body_ids(model, names), strict=True) if not model.body_simple[b]]
+    return [n for n, b in zip(names, body_ids(model, names), strict=True) if model.body_simple[b] != _TURNING]
 
 
 class Moved(Effect):
@@ -93,7 +107,7 @@ class Moved(Effect):
 
     def _refuse_simple(self, model: mujoco.MjModel) -> None:
         for name, body in zip(self.where, self.bodies, strict=True):
-            if model.body_simple[body]:
+            if model.body_simple[body] == _TURNING:
                 raise InputError(
                     f"{self.family} at body {name!r}: the model was compiled with MuJoCo's simple-body "
                     "short cut, which fixes the centre of mass; compile it with simple='false' "
@@ -164,13 +178,19 @@ def add_point_mass(fields: ModelFields, body: int, mass: Array, place: Array) ->
 
     About the common centre the two add mu (|d|^2 1 - d d'), mu the reduced mass and d the way from the old centre. What
     holds a body up against gravity (`gravcomp`, a share of its weight) does not grow with what is put on it; MuJoCo
-    has it act at the common centre.
+    has it act at the common centre. Of a simple body, which only slides, the mass alone counts.
     """
-    masses, iposes = fields["body_mass"], fields["body_ipos"]
-    inertias, iquats = fields["body_inertia"], fields["body_iquat"]
-    old, quat = masses[..., body], iquats[..., body, :]
+    masses = fields["body_mass"]
+    old = masses[..., body].copy()
     whole = old + mass
     share = (mass / np.where(whole > 0, whole, 1.0))[..., None]  # nothing that is put on nothing lies nowhere
+    masses[..., body] = whole
+    if fields.nominal_model.body_gravcomp[body]:
+        fields["body_gravcomp"][..., body] *= 1 - share[..., 0]
+    if fields.nominal_model.body_simple[body]:
+        return
+    iposes, inertias, iquats = fields["body_ipos"], fields["body_inertia"], fields["body_iquat"]
+    quat = iquats[..., body, :]
     d = rotate_back(quat, place - iposes[..., body, :])
     reduced = (share[..., 0] * old)[..., None, None]
     outer = d[..., :, None] * d[..., None, :]
@@ -181,9 +201,6 @@ def add_point_mass(fields: ModelFields, body: int, mass: Array, place: Array) ->
     iposes[..., body, :] += share * (place - iposes[..., body, :])
     iquats[..., body, :] = quat_multiply(quat, turn)
     inertias[..., body, :] = moments
-    masses[..., body] = old + mass
-    if fields.nominal_model.body_gravcomp[body]:
-        fields["body_gravcomp"][..., body] *= 1 - share[..., 0]
 
 
 class ComShift(Moved):
