@@ -20,7 +20,7 @@ from nfc_gym.measured.signal_checks import suspicions
 from nfc_gym.measured.speed_checks import clock_unit
 from nfc_gym.measured.splits import Source, find_logs
 from nfc_gym.measured.stream_checks import stream_notes
-from nfc_gym.physics.quiet import no_warnings
+from nfc_gym.physics.quiet import compiled, no_warnings
 
 __all__ = ["Finding", "check", "examine", "require"]
 
@@ -58,6 +58,7 @@ def examine(dataset_path: Path | str) -> tuple[Dataset | None, list[Finding]]:
     try:
         spec = read_spec(mapping.model_file, path.parent)
         model = compile_model(spec, mapping.model_file)
+        findings += [Finding("note", "model", *parted(remark)) for remark in compiled(spec)[1]]
         findings += model_findings(mapping, spec, model)
     except InputError as e:
         findings.append(_finding("model", str(e).removeprefix("model ")))

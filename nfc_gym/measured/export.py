@@ -23,6 +23,7 @@ from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.physics.effects.timing import command_limits
 from nfc_gym.physics.fields import ModelFields
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
+from nfc_gym.physics.quiet import compiled
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
@@ -119,8 +120,8 @@ def corrected(
         numeric = next((n for n in spec.numerics if n.name == mark), None) or spec.add_numeric(name=mark, size=len(at))
         numeric.data = at
     told = mend(spec, model)
-    _settle_keys(spec, spec.compile(), keys)
-    spec.compile()
+    _settle_keys(spec, compiled(spec)[0], keys)
+    compiled(spec)
     if told:
         spec.comment = "\n".join(filter(None, [spec.comment, *told]))
     text = spec.to_xml() if folder is None else asset_files.relative(spec.to_xml(), folder)

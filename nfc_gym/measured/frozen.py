@@ -3,6 +3,8 @@
 import mujoco
 import numpy as np
 
+from nfc_gym.physics.quiet import compiled
+
 _INFERRED = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
 _AFFINE = mujoco.mjtBias.mjBIAS_AFFINE
 
@@ -20,7 +22,7 @@ def freeze(spec: mujoco.MjSpec) -> mujoco.MjModel:
     Raises:
       ValueError: the spec does not compile.
     """
-    model = spec.compile()
+    model = compiled(spec)[0]
     for actuator in spec.actuators:
         _freeze_actuator(actuator, model)
     for joint in spec.joints:
@@ -33,7 +35,7 @@ def freeze(spec: mujoco.MjSpec) -> mujoco.MjModel:
         tendon.springlength = model.tendon_lengthspring[tendon.id]
     if _recomputes_inertia(spec.compiler):
         freeze_inertia(spec, model)
-    return spec.compile()
+    return compiled(spec)[0]
 
 
 def _freeze_actuator(actuator: mujoco.MjsActuator, model: mujoco.MjModel) -> None:

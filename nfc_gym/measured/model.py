@@ -10,6 +10,7 @@ from nfc_gym import assets
 from nfc_gym.core import InputError
 from nfc_gym.physics.effects.lookup import one_command_each
 from nfc_gym.physics.names import name_all, names
+from nfc_gym.physics.quiet import compiled
 
 
 def registered(name: str) -> str | None:
@@ -66,7 +67,7 @@ def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
         text, has the flag `ipc`, or an actuator with several commands.
     """
     try:
-        model = spec.compile()
+        model = compiled(spec)[0]
     except (ValueError, mujoco.FatalError) as e:
         raise InputError(f"model {name}: does not compile: {_one_line(e)}") from None
     try:

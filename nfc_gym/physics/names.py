@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import mujoco
 
 from nfc_gym.physics.fields import names_of
+from nfc_gym.physics.quiet import compiled
 
 _OBJ = mujoco.mjtObj
 
@@ -42,7 +43,7 @@ def name_all(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     Raises:
       ValueError: the model does not compile.
     """
-    called = names(spec.compile())  # which also tells each its id
+    called = names(compiled(spec)[0])  # which also tells each its id
     for objects, wanted in (
         (spec.actuators, called.actuators),
         (spec.joints, called.joints),

@@ -1,6 +1,7 @@
-"""MuJoCo's warnings, kept to itself where simulations that come apart are expected and counted."""
+"""MuJoCo's warnings, kept to itself: of simulations that come apart and are counted, of models compiled repeatedly."""
 
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -31,3 +32,15 @@ def no_warnings() -> Iterator[None]:
             _inside -= 1
             if not _inside:
                 mujoco.set_mju_user_warning(_handler)
+
+
+def compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, list[str]]:
+    """A model, and what MuJoCo remarked as it compiled it, each once: of old attributes, say, it warns every time.
+
+    Raises:
+      ValueError: it does not compile.
+    """
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        model = spec.compile()
+    return model, list(dict.fromkeys(str(w.message) for w in said))

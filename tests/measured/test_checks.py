@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from nfc_gym.core import InputError
 from nfc_gym.measured.checks import check, require
 from nfc_gym.measured.findings import parted
+from tests.measured import arm
 
 Build = Any
 DEGREES = 180 / np.pi
@@ -57,6 +59,18 @@ def errors(path: Path) -> list[str]:
 
 def test_a_sound_data_set_has_no_findings(build: Build) -> None:
     assert check(build()) == []
+
+
+def test_what_mujoco_remarks_on_a_model_is_told_once(tmp_path: Path) -> None:
+    """And not as a warning of Python's at each of the times that it is compiled."""
+    path = arm.machine(tmp_path)
+    model = tmp_path / "arm.xml"
+    model.write_text(model.read_text().replace("<compiler ", '<compiler settotalmass="0.5" '))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (remark,) = (f for f in check(path) if f.where == "model")
+    assert remark.severity == "note"
+    assert "'settotalmass' is deprecated" in remark.message
 
 
 def test_what_comes_apart_is_not_told_by_mujoco(
