@@ -36,6 +36,7 @@ ALLOWED: dict[str, set[str]] = {
         "simulate",
         "adaptation",
     },
+    "__main__": {"cli"},
     "": {"core", "envs", "inference"},
 }
 # package -> all that it may import from outside the standard library
