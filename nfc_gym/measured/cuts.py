@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 _STEP, _SHARE = 8.0, 0.02  # times its usual change from row to row, and of its range, from which a command steps
 _AROUND = 3  # rows on either side of a start from which its state is estimated
 _SETTLED = 0.05  # s after a step in which late drives may still pass it on
+_LATE = 0.1  # s by which a drive may well be late, or for which it lags
+_IDLE = 0.1  # of their usual change, below which commands rest
 _SPARSE = 2.0  # times as far apart as usual that the samples that tell a state may lie
 _PUT_OFF = 0.5  # of a stride, at most, by which a start is put off
 
@@ -31,8 +33,8 @@ class Layout:
       stride: s between starts; the length where segments follow each other.
       dt: physics step, s.
       put_off: whether a start waits until no command steps beside it; not where states are known and not estimated.
-      unknown: s from a log's beginning in which commands before it, of which it does not tell, are still felt; no
-        segment starts there, short of half the log.
+      unknown: s from a log's beginning in which commands before it, of which it does not tell, are still felt by the
+        model; no segment starts there, short of half the log. Nor while a late drive may be at them (`_unknown`).
     """
 
     length: float
@@ -79,6 +81,21 @@ def _calm(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     rows, settled = np.flatnonzero(_stepped(log)), round(_SETTLED / log.interval)
     near, late = (_between(len(log), rows - _AROUND + 1, rows + _AROUND + more) for more in (0, settled))
     return ~near, ~late
+
+
+def _unknown(log: Log, layout: Layout) -> float:
+    """S from a log's beginning in which commands before it may still be felt.
+
+    Of a machine that is logged in mid motion nobody knows what it was told last, and a drive that is late does that
+    after the log has begun: a start there belies a delay that is as true as can be. Where commands rest as the log
+    begins they will have rested before.
+    """
+    if log.inputs.time[0] < log.time[0] or not layout.put_off:
+        return 0.0
+    late, rows = min(_LATE, layout.history), log.time[1:] - log.time[0] <= _LATE + 1e-9
+    change = [np.abs(np.diff(values)) for values in log.controls.values()]
+    moving = any(c[rows].mean() > _IDLE * c.mean() for c in change if rows.any())
+    return max(layout.unknown, late) if moving else layout.unknown
 
 
 def _between(size: int, first: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -139,8 +156,7 @@ def _starts(log: Log, layout: Layout, last: float) -> Iterator[int]:
     A start near which a command steps is put off to where its state can be told (`Layout.put_off`), and those behind it
     with it. So is one in a stretch that is masked, however long that is, unless every start of the log would be.
     """
-    calm, told = _calm(log), log.inputs.time[0] < log.time[0]
-    late = 0.0 if told or not layout.put_off else min(layout.unknown, max(last, 0.0) / 2)
+    calm, late = _calm(log), min(_unknown(log, layout), max(last, 0.0) / 2)
     seen = _seen(log)
     if not layout.put_off or not (seen & (log.time <= last + 1e-9)).any():
         seen[:] = True

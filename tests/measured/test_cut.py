@@ -63,6 +63,18 @@ def test_no_start_lies_where_commands_before_the_log_are_felt() -> None:
     np.testing.assert_array_equal(cut([part], late).start, cut([part], LAYOUT).start)
 
 
+def test_no_start_lies_where_a_late_drive_is_at_commands_of_before_the_log() -> None:
+    """In the first tenth of a second, where commands move as the log begins and effects may remember."""
+    remembers, time = replace(LAYOUT, history=0.5), 0.01 * np.arange(201)
+    for rest, first in ((0.0, 10), (0.15, 0)):
+        one = replace(log(0.01, 201), controls={"ctrl:motor": np.sin(3 * np.maximum(time - rest, 0.0))})
+        np.testing.assert_array_equal(cut([one], remembers).start, first + 40 * np.arange(5 if rest else 4))
+        assert cut([one], LAYOUT).start[0] == 0
+        assert cut([one], replace(remembers, put_off=False)).start[0] == 0
+        part = one.part(100, 201, "run@verify")
+        assert cut([part], remembers).start[0] == 0
+
+
 def stepping(interval: float = 0.01, rows: int = 240, every: float = 0.4, until: float = np.inf) -> Log:
     time = interval * np.arange(rows)
     goal = np.where(time < until, np.floor(time / every + 1e-9) % 2, 0.0)
