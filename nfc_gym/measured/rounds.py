@@ -175,7 +175,7 @@ class Contest:
             outcome.ranking = ranked(outcome.ranking, [arena.row(j) for j in mimics])
             best = self._choice.simplest(believed := [j for j in judged if self._believed(j)])
         if rivals := self._rivals(best, judged):
-            duel = self._at_half([best, *rivals])
+            duel = self._at_half([best, *rivals, *self._places(best, judged)])
             # Their families' other forms were judged at the whole step alone, and lost to these there.
             families = {arena.new(j)[0].family for j in duel}
             judged = [*duel, *(j for j in judged if arena.new(j)[0].family not in families)]
@@ -279,6 +279,19 @@ class Contest:
             if not contains(laws[0], new[0]) and not contains(new[0], laws[0]):
                 near.setdefault(laws[0].family, j)
         return list(near.values())[:_DUELS]
+
+    def _places(self, best: Judged, judged: Sequence[Judged]) -> list[Judged]:
+        """The same law as the one about to be accepted, at other places where it does as well: coupled joints share it.
+
+        What its family did at other places at the whole step alone is forgotten where it meets its rivals at half.
+        """
+        arena, law = self.arena, self.arena.new(best)[0]
+
+        def elsewhere(j: Judged) -> bool:
+            one, *more = arena.new(j)
+            return not more and one.family == law.family and set(one.where) != set(law.where)
+
+        return [j for j in judged if elsewhere(j) and arena.ties(best, j, priced=False)][:_DUELS]
 
     def _at_half(self, duel: Sequence[Judged]) -> list[Judged]:
         """Candidates with the gains that they have at half the physics step, best first.

@@ -22,6 +22,7 @@ from nfc_gym.measured.contest import (
 from nfc_gym.measured.fit import Fit
 from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.rounds import Contest
 from nfc_gym.measured.screen import Screened, likeness
 from nfc_gym.physics.effects import FAMILIES
@@ -439,6 +440,38 @@ def test_who_comes_near_the_best_meets_it_again_at_half_the_step() -> None:
     assert duel[0].fitted is lag.fitted  # the search goes on at the whole step
     contest.rough = False
     assert contest._rivals(best, judged) == []
+
+
+def test_the_same_law_at_a_place_where_it_does_as_well_comes_to_half_the_step_too() -> None:
+    """Of two coupled jaws friction at one alone; what is clearly worse there, and values of their own, stay away."""
+    best, one, worse = (
+        rated("coulomb", 100.0, ("l", "r")),
+        rated("coulomb", 99.0, ("l",)),
+        rated("coulomb", 90.0, ("r",)),
+    )
+    apart, other = rated("coulomb", 99.0, ("l", "r")), rated("hysteresis", 98.0, ("l",))
+    met: list[str] = []
+
+    def again(j: Judged) -> Judged:
+        met.append(arena.label(j))
+        return j
+
+    arena: Any = SimpleNamespace(
+        fit_data=SimpleNamespace(problem=SimpleNamespace(rough=True)),
+        new=lambda j: j.fitted.plant.effects,
+        ties=lambda best, j, priced: j.total > 0.95 * best.total,
+        halved=lambda: SimpleNamespace(enter_halved=again),
+        label=lambda j: j.fitted.plant.effects[0].id,
+        row=lambda j: {"id": j.fitted.plant.effects[0].id},
+    )
+    contest = Contest(arena, SimpleNamespace(), [], 8, 0.02)  # pyright: ignore[reportArgumentType]
+    contest._mimics, contest._believed = (lambda *_: []), (lambda j: True)  # type: ignore[method-assign]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Choice, "simplest", lambda self, believed: believed[0])
+        judged = [best, one, apart, other, worse]
+        _, left, _ = contest._challenged(Round([], 0.0), judged, judged)
+    assert met == ["coulomb:l+r", "hysteresis:l", "coulomb:l"]
+    assert one in left
 
 
 def test_a_law_and_its_special_case_do_not_meet_again() -> None:
