@@ -134,7 +134,9 @@ def train(
     ] = False,
     mirror: Annotated[
         bool,
-        typer.Option(help="Show half of the windows in each mirror of the robot, as if they were more; not with --maps."),
+        typer.Option(
+            help="Show half of the windows in each mirror of the robot, as if they were more; not with --maps."
+        ),
     ] = True,
     noise: Annotated[
         float, typer.Option(metavar="FACTOR", min=0, help="Times the sensor noise that the windows' manifest assumes.")
