@@ -158,6 +158,7 @@ def _effect(effect: Row, effects: Sequence[Row]) -> Row:
     rows = []
     for name, p in (effect.get("parameters") or {}).items():
         value, span = wording.interval(p.get("value"), p.get("low"), p.get("high"))
+        span = "given" if p.get("given") else span
         what, at, place = str(name).partition("@")
         label = what.replace("_", " ") + (f" at {place}" if at else "")
         rows.append({"name": label, "value": value, "interval": span, "unit": p.get("unit")})

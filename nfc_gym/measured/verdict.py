@@ -223,7 +223,10 @@ def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any
 
 
 def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[str, float]) -> list[dict[str, Any]]:
-    """Accepted effects with sentences, intervals and equivalents; sd (size,) of all parameters."""
+    """Accepted effects with sentences, intervals and equivalents; sd (size,) of all parameters.
+
+    A parameter that only sets a unit is `given`: its low and high are what it may be, and no interval.
+    """
     at = len(fitted.plant.space)
     equivalents = {i: r.rivals(i) for r in rounds for i in r.accepted}
     rows = []
@@ -247,6 +250,7 @@ def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[st
                         "low": float(max(p.low, t - 1.96 * s)),
                         "high": float(min(p.high, t + 1.96 * s)),
                         "unit": p.unit,
+                        **({"given": True} if p.given else {}),
                     }
                     for p, t, s in zip(effect.params, theta, own, strict=True)
                 },

@@ -4,6 +4,7 @@ import copy
 import math
 import re
 from importlib import resources
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,10 @@ from reports import EVIL, effect, errors, example, pictures, read, summary
 
 from nfc_gym.measured import story, wording
 from nfc_gym.measured.report import render, render_summary
+from nfc_gym.measured.verdict import effect_rows
+from nfc_gym.physics.effects import FAMILIES
+from nfc_gym.physics.effects.command import SupplySag
+from nfc_gym.physics.effects.places import sized
 
 SECTIONS = ("effects", "errors", "traces", "misfit", "candidates", "parameters", "identifiability", "noise", "glossary")
 
@@ -157,6 +162,22 @@ def test_one_missing_value_spoils_only_its_own_cell() -> None:
     text = read(render(report, pictures())).text
     assert "0.00410 rad" in text
     assert "20.000" in text
+
+
+def test_a_number_that_only_sets_a_unit_has_no_interval() -> None:
+    """The voltage at which a sagging supply changes nothing is given; free, it would be a gain by another name."""
+    volts = 23.3
+    narrow = {"low": 0.999 * volts, "high": 1.001 * volts, "probes": (volts,)}
+    sag = FAMILIES["supply_sag"](("winch",), sized(SupplySag.PARAMS, reference=narrow))
+    x = np.array([0.99, 1.001 * volts])
+    plant = SimpleNamespace(space=[], effects=[sag], split=lambda x: (x[:0], [x]))
+    (row,) = effect_rows(SimpleNamespace(plant=plant, x=x), [], np.array([0.005, 1.0]), {})  # type: ignore[arg-type]
+    numbers = row["parameters"]
+    assert numbers["reference"]["given"]
+    assert "given" not in numbers["exponent"]
+    page = read(render(example() | {"effects": [row]}, pictures()))
+    assert "given" in page.text
+    assert "23.277 to 23.323" not in page.text
 
 
 def test_an_empty_report_still_makes_a_page() -> None:
