@@ -93,37 +93,39 @@ def _push(model: mujoco.MjModel, log: Log, states: States, size: Array) -> Array
     """
     out = np.zeros((model.nv, model.nu))
     rows = np.unique(np.linspace(0, len(log) - 1, _MOMENTS).astype(int))
-    free, damped = (_stepper(model, log.interval, each) for each in ("euler", "implicitfast"))
+    free, damped = (_Row(model, log.interval, each) for each in ("euler", "implicitfast"))
     ctrl = np.zeros((len(log), model.nu))
     for key, values in log.controls.items():
         if key not in log.servo:
             ctrl[:, mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, key.removeprefix("ctrl:"))] = values
-    for u in np.flatnonzero(size > 0):
-        for row in rows:
+    for row in rows:
+        as_told = [m.after(states, row, ctrl[row]) for m in (free, damped)]
+        for u in np.flatnonzero(size > 0):
             up = ctrl[row].copy()
             up[u] += size[u]
-            first, last = (_after(m, states, row, up) - _after(m, states, row, ctrl[row]) for m in (free, damped))
+            first, last = (m.after(states, row, up) - was for m, was in zip((free, damped), as_told, strict=True))
             out[:, u] += _share(first, last) / size[u] / len(rows)
     return out
 
 
-def _stepper(model: mujoco.MjModel, dt: float, integrator: str) -> mujoco.MjModel:
+class _Row:
     """The model with a step as long as a row, and nothing that it could touch."""
-    out = copy.copy(model)
-    out.opt.timestep = dt
-    kind = mujoco.mjtIntegrator
-    out.opt.integrator = int(kind.mjINT_EULER if integrator == "euler" else kind.mjINT_IMPLICITFAST)
-    flags = mujoco.mjtDisableBit
-    out.opt.disableflags |= int(flags.mjDSBL_CONSTRAINT) | int(flags.mjDSBL_EULERDAMP)
-    return out
 
+    def __init__(self, model: mujoco.MjModel, dt: float, integrator: str) -> None:
+        self._model = copy.copy(model)
+        kind, flags, opt = mujoco.mjtIntegrator, mujoco.mjtDisableBit, self._model.opt
+        opt.timestep = dt
+        opt.integrator = int(kind.mjINT_EULER if integrator == "euler" else kind.mjINT_IMPLICITFAST)
+        opt.disableflags |= int(flags.mjDSBL_CONSTRAINT) | int(flags.mjDSBL_EULERDAMP)
+        self._data = mujoco.MjData(self._model)  # one for all rows: to make it takes longer than the step
 
-def _after(model: mujoco.MjModel, states: States, row: int, ctrl: Array) -> Array:
-    """(nv,) speeds one step later."""
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:], data.ctrl[:] = states.qpos[row], states.qvel[row], ctrl
-    mujoco.mj_step(model, data)
-    return np.asarray(data.qvel).copy()
+    def after(self, states: States, row: int, ctrl: Array) -> Array:
+        """(nv,) speeds one step later."""
+        data = self._data
+        mujoco.mj_resetData(self._model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = states.qpos[row], states.qvel[row], ctrl
+        mujoco.mj_step(self._model, data)
+        return np.asarray(data.qvel).copy()
 
 
 def _share(free: Array, damped: Array) -> Array:
