@@ -282,7 +282,7 @@ def _arguments() -> argparse.Namespace:
         help="windows that are replayed, or whose maps are drawn (default %(default)s)")  # fmt: skip
     add("--ceiling-windows", type=count(1), default=8, help="that a ceiling is the mean of (default %(default)s)")
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
-    parser.add_argument("--mirror", action="store_true", help="show half of the windows of each step in a mirror")
+    parser.add_argument("--mirror", action="store_true", help="show half of each step's windows in each mirror")
     args = parser.parse_args()
     if args.quick:
         args.windows, args.methods, args.inputs, args.gpus = ["JackalFlat=256"], ["mdn-rff"], ["summaries"], ["cpu"]

@@ -229,7 +229,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--mirror",
         action="store_true",
-        help="show half of each step's windows in a mirror; sbi's methods see none",
+        help="show half of each step's windows in each mirror of the robot; sbi's methods see none",
     )
     parser.add_argument(
         "--jobs", type=count(0), default=0, help="processes of the simulation; default 0 takes all cores"

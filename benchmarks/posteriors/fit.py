@@ -35,7 +35,7 @@ class Plan(NamedTuple):
       rate: step size.
       draws: of noise a window and step, of score models.
       small: networks of a toy's size.
-      mirror: whether half of the windows of each step are shown in a mirror; no peer's are, and none with maps.
+      mirror: whether half of the windows of each step are shown in each mirror; no peer's are, and none with maps.
     """
 
     epochs: int

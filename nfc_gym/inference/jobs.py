@@ -101,7 +101,7 @@ def train_posterior(
       device: `auto`, `cpu`, `cuda`.
       report: is told of the progress.
       noise: what multiplies the sensor noise that the windows' manifest assumes, for sensors that are better or worse.
-      mirror: of the windows' robot, which half of the windows of each step are shown in; None shows all as they are. So
+      mirror: in whose mirrors half of the windows of each step are shown, each; None shows all as they are. So
         are windows with maps, and those of a proposal, whose mirror images nobody proposed.
 
     Raises:

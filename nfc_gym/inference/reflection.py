@@ -81,6 +81,10 @@ class Reflection:
     def __init__(self, mirrors: Sequence[Mirror]) -> None:
         self._images = [_Image(mirror) for mirror in mirrors]
 
+    def __len__(self) -> int:
+        """How many mirrors."""
+        return len(self._images)
+
     def to(self, device: torch.device) -> "Reflection":
         """The same on another device."""
         for image in self._images:

@@ -110,7 +110,7 @@ def train(
       report: is told of the progress.
       scales: whether those of the inputs are taken from `windows` first; a network that was trained before on other
         windows keeps its own, which its weights are made for.
-      mirror: shows half of the windows of each step in a mirror; None shows all as they are.
+      mirror: shows half of the windows of each step in each of its mirrors; None shows all as they are.
 
     Raises:
       InputError: windows that are not the network's, or that have maps where there is a mirror, no memory for the
@@ -192,7 +192,7 @@ class _Run:
         if not told and isinstance(self.given, TensorWindows):
             told = {"contents of the windows": self.given.contents}
         if self.mirror is not None:
-            config["mirror"] = True
+            config["mirror"] = len(self.mirror)
         return {
             "config": config, "network": self.network.config.to_dict(), "prior": self.network.prior.to_dict(),
             "windows": len(self.given), "held_out": len(self.held_out), "of": told,

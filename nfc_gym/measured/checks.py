@@ -13,14 +13,14 @@ from nfc_gym.measured.clock_checks import clock_offsets, even_rows, shift_notes
 from nfc_gym.measured.dataset import Dataset, assemble, read_log
 from nfc_gym.measured.findings import Finding, Suspicion, gather, in_order, parted
 from nfc_gym.measured.mapping import SPLITS, Mapping, load_mapping
-from nfc_gym.measured.model import compile_model, read_spec
+from nfc_gym.measured.model import compile_told, read_spec
 from nfc_gym.measured.model_checks import model_findings
 from nfc_gym.measured.sign_checks import turned_round
 from nfc_gym.measured.signal_checks import suspicions
 from nfc_gym.measured.speed_checks import clock_unit
 from nfc_gym.measured.splits import Source, find_logs
 from nfc_gym.measured.stream_checks import stream_notes
-from nfc_gym.physics.quiet import compiled, no_warnings
+from nfc_gym.physics.quiet import no_warnings
 
 __all__ = ["Finding", "check", "examine", "require"]
 
@@ -57,8 +57,8 @@ def examine(dataset_path: Path | str) -> tuple[Dataset | None, list[Finding]]:
     model: mujoco.MjModel | None = None
     try:
         spec = read_spec(mapping.model_file, path.parent)
-        model = compile_model(spec, mapping.model_file)
-        findings += [Finding("note", "model", *parted(remark)) for remark in compiled(spec)[1]]
+        model, remarks = compile_told(spec, mapping.model_file)
+        findings += [Finding("note", "model", *parted(remark)) for remark in remarks]
         findings += model_findings(mapping, spec, model)
     except InputError as e:
         findings.append(_finding("model", str(e).removeprefix("model ")))

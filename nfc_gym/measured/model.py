@@ -60,14 +60,19 @@ def read_spec(name: str, folder: Path) -> mujoco.MjSpec:
 
 
 def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
-    """The compiled model.
+    """The compiled model, see `compile_told`."""
+    return compile_told(spec, name)[0]
+
+
+def compile_told(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, list[str]]:
+    """The compiled model, and what MuJoCo remarked on it.
 
     Raises:
       InputError: it does not compile, in MuJoCo's own words, holds a number that is not finite or a name that is no
         text, has the flag `ipc`, or an actuator with several commands.
     """
     try:
-        model = compiled(spec)[0]
+        model, remarks = compiled(spec)
     except (ValueError, mujoco.FatalError) as e:
         raise InputError(f"model {name}: does not compile: {_one_line(e)}") from None
     try:
@@ -94,7 +99,7 @@ def compile_model(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
                 odd = np.asarray(value)[~np.isfinite(value)]
                 if odd.size:
                     raise InputError(f"model {name}: {before}{field} holds {odd.flat[0]}; want finite numbers")
-    return model
+    return model, remarks
 
 
 def bare(spec: mujoco.MjSpec, named: Collection[str] = ()) -> mujoco.MjSpec:

@@ -1,5 +1,7 @@
 """Windows in a mirror: a network that sees the parts of one side learns of the other's."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -70,6 +72,15 @@ def test_of_two_mirrors_a_quarter_is_shown_in_each_way() -> None:
         assert 0.22 < chosen.float().mean() < 0.28
         assert swapped[chosen].all() if second < 0 else not swapped[chosen].any()
         assert (shown["actions"][chosen] == second).all()
+
+
+def test_a_state_of_fewer_mirrors_is_refused(tmp_path: Path) -> None:
+    windows, held_out = sides(60, 0, True).split(0.1)
+    image = Mirror(STATES, Signed(np.zeros(0, int), np.zeros(0)), SWAP)
+    once = TrainConfig(epochs=1, batch=16)
+    train(network(windows), windows, held_out, once, folder=tmp_path, mirror=Reflection([image]))
+    with pytest.raises(InputError, match=r"of another run \(mirror 1, now 2\)"):
+        train(network(windows), windows, held_out, once, folder=tmp_path, mirror=Reflection([image, image]))
 
 
 def test_maps_are_refused() -> None:
