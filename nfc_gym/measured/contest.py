@@ -144,7 +144,7 @@ def left_out(problem: Problem, by: Metric, fitted: Fit, folds: NDArray[np.intp])
     """(S,) surprise of each block when its fold takes no part in the fit: one Gauss-Newton step from the whole fit.
 
     At the optimum the blocks' gradients add up to zero; without fold k they add up to minus its own, and the parameters
-    move by H_-k^{-1} g_k. The residuals there are rolled out, all folds in one batch, and count as `by` has it.
+    move by H_-k^{-1} g_k. The residuals there, of each block where its own fold is left out, count as `by` has it.
     """
     jac, white = fitted.jacobian, fitted.white
     if jac.shape[-1] == 0:
@@ -161,8 +161,8 @@ def left_out(problem: Problem, by: Metric, fitted: Fit, folds: NDArray[np.intp])
     for row, k in zip(z, names, strict=True):
         of = folds == k
         row += np.linalg.solve(whole - hessians[of].sum(0) + ridge, gradients[of].sum(0))
-    found = by.surprise(problem.residual(fitted.plant, limits.x(z, fitted.x)))
-    return found[np.searchsorted(names, folds), np.arange(len(folds))]
+    outside = limits.x(z, fitted.x)[np.searchsorted(names, folds)]
+    return by.surprise(problem.each(fitted.plant, outside)[None])[0]
 
 
 def fold_of(problem: Problem, most: int = 8) -> NDArray[np.intp]:

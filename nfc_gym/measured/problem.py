@@ -56,6 +56,11 @@ class Problem(ABC):
     def residual(self, plant: Plant, x: Array) -> Array:
         """measured - predicted (P, S, m) for parameter vectors x (P, size); 0 where masked, NaN where unstable."""
 
+    def each(self, plant: Plant, x: Array) -> Array:
+        """(S, m) the same, of each block under parameters of its own: x (S, size), of which many are alike."""
+        rows, of = np.unique(x, axis=0, return_inverse=True)
+        return self.residual(plant, rows)[of.reshape(-1), np.arange(len(self))]
+
     @abstractmethod
     def covariance(self, plant: Plant, x: Array) -> Array:
         """(S, m, m) of the residual that a perfect model would leave at x (size,)."""

@@ -1,7 +1,7 @@
 """Multiple shooting: segments of logs rolled out from their measured starts, and the noise that their errors have."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -222,8 +222,25 @@ class RolloutProblem(Problem):
             of = self if len(blocks) == len(self) else self.take(blocks)
             return of._compare(plant, x[rows], of.segments, of._measured, of._where.step, of.mask)
 
-        questions = [(plant.model, plant.space, plant.effects, row.tobytes()) for row in x]
-        return self._recent(questions, self._of, rolled)
+        return self._recent([_question(plant, row) for row in x], self._of, rolled)
+
+    def each(self, plant: Plant, x: Array) -> Array:
+        """See `Problem`; all in one batch, of which each block is in but once."""
+        rows, of = np.unique(x, axis=0, return_inverse=True)
+        of, whole, out = of.reshape(-1), list[Array](), np.empty(self.mask.shape)
+
+        def rolled(index: NDArray[np.intp]) -> Array:
+            if not whole:
+                inside, own = plant.under(rows, self.segments.condition)
+                own = own[of] if own.ndim == 2 else own[of, np.arange(len(self))]
+                whole.append(self._again(inside, own[None], self.segments, 1)[0])
+            return whole[0][index][None]
+
+        for k, row in enumerate(rows):
+            index = np.flatnonzero(of == k)
+            answer = lambda _, blocks, index=index: rolled(index[blocks])  # noqa: E731
+            out[index] = self._recent([_question(plant, row)], self._of[index], answer)[0]
+        return out
 
     def touches(self, plant: Plant, x: Array) -> bool:
         """Whether bodies touch in any roll-out at x (size,)."""
@@ -326,9 +343,12 @@ class RolloutProblem(Problem):
     def _again(self, plant: Plant, x: Array, segments: Segments, copies: int, finer: int = 1) -> Array:
         """(copies, S, m) residual of copies of the segments with other starts, at a step so many times finer.
 
-        x is (size,), or (copies, size) with parameters of its own for each copy.
+        x is (size,); (copies, size) with parameters of its own for each copy; or (copies, S, size) for each block.
         """
-        x = x if x.ndim == 1 else np.repeat(x, len(self), 0)
+        if x.ndim == 2:
+            plant, x = plant.under(x, self.segments.condition)
+            x = np.repeat(x[:, None], len(self), 1) if x.ndim == 2 else x
+        x = x if x.ndim == 1 else x.reshape(copies * len(self), x.shape[-1])
         measured = [np.concatenate([m] * copies) for m in self._measured]
         step, mask = np.concatenate([self._where.step * finer] * copies), np.concatenate([self.mask] * copies)
         return self._compare(plant, x[None], segments, measured, step, mask)[0].reshape(copies, len(self), -1)
@@ -404,6 +424,11 @@ class RolloutProblem(Problem):
         dq, dv = (rng.normal(size=sd.shape) * sd for sd in self._start_sd)
         starts = self.segments
         return self.beginning(replace(starts, qpos=integrate(self._kit.model, starts.qpos, dq), qvel=starts.qvel + dv))
+
+
+def _question(plant: Plant, x: Array) -> Hashable:
+    """All that a block's residual depends on besides the block; x (size,)."""
+    return plant.model, plant.space, plant.effects, x.tobytes()
 
 
 def finer(plant: Plant) -> Plant:

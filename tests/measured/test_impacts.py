@@ -1,5 +1,7 @@
 """Where bodies touch: the noise that impacts make of starts and steps, and psi near by."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.shooting import RolloutProblem, finer
 from nfc_gym.measured.states import estimate_states
+from nfc_gym.physics.effects import build
+from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -106,3 +110,45 @@ def test_the_noise_of_impacts_is_that_of_several_psi_near_by(monkeypatch: pytest
     alone = np.stack([noise(row) for row in rows])
     assert (np.abs(np.log(alone / alone[0])) > 0.1).any(), "else this would test nothing"
     np.testing.assert_allclose(together, alone.mean(0), rtol=0.15)
+
+
+def falling(conditions: bool = False) -> tuple[RolloutProblem, Plant]:
+    """Two logs of falling balls, under psi: the first ball's mass."""
+    rng, model = np.random.default_rng(5), bouncy(DT)
+    logs = [bounce(DT / 5, 1.7, rng) for _ in range(2)]
+    if conditions:
+        logs = [replace(log, condition=label) for log, label in zip(logs, "ab", strict=True)]
+    problem = RolloutProblem(model, logs, [estimate_states(model, log) for log in logs], LAYOUT)
+    space = ParameterSpace(model, [Parameter("mass", "body_mass", ("ball0",), "kg", 0.1, 0.4)])
+    return problem, Plant(model, space, nthread=1)
+
+
+@pytest.mark.parametrize("conditions", [False, True])
+def test_each_block_under_its_own_parameters_is_rolled_out_under_these_alone(
+    conditions: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, plant = falling(conditions)
+    push = build("external_force", "ball0", {"x": 0.0, "y": 0.0, "z": 1.0})[0]
+    plant = plant.with_effects([Conditioned(push, ["a", "b"]) if conditions else push])
+    rows = np.repeat(plant.null[None], 3, 0)
+    rows[:, -1] = 0.1, 0.2, 0.3
+    of = np.arange(len(problem)) % 3
+    expected = falling(conditions)[0].residual(plant, rows)[of, np.arange(len(problem))]
+    rolled, shoot = list[int](), Plant.shoot
+    count = lambda self, x, seg, **kw: rolled.append(len(x) * len(seg)) or shoot(self, x, seg, **kw)  # noqa: E731
+    monkeypatch.setattr(Plant, "shoot", count)
+    np.testing.assert_array_equal(problem.each(plant, rows[of]), expected)
+    assert sum(rolled) == len(problem)
+    np.testing.assert_array_equal(problem.each(plant, rows[of]), expected)
+    np.testing.assert_array_equal(problem.part(np.array([1, 4])).residual(plant, rows[1:2])[0], expected[[1, 4]])
+    assert sum(rolled) == len(problem)
+
+
+def test_noise_where_bodies_touch_is_that_of_each_condition() -> None:
+    """An effect with values of its own in each condition is at work in the drawn starts too."""
+    problem, plant = falling(conditions=True)
+    push = build("external_force", "ball0", {"x": 0.0, "y": 0.0, "z": 1.0})[0]
+    alike, apart = plant.with_effects([push]), plant.with_effects([Conditioned(push, ["a", "b"])])
+    theta = np.array([0.0, 0.0, 1.0])
+    x = [np.concatenate([plant.null, t]) for t in (theta, np.tile(theta, 2))]
+    np.testing.assert_allclose(problem.covariance(apart, x[1]), problem.covariance(alike, x[0]), atol=1e-12)
