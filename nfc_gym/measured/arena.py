@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from nfc_gym.measured.contest import Judged
 from nfc_gym.measured.fit import TURNING, Fit, fit, fit_last
 from nfc_gym.measured.metric import Metric, loss, metric
-from nfc_gym.measured.owned import Data
+from nfc_gym.measured.owned import Data, Told, heard
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
@@ -30,13 +30,15 @@ class Arena(Yardstick):
 
     def sharper(self, than: Fit) -> "Arena":
         """The arena under what another, better model leaves unexplained; where bodies touch, each by its own noise."""
-        data, select = self.fit_data, self.select
+        data, select, before = self.fit_data, self.select, self._heard
         if rough := data.problem.rough:
-            data, select = data.expected(than), select.expected(than)
+            told = heard((than.plant, than.x), before)
+            data, select = data.expected(told), select.expected(told)
         extra = slack(data.problem, data.sigma, than.plant, than.x)
         under = metric(data.problem, data.sigma, extra)
         current = fit(data.problem, under, self.current.plant, self.current.x, 6)
-        return Arena(data, select, current, under, extra, self.rng, self.say, own=rough)
+        told = heard((current.plant, current.x), before)
+        return Arena(data, select, current, under, extra, self.rng, self.say, own=rough, told=told)
 
     def halved(self) -> "Arena":
         """The arena of the same logs at half the physics step, for problems that are roll-outs.
@@ -48,13 +50,22 @@ class Arena(Yardstick):
         if not all(isinstance(p, RolloutProblem) for p in problems):
             raise TypeError("only roll-outs have a step to halve")
         data, select = (Data(p.halved(), d.sigma) for p, d in zip(problems, (self.fit_data, self.select), strict=True))
-        current = _at_half(data.problem, self.under, self.current)
-        return Arena(data, select, current, self.under, self.extra, self.rng, self.say, own=self.own)
+        current, told = _at_half(data.problem, self.under, self.current), self._told_at_half(self.current)
+        return Arena(data, select, current, self.under, self.extra, self.rng, self.say, own=self.own, told=told)
 
-    def enter_halved(self, coarse: Judged) -> Judged:
-        """Judge here, at half the step, a candidate that was fitted at the whole one."""
+    def enter_halved(self, coarse: Judged, whole: "Arena") -> Judged:
+        """Judge here, at half the step, a candidate that was fitted in the arena of the whole one.
+
+        The noise that it expects follows from what it told there: its fit at half the step moves it little.
+        """
         self.say(f"judging {self.label(coarse)} at half the physics step")
-        return self.judge(_at_half(self.fit_data.problem, self.under, coarse.fitted))
+        at_half = _at_half(self.fit_data.problem, self.under, coarse.fitted)
+        return self.judge(at_half, whole._told_at_half(coarse.fitted))
+
+    def _told_at_half(self, fitted: Fit) -> Told:
+        """Where a model of this arena told the noise that it expects, as a model at half the step."""
+        plant, x = self._own(fitted).told
+        return finer(plant), x
 
     # ---- entering ---------------------------------------------------------------------------------------------------
 

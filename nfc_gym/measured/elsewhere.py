@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from nfc_gym.measured.box import Box, box
 from nfc_gym.measured.fit import TURNING, Fit, fit, fitted
 from nfc_gym.measured.metric import Metric, loss, metric
+from nfc_gym.measured.owned import Told, heard
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.race import lost
 from nfc_gym.physics.rollout import Plant
@@ -34,12 +35,12 @@ class Ended:
     Attributes:
       x: (size,) the likeliest.
       unsure: (size,) root mean square distance of the others from it: what the search for it leaves open.
-      sigma: (S, m, m) the noise that it expects itself, where hollows were compared by theirs on all blocks.
+      told: (size,) where it told the noise that it expects, see `owned.heard`; None: it was not asked.
     """
 
     x: Array
     unsure: Array
-    sigma: Array | None = None
+    told: Array | None = None
 
 
 def hollows(
@@ -51,6 +52,7 @@ def hollows(
     others: tuple[Array, ...] = (),
     starts: int = STARTS,
     tick: Callable[[int], None] = lambda start: None,
+    told: Array | None = None,
 ) -> Ended:
     """Fit again from starts about a fit, and keep the likeliest, each by the noise that it expects itself.
 
@@ -65,6 +67,7 @@ def hollows(
       others: (size,) each, starts besides.
       starts: how many are drawn.
       tick: called with the number of each start, from 1.
+      told: (size,) where the noise of `under` was told.
     """
     if not problem.rough:
         return Ended(found.x, np.zeros(len(found.x)))
@@ -82,14 +85,16 @@ def hollows(
             apart.append(ends[-1])
         elif quiet == _SETTLED:
             break
-    near, sigma, least = _race(problem, extra, plant, apart), None, np.inf
+    before: list[Told] = [] if told is None else [(plant, told)]
+    told_at = lambda x: heard((plant, x), before)[1]  # noqa: E731
+    near, least = _race(problem, extra, plant, apart, told_at), np.inf
     best = near[0]
     for x in near if len(near) > 1 else ():  # by the noise that each expects; within one hollow all expect the same
-        expected = problem.covariance(plant, x)
+        expected = problem.covariance(plant, told_at(x))
         if (value := float(surprises(problem, expected, extra, plant, x).sum())) < least:
-            best, sigma, least = x, expected, value
+            best, least = x, value
     away = np.stack([x for x in ends if x is not best] or [best]) - best
-    return Ended(best, np.sqrt((away**2).mean(0)), sigma)
+    return Ended(best, np.sqrt((away**2).mean(0)), told_at(best))
 
 
 def resized(problem: Problem, metric: Metric, found: Fit) -> Fit:
@@ -123,7 +128,9 @@ def _errors_between(found: Fit, limits: Box, a: Array, b: Array) -> float:
     return float(np.sqrt((moved**2).sum() / max(len(limits.scale), 1)))
 
 
-def _race(problem: Problem, extra: Array, plant: Plant, ends: list[Array]) -> list[Array]:
+def _race(
+    problem: Problem, extra: Array, plant: Plant, ends: list[Array], told_at: Callable[[Array], Array]
+) -> list[Array]:
     """Ends (size,) that may be the likeliest, as far as some of the blocks tell (`race`).
 
     What a model expects takes some fifty roll-outs of every block; who is far behind on a few need not be asked of all.
@@ -131,7 +138,7 @@ def _race(problem: Problem, extra: Array, plant: Plant, ends: list[Array]) -> li
     if len(ends) == 1 or len(problem) < _THIN * _ENOUGH:
         return ends
     part = problem.part(np.arange(0, len(problem), _THIN))
-    told = np.stack([surprises(part, part.covariance(plant, x), extra, plant, x) for x in ends])
+    told = np.stack([surprises(part, part.covariance(plant, told_at(x)), extra, plant, x) for x in ends])
     return [x for x, out in zip(ends, lost(told), strict=True) if not out]
 
 

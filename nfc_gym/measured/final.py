@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from nfc_gym.measured import marginal
 from nfc_gym.measured.contest import clusters
 from nfc_gym.measured.distances import Model
-from nfc_gym.measured.elsewhere import STARTS, hollows, resized
+from nfc_gym.measured.elsewhere import STARTS, Ended, hollows, resized
 from nfc_gym.measured.fit import Fit, differs, stand
 from nfc_gym.measured.halved import step_error
 from nfc_gym.measured.metric import Metric, metric
+from nfc_gym.measured.owned import heard
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.run import Run
@@ -66,7 +67,7 @@ class _Settled:
       plant, x: the model.
       extra: (m,) slack of its metric.
       unsure: (size,).
-      sigma: (S, m, m) noise of its metric; None: what it expects at `noisy` (size,).
+      told: (size,) where it told the noise of its metric.
     """
 
     whole: Problem
@@ -74,14 +75,12 @@ class _Settled:
     x: Array
     extra: Array
     unsure: Array
-    sigma: Array | None
-    noisy: Array
+    told: Array
 
     @cached_property
     def under(self) -> Metric:
         """The metric that it was fitted under."""
-        sigma = self.whole.covariance(self.plant, self.noisy) if self.sigma is None else self.sigma
-        return metric(self.whole, sigma, self.extra)
+        return metric(self.whole, self.whole.covariance(self.plant, self.told), self.extra)
 
     @cached_property
     def fitted(self) -> Fit:
@@ -93,7 +92,7 @@ def _settled(
     run: Run, name: str, start: Fit, whole: Problem, others: tuple[Array, ...] = (), starts: int = STARTS
 ) -> _Settled:
     """Fit a model from where it stands and, where bodies touch, from other places (size,) or over drawn starts too."""
-    plant, stage, sigma = start.plant, f"final {name}", None
+    plant, stage = start.plant, f"final {name}"
     if run.stages.get(stage) is None:
         run.say(f"fitting the {name} model on all {len(whole)} segments")
         fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
@@ -104,8 +103,17 @@ def _settled(
             ended = marginal.marginal(whole, under, fitted, run.seed, tick)
         else:
             tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
-            ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick)
-        run.stages.put(stage, {"x": ended.x.tolist(), "slack": extra.tolist(), "unsure": ended.unsure.tolist()})
-        sigma = ended.sigma
-    x, extra, unsure = (np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "unsure"))
-    return _Settled(whole, plant, x, extra, unsure, sigma, x if whole.rough else start.x)
+            ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick, start.x)
+        told = _told(whole, plant, start.x, ended)
+        kept = {"x": ended.x, "slack": extra, "unsure": ended.unsure, "told": told}
+        run.stages.put(stage, {k: v.tolist() for k, v in kept.items()})
+    return _Settled(
+        whole, plant, *(np.array(run.stages.get(stage)[k], float) for k in ("x", "slack", "unsure", "told"))
+    )
+
+
+def _told(whole: Problem, plant: Plant, start: Array, ended: Ended) -> Array:
+    """(size,) where a model that began a fit at `start` (size,), which told its noise, tells that in the end."""
+    if not whole.rough:
+        return start
+    return heard((plant, ended.x), [(plant, start)])[1] if ended.told is None else ended.told

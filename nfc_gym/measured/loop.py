@@ -265,7 +265,7 @@ def _search(run: Run, fitting: Any, work: Problem, select: Problem) -> Found:
     calibrated = stand(work, under, plant, x)
     lost = bench.mode == "rollout" and drowned(work, under, plant, x, run.seed)
     pool = [] if lost else candidates(bench, fitting)
-    data = Data(work, sigma), Data(select, select.covariance(plant, x))
+    data = Data(work, sigma, (plant, x)), Data(select, select.covariance(plant, x), (plant, x))
     search = Search(*data, pool, Options(seed=run.seed), run.say, _suspects(run, fitting, x))
     if run.stages.get("found") is None:
         hunted = _hunt(run, search, calibrated, pool)

@@ -299,7 +299,7 @@ class Contest:
         A coarse step errs in time by about half of itself, which a delay mends better than the lag that is at work.
         """
         fine = self.arena.halved()
-        found = [replace(fine.enter_halved(j), fitted=j.fitted) for j in duel]
+        found = [replace(fine.enter_halved(j, self.arena), fitted=j.fitted) for j in duel]
         return sorted(found, key=lambda j: -j.total)
 
     def _together(self, pairs: Sequence[Judged], believed: Sequence[Judged], judged: Sequence[Judged]) -> list[Judged]:

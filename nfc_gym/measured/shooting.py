@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import mujoco
 import numpy as np
@@ -99,8 +99,8 @@ class RolloutProblem(Problem):
         self._place(where, None)
 
     def _place(self, where: Cut, measured: list[Array] | None) -> None:
-        kit, self._recent, self._of = self._kit, Blocks(_RECENT, len(where.log)), np.arange(len(where.log))
-        self._whole: RolloutProblem | None = None  # the same at twice the step, of a problem that was halved
+        kit = self._kit
+        self._begin(len(where.log))
         self._where, self.log_of = where, where.log
         self.time_of = np.array([kit.logs[i].time[s] for i, s in zip(where.log, where.start, strict=True)])
         segments = lay(kit.model, kit.logs, kit.states, where, kit.layout, kit.servos, kit.linear)
@@ -130,6 +130,14 @@ class RolloutProblem(Problem):
             )
         )
         self.columns = self._describe()
+
+    def _begin(self, size: int) -> None:
+        """Nothing is known yet of so many blocks."""
+        self._recent, self._noises = Blocks(_RECENT, size), Blocks(_RECENT, size)
+        self._of = np.arange(size)
+        self._whole: RolloutProblem | None = None  # the same at twice the step, of a problem that was halved
+        self._root: RolloutProblem | None = None  # of a part, what it is part of
+        self.__dict__.pop("_draws", None)
 
     @staticmethod
     def _flat(difference: Array, o: Observer) -> Array:
@@ -258,10 +266,10 @@ class RolloutProblem(Problem):
         size, width = len(self), len(self.columns)
         sigma = np.zeros((size, width, width))
         sigma[:, np.arange(width), np.arange(width)] = np.where(self.mask, self._noise**2, 1.0)
-        base = self.residual(plant, x[None])[0]
         if self.rough:
-            carried, discretised = self._drawn(plant, x, base)
+            carried, discretised = self._impacts(plant, x)
         else:
+            base = self.residual(plant, x[None])[0]
             carried = self._carried(plant, x, base)
             discretised = (self._halved(plant, x, self.segments) - base) / self.reach(plant)
         for column in (*carried, *discretised):
@@ -275,8 +283,30 @@ class RolloutProblem(Problem):
         order = 4 if plant.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else 1
         return 1 - 0.5**order
 
-    def _drawn(self, plant: Plant, x: Array, base: Array) -> tuple[Array, Array]:
+    def _impacts(self, plant: Plant, x: Array) -> tuple[Array, Array]:
         """Columns (D, S, m) of start-state noise, (F, S, m) of the discretisation's error, from starts drawn at random.
+
+        What was asked last is kept, block by block. At half the step they are those of the whole one: what a start
+        carries is the same, and of the error that part is left which halving the step leaves.
+        """
+        if self._whole is not None:
+            carried, error = self._whole._impacts(coarser(plant), x)
+            return carried, (1 - self.reach(plant)) * error
+        drawn, few = (self._root or self)._draws
+        question = plant.model.opt.timestep, plant.space, plant.effects, x.tobytes()
+
+        def rolled(_: NDArray[np.intp], blocks: NDArray[np.intp]) -> Array:
+            of = self if len(blocks) == len(self) else self.part(blocks)
+            columns = np.concatenate(of._drawn(plant, x, drawn[:, of._of], few))
+            return np.moveaxis(columns, 0, 1).reshape(1, len(blocks), -1)
+
+        found = self._noises([question], self._of, rolled)[0].reshape(len(self), len(drawn) + few, -1)
+        carried, error = np.split(np.moveaxis(found, 1, 0), [len(drawn)])
+        return carried, error
+
+    @cached_property
+    def _draws(self) -> tuple[Array, int]:
+        """(D, S, 2 nv) draws of the starts' noise, and how many of them tell the discretisation's error.
 
         Draws at right angles carry the linear part of the noise as exactly as a difference for each coordinate would.
         """
@@ -287,22 +317,20 @@ class RolloutProblem(Problem):
             found = across(np.random.default_rng(len(self)), len(self), int(noisy.sum()), _DRAWS)
             draws = np.zeros((len(found), *sd.shape))
             draws[..., noisy] = found * sd[:, noisy]
-        few = draws[: -(-2 * len(draws) // 3)]
-        rows, bases = self._near(plant, x, base, len(draws))
-        here, reach = self._again(plant, rows, self._begun(draws), len(draws)), self.reach(plant)
-        if self._whole is None:
-            error = (here[: len(few)] - self._halved(plant, rows[: len(few)], self._begun(few), len(few))) / reach
-        else:  # a step twice as long tells the same in a quarter of the time
-            whole = self._whole
-            coarse = whole._again(coarser(plant), rows[: len(few)], whole._begun(few), len(few))
-            error = (coarse - here[: len(few)]) * (1 / reach - 1)
-        return (here - bases) / np.sqrt(len(draws)), error / np.sqrt(len(few))
+        return draws, -(-2 * len(draws) // 3)
+
+    def _drawn(self, plant: Plant, x: Array, draws: Array, few: int) -> tuple[Array, Array]:
+        """See `_impacts`, rolled out from starts off by draws (D, S, 2 nv), of which few tell the error of a step."""
+        rows, bases = self._near(plant, x, self.residual(plant, x[None])[0], len(draws))
+        here = self._again(plant, rows, self._begun(draws), len(draws))
+        fine = self._halved(plant, rows[:few], self._begun(draws[:few]), few)
+        return (here - bases) / np.sqrt(len(draws)), (here[:few] - fine) / self.reach(plant) / np.sqrt(few)
 
     def _near(self, plant: Plant, x: Array, base: Array, count: int) -> tuple[Array, Array]:
         """(count, size) parameters, in turn x and a few with a psi near by, and (count, S, m) residuals under each."""
         free = np.flatnonzero(plant.space.free)
         rows = np.repeat(x[None], _NEAR, 0)
-        off = np.random.default_rng(len(self)).normal(size=(_NEAR - 1, len(free)))
+        off = np.random.default_rng(self._recent.size).normal(size=(_NEAR - 1, len(free)))
         low, high = plant.space.low[free], plant.space.high[free]
         rows[1:, free] = np.clip(x[free] * (1 + _OFF * off), np.minimum(low, x[free]), np.maximum(high, x[free]))
         bases = np.concatenate([base[None], self.residual(plant, rows[1:])])
@@ -374,9 +402,8 @@ class RolloutProblem(Problem):
         """
         out = object.__new__(RolloutProblem)
         out.__dict__.update(self.__dict__)
-        out.segments, out._recent, out._of, out._whole = (
-            segments, Blocks(_RECENT, len(self)), np.arange(len(self)), None,
-        )  # fmt: skip
+        out.segments = segments
+        out._begin(len(self))
         if signs:
             pairs = zip(self._observers, self._measured, strict=True)
             out._measured = [m * signs[o.name] if o.name in signs else m for o, m in pairs]
@@ -385,13 +412,14 @@ class RolloutProblem(Problem):
     def part(self, index: NDArray[np.intp]) -> "RolloutProblem":
         """See `Problem`."""
         out = self.take(index)
-        out._recent, out._of = self._recent, self._of[index]
+        out._recent, out._noises, out._of, out._root = self._recent, self._noises, self._of[index], self._root or self
+        out._whole = None if self._whole is None else self._whole.part(index)
         return out
 
     def take(self, index: NDArray[np.intp]) -> "RolloutProblem":
         """See `Problem`."""
         out, w = self.beginning(pick(self.segments, index)), self._where
-        out._recent, out._of = Blocks(_RECENT, len(index)), np.arange(len(index))
+        out._begin(len(index))
         out._where = Cut(w.log[index], w.start[index], w.samples[index], w.step[index])
         out.log_of, out.time_of = self.log_of[index], self.time_of[index]
         out._start_sd = [s[index] for s in self._start_sd]

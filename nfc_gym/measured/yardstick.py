@@ -22,7 +22,7 @@ from nfc_gym.measured.contest import (
 )
 from nfc_gym.measured.fit import Fit, differs
 from nfc_gym.measured.metric import Metric, loss, loss_weight, metric
-from nfc_gym.measured.owned import Data, Owned, owned
+from nfc_gym.measured.owned import Data, Owned, Told, heard, owned
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.base import Effect
@@ -47,6 +47,7 @@ class Yardstick:
       own: judge each model, fitted so, by a metric of its own: the noise that it expects and the slack that it needs,
         at the price of both. Where bodies touch, noise grows with the model's own impacts, and what one model expects
         or leaves unexplained would excuse its errors and not a rival's.
+      told: where the model to beat tells that noise, if not where it stands.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Yardstick:
         rng: np.random.Generator,
         say: Callable[[str], None],
         own: bool = False,
+        told: Told | None = None,
     ) -> None:
         self.fit_data, self.select, self.current, self.under, self.rng, self.say = (
             fit_data, select, current, under, rng, say,
@@ -67,10 +69,11 @@ class Yardstick:
         self.blocks = clusters(fit_data.problem), clusters(select.problem)
         self.folds = fold_of(fit_data.problem)
         self._owned: dict[int, Owned] = {}
-        self._face(current)
+        self._heard: list[Told] = [] if fit_data.by is None else [fit_data.by]
+        self._face(current, told)
 
-    def _face(self, current: Fit) -> None:
-        self.current, own = current, self._own(current)
+    def _face(self, current: Fit, told: Told | None = None) -> None:
+        self.current, own = current, self._own(current, told)
         self.base = losses(self.select.problem, self.on, current)
         self._sides = (
             Side(
@@ -85,12 +88,14 @@ class Yardstick:
             ),
         )
 
-    def _own(self, fitted: Fit) -> Owned:
-        """A model as it is judged."""
+    def _own(self, fitted: Fit, told: Told | None = None) -> Owned:
+        """A model as it is judged; `told` is where it tells the noise that it expects, if that is known."""
         if not self.own:
-            return Owned(fitted, (self.under, self.on), fitted, fitted)
+            return Owned(fitted, (self.under, self.on), fitted, fitted, (fitted.plant, fitted.x))
         if id(fitted) not in self._owned:
-            one = owned(fitted, self.fit_data, self.select, self.under)
+            told = told or heard((fitted.plant, fitted.x), self._heard)
+            self._heard.append(told)
+            one = owned(fitted, self.fit_data, self.select, self.under, told)
             self._owned |= {id(fitted): one, id(one.seen): one}
         return self._owned[id(fitted)]
 
@@ -119,9 +124,9 @@ class Yardstick:
         """
         return not self.own or self.drop(fitted, than) > HOPE * self.cost(len(fitted.x) - len(than.x))
 
-    def judge(self, fitted: Fit) -> Judged:
-        """Compare a fitted model with the one to beat."""
-        own = self._own(fitted)
+    def judge(self, fitted: Fit, told: Told | None = None) -> Judged:
+        """Compare a fitted model with the one to beat; `told` as for `Owned`."""
+        own = self._own(fitted, told)
         judged = judge(own.fitted, self.current, own.by, self._sides, self.folds, self.rng)
         return replace(judged, fitted=own.seen)
 

@@ -422,7 +422,7 @@ def test_who_comes_near_the_best_meets_it_again_at_half_the_step() -> None:
     judged = [best, rated("delay", 95.0, ("one",)), lag, apart, gain, slip, faint]
     said: list[Judged] = []
 
-    def again(j: Judged) -> Judged:
+    def again(j: Judged, whole: Any) -> Judged:
         said.append(j)
         return replace(j, total=200.0 if j is lag else 50.0, fitted=SimpleNamespace(step="half"))  # type: ignore[arg-type]
 
@@ -452,7 +452,7 @@ def test_the_same_law_at_a_place_where_it_does_as_well_comes_to_half_the_step_to
     apart, other = rated("coulomb", 99.0, ("l", "r")), rated("hysteresis", 98.0, ("l",))
     met: list[str] = []
 
-    def again(j: Judged) -> Judged:
+    def again(j: Judged, whole: Any) -> Judged:
         met.append(arena.label(j))
         return j
 

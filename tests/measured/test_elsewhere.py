@@ -75,11 +75,24 @@ def test_who_is_far_behind_on_some_of_the_blocks_is_not_asked_of_all() -> None:
     found = hollows(problem, under, np.zeros(2), shallow, 0, (np.array([-0.8]),))
     assert found.x == pytest.approx(-1.0, abs=0.02)
     assert set(problem.asked[1:]) == {12}  # the first was the metric's
-    assert found.sigma is None
     even = Wells(0.0, blocks=36)  # two hollows alike: neither is lost early
     under, one = stood(even, 1.0)
     hollows(even, under, np.zeros(2), one, 0, (np.array([-0.8]),))
     assert even.asked.count(36) == 3
+
+
+@pytest.mark.parametrize(("told", "there"), [(-1.04, True), (-0.94, False)])
+def test_who_ends_near_where_noise_was_told_is_not_asked_again(told: float, there: bool) -> None:
+    problem, asked = Wells(0.0), list[float]()
+    under, deep = stood(problem, -1.0)
+    covariance = problem.covariance
+    problem.covariance = lambda plant, x: asked.append(x[0]) or covariance(plant, x)  # type: ignore[method-assign]
+    found = hollows(problem, under, np.zeros(2), deep, 0, (np.array([0.8]),), told=np.array([told]))
+    assert found.told is not None
+    assert (found.told == told) == there
+    assert found.told == pytest.approx(-1.0, abs=0.05)
+    assert any(x == told for x in asked) == there
+    assert min(asked, key=lambda x: abs(x - 1)) == pytest.approx(1.0, abs=0.02)  # the other hollow's noise is its own
 
 
 def test_where_nothing_touches_the_fit_at_hand_is_the_answer() -> None:

@@ -99,7 +99,8 @@ def test_the_noise_of_impacts_is_that_of_several_psi_near_by(monkeypatch: pytest
     x = np.array([0.4])
 
     def noise(at: np.ndarray) -> np.ndarray:
-        return np.einsum("sii->i", problem.covariance(plant, at)) / len(problem)
+        anew = problem.take(np.arange(len(problem)))  # which knows of no psi yet
+        return np.einsum("sii->i", anew.covariance(plant, at)) / len(problem)
 
     monkeypatch.setattr("nfc_gym.measured.shooting._OFF", 1.0)
     rows = problem._near(plant, x, problem.residual(plant, x[None])[0], 4)[0]
@@ -152,3 +153,34 @@ def test_noise_where_bodies_touch_is_that_of_each_condition() -> None:
     theta = np.array([0.0, 0.0, 1.0])
     x = [np.concatenate([plant.null, t]) for t in (theta, np.tile(theta, 2))]
     np.testing.assert_allclose(problem.covariance(apart, x[1]), problem.covariance(alike, x[0]), atol=1e-12)
+
+
+def test_noise_of_impacts_is_told_once_and_of_some_blocks_as_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who asks some of the blocks first, all then, and half the step at last has each roll-out made once."""
+    problem, plant = falling()
+    expected, half = falling()[0].covariance(plant, plant.null), falling()[0].halved()
+    rolled, shoot = list[int](), Plant.shoot
+    count = lambda self, x, seg, **kw: rolled.append(len(x) * len(seg)) or shoot(self, x, seg, **kw)  # noqa: E731
+    monkeypatch.setattr(Plant, "shoot", count)
+    some = np.arange(0, len(problem), 3)
+    np.testing.assert_array_equal(problem.part(some).covariance(plant, plant.null), expected[some])
+    np.testing.assert_array_equal(problem.covariance(plant, plant.null), expected)
+    once = sum(rolled)
+    np.testing.assert_array_equal(problem.covariance(plant, plant.null), expected)
+    fine = problem.halved().covariance(finer(plant), plant.null)
+    assert sum(rolled) == once
+    np.testing.assert_array_equal(half.covariance(finer(plant), plant.null), fine)
+    assert sum(rolled) == 2 * once
+    part = problem.halved().part(some)
+    np.testing.assert_array_equal(part.covariance(finer(plant), plant.null), fine[some])
+    assert sum(rolled) == 2 * once
+
+
+def test_half_the_step_leaves_a_quarter_of_its_errors_variance() -> None:
+    """What starts carry stays: the noise at half the step lies between that and the noise at the whole one."""
+    problem, plant = falling()
+    carried, error = problem._impacts(plant, plant.null)
+    alike, less = problem.halved()._impacts(finer(plant), plant.null)
+    np.testing.assert_array_equal(alike, carried)
+    np.testing.assert_array_equal(less, 0.5 * error)  # implicitfast is of first order
+    assert (np.einsum("dsm,dsm->sm", error, error) > 0).any()
