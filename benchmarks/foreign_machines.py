@@ -85,14 +85,21 @@ def folder(out: Path | None) -> Iterator[Path]:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Each machine, what it hides by kind, and its logs."""
+    """Each machine, its logs, what it hides of which size, and how plainly that is to show."""
     lines = []
     for name in names:
         case = CASES[name]
         m = case.machine
         logs = f"{m.logs} logs of {m.seconds:g} s at {m.rate:g} Hz, {m.format.suffix}"
-        lines.append(f"{name:20} {GROUPS[case.group]:20} {m.model:20} {logs}")
+        hidden = case.what
+        if case.hide:
+            hidden = f"{_range(case.sizes)} {case.what}; {_range(case.shown)} noise deviations after 0.2 s"
+        lines.append(f"{name:20} {GROUPS[case.group]:20} {logs:36} {hidden}")
     return "\n".join(lines)
+
+
+def _range(ends: tuple[float, float]) -> str:
+    return " to ".join(f"{end:g}" for end in ends)
 
 
 def drawn(name: str, seed: int, folders: Folders) -> None:

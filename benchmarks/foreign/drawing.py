@@ -8,7 +8,7 @@ import numpy as np
 
 from .channels import UNITS, Signal
 from .effect import Array, Effect, Rng, Signals
-from .machine import Case, Machine, log_between
+from .machine import Case, Machine, Make, log_between
 from .simulation import Run, UnstableError, simulate, visible, with_effects
 
 TRIES = 4  # simulations in search of the size
@@ -22,7 +22,7 @@ class Drawn:
     case: Case
     seed: int
     psi: list[float]
-    effects: list[Effect]
+    effects: Sequence[Effect]
     runs: list[Run]
     signals: list[Signals]
     shown: dict[str, float]
@@ -36,7 +36,7 @@ def draw(case: Case, seed: int) -> Drawn:
     clean = machine.true_model(psi)
     seeds = [int(s) for s in courses.integers(2**32, size=machine.logs)]
     signals = [_signals(machine.signals, courses) for _ in seeds]
-    effects: list[Effect] = []
+    effects: Sequence[Effect] = []
     if case.hide:
         make = case.hide(truth)
         effects = make(_size(case, clean, make, log_between(truth, *case.shown), seeds, signals))
@@ -59,7 +59,14 @@ def _runs(
     return out
 
 
-def _size(case: Case, clean, make, wanted: float, seeds: Sequence[int], signals: Sequence[Signals]) -> float:
+def _size(
+    case: Case,
+    clean: mujoco.MjModel,
+    make: Make,
+    wanted: float,
+    seeds: Sequence[int],
+    signals: Sequence[Signals],
+) -> float:
     """The size within the case's bounds at which the plainest channel shows about `wanted`, on two of the logs."""
     low, high = case.sizes
     size = float(np.sqrt(low * high))

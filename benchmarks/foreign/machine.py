@@ -15,7 +15,8 @@ MODELS = Path(__file__).parent / "models"
 
 Policy = Callable[[float, mujoco.MjData], Array | Sequence[float]]  # (seconds since the log's start, state) -> (nu,)
 Start = Callable[[mujoco.MjData], None]  # puts the state at the beginning
-Hide = Callable[[Rng], Callable[[float], list[Effect]]]  # draws all but the size; then makes the effects of a size
+Make = Callable[[float], Sequence[Effect]]  # the effects of a size
+Hide = Callable[[Rng], Make]  # draws all of them but the size
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,8 @@ class Case:
     Attributes:
       group: `null`, `single`, `pair` or `outside` (the library).
       hide: draws what is hidden; None hides nothing.
-      sizes: least and greatest size that would be realistic, in the unit that `hide` takes.
+      what: what that is in words; the sizes come before it.
+      sizes: least and greatest size that would be realistic, in the unit that `hide` takes and `what` begins with.
       shown: range, log-uniform, of how many of its noise deviations the plainest channel is off 0.2 s ahead.
       cost: rough seconds of its loop on one core: the longest begin first.
     """
@@ -106,6 +108,7 @@ class Case:
     machine: Machine
     group: str
     hide: Hide | None = None
+    what: str = "nothing"
     sizes: tuple[float, float] = (1.0, 1.0)
     shown: tuple[float, float] = (10.0, 100.0)
     cost: float = 120.0

@@ -1,5 +1,6 @@
 """Arms: two links with motors, six joints of servos, three links, a geared one, and a URDF leg on a test stand."""
 
+import mujoco
 import numpy as np
 
 from ..bodies import Payload
@@ -7,7 +8,7 @@ from ..channels import Channel, Control, controls, joints, speeds
 from ..drives import Delay
 from ..effect import Effect, Rng
 from ..joints import Bias, Coulomb, LoadFriction
-from ..machine import Case, Format, Hide, Machine, Motion, between, either_way, waves
+from ..machine import Case, Format, Machine, Make, Motion, between, either_way, waves
 from ..outside import Loom
 from ..parameters import Parameter
 
@@ -44,7 +45,7 @@ TACHO = Machine(
 )  # fmt: skip
 
 
-def _dry_and_late(rng: Rng) -> Hide:
+def _dry_and_late(rng: Rng) -> Make:
     friction, late = between(rng, 0.05, 0.15), between(rng, 0.008, 0.03)
 
     def make(size: float) -> list[Effect]:
@@ -53,7 +54,7 @@ def _dry_and_late(rng: Rng) -> Hide:
     return make
 
 
-def _bias(rng: Rng) -> Hide:
+def _bias(rng: Rng) -> Make:
     side = either_way(rng, 1, 1)
     return lambda size: [Bias("joint:sh:pos", side * size)]
 
@@ -65,7 +66,7 @@ def six_joints(rng: Rng) -> Motion:
     """Goals of six servos, from where the goals begin."""
     goal = waves(rng, [0.5, 0.35, 0.4, 0.7, 0.6, 0.8], 0.15, 1.3)
 
-    def start(data) -> None:
+    def start(data: mujoco.MjData) -> None:
         data.qpos[:] = goal(-0.5)
 
     return Motion(lambda t, d: goal(t), start)
@@ -84,7 +85,7 @@ SERVO_ARM = Machine(
 )  # fmt: skip
 
 
-def _tool(rng: Rng) -> Hide:
+def _tool(rng: Rng) -> Make:
     height = between(rng, -0.03, 0.03)
     return lambda size: [Payload("link6", size, (0.08, 0.0, height), ["j6", "j5", "link6"])]
 
@@ -110,6 +111,11 @@ LOOMED = Machine(
     format=Format("npz"),
 )  # fmt: skip
 
+
+def _loom(rng: Rng) -> Make:
+    return lambda size: [Loom(("q2", "q3"), size)]
+
+
 # ---- geared ---------------------------------------------------------------------------------------------------------
 
 
@@ -117,7 +123,7 @@ def geared(rng: Rng) -> Motion:
     """Position control behind gears of 60 and 100, the weight of the beam held."""
     goal, push = waves(rng, [1.0, 0.8], 0.15, 1.0), waves(rng, [3.0, 4.0], 1, 4)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         aim, more = goal(t), push(t)
         yaw = 60 * (aim[0] - d.qpos[0]) - 6 * d.qvel[0] + more[0]
         pitch = 140 * (aim[1] - d.qpos[1]) - 14 * d.qvel[1] + more[1] - 9 * np.cos(d.qpos[1])
@@ -138,7 +144,7 @@ GEARED = Machine(
 )  # fmt: skip
 
 
-def _gear(rng: Rng) -> Hide:
+def _gear(rng: Rng) -> Make:
     level, share = between(rng, 0.1, 0.4), between(rng, 0.1, 0.25)
     return lambda size: [LoadFriction("pitch", level * size, share * size)]
 
@@ -150,7 +156,7 @@ def swinging(rng: Rng) -> Motion:
     """Let go somewhere, with some speed."""
     angles, rates = rng.uniform(-1.2, 1.2, 3) * [1, 1, 0.6], rng.normal(0, 1, 3)
 
-    def start(data) -> None:
+    def start(data: mujoco.MjData) -> None:
         data.qpos[:], data.qvel[:] = angles, rates
 
     return Motion(lambda t, d: np.zeros(0), start)
@@ -168,7 +174,7 @@ SWINGING = Machine(
 )  # fmt: skip
 
 
-def _dry_joint(rng: Rng) -> Hide:
+def _dry_joint(rng: Rng) -> Make:
     joint = str(rng.choice(["hip", "knee"]))
     usual = {"hip": 0.06, "knee": 0.03}[joint]  # N m
     return lambda size: [Coulomb(joint, usual * size)]
@@ -176,13 +182,29 @@ def _dry_joint(rng: Rng) -> Hide:
 
 CASES = (
     Case("arm2_none", COUNTED, "null", cost=80),
-    Case("arm2_pair", TACHO, "pair", _dry_and_late, sizes=(0.1, 1.0), shown=(50, 300), cost=240),
-    Case("arm2_bias", TACHO, "single", _bias, sizes=(0.005, 0.05), shown=(20, 130), cost=100),
+    Case(
+        "arm2_pair", TACHO, "pair", _dry_and_late, sizes=(0.1, 1.0), shown=(50, 300), cost=240,
+        what="times 0.05 to 0.15 N m of dry friction of el and 8 to 30 ms of delay of m_sh",
+    ),
+    Case(
+        "arm2_bias", TACHO, "single", _bias, sizes=(0.005, 0.05), shown=(20, 130), cost=100,
+        what="rad of bias of the encoder at sh, either way",
+    ),
     Case("arm6_none", SERVO_ARM, "null", cost=60),
-    Case("arm6_payload", SERVO_ARM, "single", _tool, sizes=(0.1, 1.5), shown=(10, 60), cost=110),
-    Case("arm3_loom", LOOMED, "outside", _loom := (lambda rng: lambda s: [Loom(("q2", "q3"), s)]), sizes=(0.01, 1.2),
-         shown=(40, 300), cost=170),
-    Case("geared_load", GEARED, "single", _gear, sizes=(0.1, 1.5), shown=(30, 300), cost=130),
+    Case(
+        "arm6_payload", SERVO_ARM, "single", _tool, sizes=(0.1, 1.5), shown=(10, 60), cost=110, what="kg at the tool"
+    ),
+    Case(
+        "arm3_loom", LOOMED, "outside", _loom, sizes=(0.01, 1.2), shown=(40, 300), cost=170,
+        what="N m/rad^3 of a cable loom over q2 and q3",
+    ),
+    Case(
+        "geared_load", GEARED, "single", _gear, sizes=(0.1, 1.5), shown=(30, 300), cost=130,
+        what="times 0.1 to 0.4 N m and 0.1 to 0.25 of the motor's force as friction of pitch",
+    ),
     Case("urdf_none", SWINGING, "null", cost=45),
-    Case("urdf_coulomb", SWINGING, "single", _dry_joint, sizes=(0.1, 2.0), shown=(10, 100), cost=130),
+    Case(
+        "urdf_coulomb", SWINGING, "single", _dry_joint, sizes=(0.1, 2.0), shown=(10, 100), cost=130,
+        what="times 0.06 N m of dry friction of the hip or 0.03 N m of the knee",
+    ),
 )  # fmt: skip

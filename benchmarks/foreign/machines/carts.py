@@ -1,11 +1,12 @@
 """A cart that balances a pole, and a pendulum with a reaction wheel."""
 
+import mujoco
 import numpy as np
 
 from ..channels import controls, joints, speeds
 from ..drives import DeadZone, TorqueSpeed
 from ..effect import Rng
-from ..machine import Case, Format, Hide, Machine, Motion, waves
+from ..machine import Case, Format, Machine, Make, Motion, waves
 from ..parameters import Parameter
 
 
@@ -13,13 +14,13 @@ def balancing(rng: Rng) -> Motion:
     """State feedback that follows a goal on the rail, shaken."""
     goal, push, begin = waves(rng, 0.25, 0.1, 0.6), waves(rng, 1.3, 1, 5), rng.normal(0, 0.03, 2)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         x, angle = d.qpos
         v, rate = d.qvel
         force = 2.2 * (x - goal(t)[0]) + 4 * v + 26 * angle + 5.5 * rate + push(t)[0]
         return [float(np.clip(force, -15, 15))]
 
-    def start(data) -> None:
+    def start(data: mujoco.MjData) -> None:
         data.qpos[:] = begin
 
     return Motion(policy, start)
@@ -37,7 +38,7 @@ CART = Machine(
 )  # fmt: skip
 
 
-def _dead(rng: Rng) -> Hide:
+def _dead(rng: Rng) -> Make:
     return lambda size: [DeadZone("belt", size, ["rail"])]
 
 
@@ -59,11 +60,29 @@ WHEEL = Machine(
 )  # fmt: skip
 
 
-def _falls(rng: Rng) -> Hide:
+def _falls(rng: Rng) -> Make:
     return lambda size: [TorqueSpeed("motor", "rotor", 0.25, size)]
 
 
 CASES = (
-    Case("cartpole_dead_zone", CART, "single", _dead, sizes=(0.1, 1.2), shown=(8, 100), cost=130),
-    Case("wheel_torque_speed", WHEEL, "single", _falls, sizes=(2e-4, 1.5e-2), shown=(60, 500), cost=130),
+    Case(
+        "cartpole_dead_zone",
+        CART,
+        "single",
+        _dead,
+        what="N of dead zone of the belt",
+        sizes=(0.1, 1.2),
+        shown=(8, 100),
+        cost=130,
+    ),
+    Case(
+        "wheel_torque_speed",
+        WHEEL,
+        "single",
+        _falls,
+        what="s/rad by which the motor's limit falls",
+        sizes=(2e-4, 1.5e-2),
+        shown=(60, 500),
+        cost=130,
+    ),
 )

@@ -1,12 +1,13 @@
 """What tendons and jaws move: a finger, a cable arm, a parallel gripper."""
 
+import mujoco
 import numpy as np
 
 from ..channels import Channel, controls, joints, speeds
 from ..drives import Loss
 from ..effect import Form, Rng
 from ..joints import Coulomb
-from ..machine import Case, Format, Hide, Machine, Motion, waves
+from ..machine import Case, Format, Machine, Make, Motion, waves
 from ..outside import Capstan
 from ..parameters import Parameter
 
@@ -15,12 +16,12 @@ def flexing(rng: Rng) -> Motion:
     """Two tendons against each other, about a bent rest."""
     pull, begin = waves(rng, [2.2, 2.0], 0.3, 4), rng.uniform(0.3, 0.7, 3)
 
-    def policy(t: float, d) -> np.ndarray:
+    def policy(t: float, d: mujoco.MjData) -> np.ndarray:
         more = pull(t)
         hold = float(np.clip(8 * (d.qpos[0] - 0.5) + 4 * (d.qpos[1] - 0.6) + 0.3 * d.qvel[0], -4, 4))
         return np.clip([-7 - more[0] + hold, -7 - more[1] - hold], -40, 0)
 
-    def start(data) -> None:
+    def start(data: mujoco.MjData) -> None:
         data.qpos[:] = begin
 
     return Motion(policy, start)
@@ -38,7 +39,7 @@ FINGER = Machine(
 )  # fmt: skip
 
 
-def _sheath(rng: Rng) -> Hide:
+def _sheath(rng: Rng) -> Make:
     near = [Form("load_friction", (j,)) for j in ("mcp", "pip")]  # what it is at one joint, in straight lines
     return lambda size: [Capstan("flexor", "flex", ("mcp", "pip"), size, near)]
 
@@ -47,7 +48,7 @@ def winching(rng: Rng) -> Motion:
     """Three cables that stay tight."""
     pull = waves(rng, [7.0, 7.0, 5.0], 0.2, 2.5)
 
-    def policy(t: float, d) -> np.ndarray:
+    def policy(t: float, d: mujoco.MjData) -> np.ndarray:
         more, hold = pull(t), 12 * d.qpos[0] + 2 * d.qvel[0]
         return np.clip([-15 + more[0] - hold, -15 + more[1] + hold, -9 + more[2]], [-60, -60, -40], 0)
 
@@ -66,7 +67,7 @@ CABLES = Machine(
 )  # fmt: skip
 
 
-def _weak_winch(rng: Rng) -> Hide:
+def _weak_winch(rng: Rng) -> Make:
     winch = str(rng.choice(["w_front", "w_back", "w_tip"]))
     moved = ["luff"] if winch == "w_tip" else ["lift"]
     return lambda size: [Loss(winch, size, moved)]
@@ -90,7 +91,7 @@ GRIPPER = Machine(
 )  # fmt: skip
 
 
-def _dry_jaw(rng: Rng) -> Hide:
+def _dry_jaw(rng: Rng) -> Make:
     # The jaws are coupled: friction of the one is friction of the other, or a half of it of each.
     def make(size: float) -> list:
         return [
@@ -102,8 +103,35 @@ def _dry_jaw(rng: Rng) -> Hide:
 
 CASES = (
     Case("finger_none", FINGER, "null", cost=65),
-    Case("finger_sheath", FINGER, "outside", _sheath, sizes=(0.01, 0.3), shown=(12, 80), cost=770),
-    Case("cable_loss", CABLES, "single", _weak_winch, sizes=(0.01, 0.4), shown=(10, 100), cost=130),
+    Case(
+        "finger_sheath",
+        FINGER,
+        "outside",
+        _sheath,
+        what="of friction of the flexor in its sheath (capstan)",
+        sizes=(0.01, 0.3),
+        shown=(12, 80),
+        cost=770,
+    ),
+    Case(
+        "cable_loss",
+        CABLES,
+        "single",
+        _weak_winch,
+        what="of a cable's force lost",
+        sizes=(0.01, 0.4),
+        shown=(10, 100),
+        cost=130,
+    ),
     Case("gripper_none", GRIPPER, "null", cost=90),
-    Case("gripper_coulomb", GRIPPER, "single", _dry_jaw, sizes=(0.1, 3.0), shown=(10, 100), cost=210),
+    Case(
+        "gripper_coulomb",
+        GRIPPER,
+        "single",
+        _dry_jaw,
+        what="N of dry friction of a jaw",
+        sizes=(0.1, 3.0),
+        shown=(10, 100),
+        cost=210,
+    ),
 )

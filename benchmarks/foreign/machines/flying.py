@@ -7,7 +7,7 @@ from ..bodies import Drag
 from ..channels import Channel, controls
 from ..drives import Lag, Loss
 from ..effect import Array, Effect, Rng
-from ..machine import Case, Format, Hide, Machine, Motion, between, waves
+from ..machine import Case, Format, Machine, Make, Motion, between, waves
 from ..outside import Tether
 from ..parameters import Parameter
 
@@ -32,7 +32,7 @@ def hovering(size: float):
     def motion(rng: Rng) -> Motion:
         goal, push = waves(rng, [size, size, 0.35, 0.6], 0.1, 0.6), waves(rng, [0.12] * 4, 1, 5)
 
-        def policy(t: float, d) -> Array:
+        def policy(t: float, d: mujoco.MjData) -> Array:
             axes, aim, rate = _axes(d.qpos[3:7]), goal(t), d.qvel[3:6]
             pull = np.clip(2.5 * (aim[:3] + CENTRE - d.qpos[:3]) - 2.2 * d.qvel[:3], -4, 4)  # m/s^2
             yaw = np.arctan2(axes[1, 0], axes[0, 0])
@@ -65,11 +65,11 @@ def _drone(size: float) -> Machine:
     )  # fmt: skip
 
 
-def _slow_rotors(rng: Rng) -> Hide:
+def _slow_rotors(rng: Rng) -> Make:
     return lambda size: [Lag(ROTORS, size, ["frame"])]
 
 
-def _weak_and_dragged(rng: Rng) -> Hide:
+def _weak_and_dragged(rng: Rng) -> Make:
     rotor, lost, drag = str(rng.choice(ROTORS)), between(rng, 0.02, 0.05), between(rng, 0.6, 1.2)
 
     def make(size: float) -> list[Effect]:
@@ -88,7 +88,7 @@ def diving(rng: Rng) -> Motion:
     """Thrusts to all sides about a depth of 2 m, kept level."""
     push = waves(rng, [25.0, 4.0, 15.0, 15.0, 35.0], 0.1, 0.8)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         axes, rate = _axes(d.qpos[3:7]), d.qvel[3:6]
         own, level, depth = axes.T @ d.qvel[:3], -14 * axes[2, 0] + 3 * rate[1], 8 * (d.qpos[2] + 2)
         surge, turn, front, back, sway = push(t)
@@ -120,20 +120,56 @@ ROV = Machine(
 )  # fmt: skip
 
 
-def _water(rng: Rng) -> Hide:
+def _water(rng: Rng) -> Make:
     shape = np.array([20, 35, 45]) * rng.uniform(0.7, 1.3, 3)
-    return lambda size: [Drag("hull", size * shape, quadratic=True)]
+    return lambda size: [Drag("hull", list(size * shape), quadratic=True)]
 
 
-def _tether(rng: Rng) -> Hide:
+def _tether(rng: Rng) -> Make:
     slack = between(rng, 0.35, 0.5)
     return lambda size: [Tether("hull", (0.0, 0.0, -1.7), slack, size)]
 
 
 CASES = (
     Case("drone_none", _drone(0.6), "null", cost=50),
-    Case("drone_lag", _drone(0.6), "single", _slow_rotors, sizes=(0.005, 0.06), shown=(6, 60), cost=110),
-    Case("drone_pair", _drone(1.2), "pair", _weak_and_dragged, sizes=(0.2, 3.0), shown=(30, 120), cost=430),
-    Case("rov_drag", ROV, "single", _water, sizes=(0.02, 1.5), shown=(6, 40), cost=75),
-    Case("rov_tether", ROV, "outside", _tether, sizes=(3.0, 120.0), shown=(8, 40), cost=100),
+    Case(
+        "drone_lag",
+        _drone(0.6),
+        "single",
+        _slow_rotors,
+        what="s of lag of all rotors",
+        sizes=(0.005, 0.06),
+        shown=(6, 60),
+        cost=110,
+    ),
+    Case(
+        "drone_pair",
+        _drone(1.2),
+        "pair",
+        _weak_and_dragged,
+        what="times 2 to 5 % of a rotor's force lost and 0.6 to 1.2 N s/m of linear drag",
+        sizes=(0.2, 3.0),
+        shown=(30, 120),
+        cost=430,
+    ),
+    Case(
+        "rov_drag",
+        ROV,
+        "single",
+        _water,
+        what="times about 20, 35 and 45 N s^2/m^2 of quadratic drag",
+        sizes=(0.02, 1.5),
+        shown=(6, 40),
+        cost=75,
+    ),
+    Case(
+        "rov_tether",
+        ROV,
+        "outside",
+        _tether,
+        what="N/m of a tether that is slack up to 0.35 to 0.5 m",
+        sizes=(3.0, 120.0),
+        shown=(8, 40),
+        cost=100,
+    ),
 )

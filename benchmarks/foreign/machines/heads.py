@@ -1,12 +1,13 @@
 """What turns a camera or a foot: a pan-tilt head with an IMU, a direct-drive gimbal, a powered ankle."""
 
+import mujoco
 import numpy as np
 
 from ..channels import Channel, Control, controls, joints
 from ..drives import Delay
 from ..effect import Rng
 from ..joints import Cogging, Spring
-from ..machine import Case, Format, Hide, Machine, Motion, between, waves
+from ..machine import Case, Format, Machine, Make, Motion, between, waves
 from ..parameters import Parameter
 
 
@@ -29,7 +30,7 @@ PAN_TILT = Machine(
 )  # fmt: skip
 
 
-def _late(rng: Rng) -> Hide:
+def _late(rng: Rng) -> Make:
     return lambda size: [Delay(["s_pan", "s_tilt"], size, 0.0005, ["pan", "tilt"])]
 
 
@@ -52,7 +53,7 @@ GIMBAL = Machine(
 )  # fmt: skip
 
 
-def _cogs(rng: Rng) -> Hide:
+def _cogs(rng: Rng) -> Make:
     joint, phase = str(rng.choice(["yaw", "roll", "pitch"])), between(rng, 0, 2 * np.pi)
     order = int(rng.choice([7, 12, 14]))  # pole pairs of such motors
     return lambda size: [Cogging(joint, size, order, phase)]
@@ -62,7 +63,7 @@ def treading(rng: Rng) -> Motion:
     """Position control of the knee, goals of the ankle's servo."""
     goal, push = waves(rng, [0.6, 0.45], 0.2, 1.6), waves(rng, 1.5, 1, 4)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         knee, ankle = goal(t)
         return [(20 * (knee - d.qpos[0]) - 2 * d.qvel[0] + push(t)[0]) / 40, ankle]
 
@@ -82,13 +83,40 @@ ANKLE = Machine(
 )  # fmt: skip
 
 
-def _sprung(rng: Rng) -> Hide:
+def _sprung(rng: Rng) -> Make:
     rest = between(rng, -0.15, 0.15)
     return lambda size: [Spring("ankle", size, rest)]
 
 
 CASES = (
-    Case("pan_tilt_delay", PAN_TILT, "single", _late, sizes=(0.002, 0.04), shown=(10, 100), cost=110),
-    Case("gimbal_cogging", GIMBAL, "single", _cogs, sizes=(2e-4, 1e-2), shown=(10, 100), cost=90),
-    Case("ankle_spring", ANKLE, "single", _sprung, sizes=(0.3, 8.0), shown=(10, 150), cost=170),
+    Case(
+        "pan_tilt_delay",
+        PAN_TILT,
+        "single",
+        _late,
+        what="s of delay of both servos",
+        sizes=(0.002, 0.04),
+        shown=(10, 100),
+        cost=110,
+    ),
+    Case(
+        "gimbal_cogging",
+        GIMBAL,
+        "single",
+        _cogs,
+        what="N m of cogging of a motor, 7, 12 or 14 times a turn",
+        sizes=(2e-4, 1e-2),
+        shown=(10, 100),
+        cost=90,
+    ),
+    Case(
+        "ankle_spring",
+        ANKLE,
+        "single",
+        _sprung,
+        what="N m/rad of a spring at the ankle",
+        sizes=(0.3, 8.0),
+        shown=(10, 150),
+        cost=170,
+    ),
 )

@@ -1,12 +1,13 @@
 """Hoists and cranes: a gantry with a swinging load, and a drum on a battery that lifts an arm."""
 
+import mujoco
 import numpy as np
 
 from ..channels import Channel, Control, Signal, joints, speeds
 from ..drives import Lag, SupplySag
 from ..effect import Effect, Rng
 from ..joints import Coulomb
-from ..machine import Case, Hide, Machine, Motion, between, waves
+from ..machine import Case, Machine, Make, Motion, between, waves
 from ..outside import Grease
 from ..parameters import Parameter
 
@@ -15,7 +16,7 @@ def hauling(rng: Rng) -> Motion:
     """The carriage is pushed about and led back softly; the hook goes up and down."""
     goal = waves(rng, [35.0, 0.1], 0.15, 1.2)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         force, depth = goal(t)
         return [force - 40 * d.qpos[0] - 10 * d.qvel[0], depth]
 
@@ -35,12 +36,12 @@ CRANE = Machine(
 )  # fmt: skip
 
 
-def _grease(rng: Rng) -> Hide:
+def _grease(rng: Rng) -> Make:
     start = between(rng, -0.5, -0.2)
     return lambda size: [Grease("bridge", size, start)]
 
 
-def _dry_and_slow(rng: Rng) -> Hide:
+def _dry_and_slow(rng: Rng) -> Make:
     friction, tau = between(rng, 8, 16), between(rng, 0.04, 0.1)
 
     def make(size: float) -> list[Effect]:
@@ -56,7 +57,7 @@ def lifting(rng: Rng) -> Motion:
     """Position control of the drum, the arm's weight held."""
     goal, push = waves(rng, 0.5, 0.15, 1.0), waves(rng, 0.05, 1, 4)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         hold = -1.96 / 20 * np.cos(d.qpos[1])
         return [hold + 0.12 * (goal(t)[0] - d.qpos[0]) - 0.02 * d.qvel[0] + push(t)[0]]
 
@@ -82,13 +83,40 @@ HOIST = Machine(
 )  # fmt: skip
 
 
-def _sag(rng: Rng) -> Hide:
+def _sag(rng: Rng) -> Make:
     return lambda size: [SupplySag("winch", size, RATED, ["shaft", "hinge"])]
 
 
 CASES = (
     Case("crane_none", CRANE, "null", cost=55),
-    Case("crane_pair", CRANE, "pair", _dry_and_slow, sizes=(0.2, 1.2), shown=(15, 80), cost=200),
-    Case("crane_grease", CRANE, "outside", _grease, sizes=(100.0, 450.0), shown=(15, 80), cost=170),
-    Case("hoist_sag", HOIST, "single", _sag, sizes=(0.8, 1.6), shown=(15, 200), cost=150),
+    Case(
+        "crane_pair",
+        CRANE,
+        "pair",
+        _dry_and_slow,
+        what="times 8 to 16 N of dry friction at the bridge and 40 to 100 ms of lag of its drive",
+        sizes=(0.2, 1.2),
+        shown=(15, 80),
+        cost=200,
+    ),
+    Case(
+        "crane_grease",
+        CRANE,
+        "outside",
+        _grease,
+        what="N s/m^3 of drag that grows with the square of the way along the rail",
+        sizes=(100.0, 450.0),
+        shown=(15, 80),
+        cost=170,
+    ),
+    Case(
+        "hoist_sag",
+        HOIST,
+        "single",
+        _sag,
+        what="as the power of the supply's volts that the winch's force goes with",
+        sizes=(0.8, 1.6),
+        shown=(15, 200),
+        cost=150,
+    ),
 )

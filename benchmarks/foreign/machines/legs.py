@@ -1,12 +1,13 @@
 """What steps: a hopping leg on a vertical rail, and a planar biped that shuffles in a stride."""
 
+import mujoco
 import numpy as np
 
 from ..channels import Channel, controls, joints, speeds
 from ..drives import Delay
 from ..effect import Array, Effect, Rng
 from ..joints import Armature, Coulomb, Spring
-from ..machine import Case, Hide, Machine, Motion, between, waves
+from ..machine import Case, Machine, Make, Motion, between, waves
 from ..parameters import Parameter
 
 
@@ -14,12 +15,12 @@ def hopping(rng: Rng) -> Motion:
     """Hip and knee swing together, and each for itself."""
     goal, rate, phase = waves(rng, [0.16, 0.3], 0.4, 2.8), between(rng, 1.2, 2.2), between(rng, 0, 6)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         hip, knee = goal(t)
         swing = np.sin(2 * np.pi * rate * t + phase)
         return [0.5 + hip + 0.12 * swing, -1.0 + knee - 0.3 * swing]
 
-    def start(data) -> None:
+    def start(data: mujoco.MjData) -> None:
         data.qpos[:] = [-0.03, 0.5, -1.0]
 
     return Motion(policy, start)
@@ -40,7 +41,7 @@ LEG = Machine(
 )  # fmt: skip
 
 
-def _at_a_joint(rng: Rng) -> Hide:
+def _at_a_joint(rng: Rng) -> Make:
     """Dry friction, a rotor or a spring, at the hip or the knee."""
     family, joint = str(rng.choice(["coulomb", "armature", "spring"])), str(rng.choice(["hip", "knee"]))
     rest = {"hip": 0.2, "knee": -0.6}[joint]
@@ -63,10 +64,10 @@ def shuffling(rng: Rng) -> Motion:
     """Goals about a stride."""
     goal = waves(rng, [0.09, 0.12, 0.09, 0.12], 0.5, 3)
 
-    def policy(t: float, d) -> Array:
+    def policy(t: float, d: mujoco.MjData) -> Array:
         return STRIDE + goal(t)
 
-    def start(data) -> None:
+    def start(data: mujoco.MjData) -> None:
         data.qpos[:] = [0, -0.06, 0, *STRIDE]
 
     return Motion(policy, start)
@@ -86,12 +87,30 @@ BIPED = Machine(
 )  # fmt: skip
 
 
-def _late(rng: Rng) -> Hide:
+def _late(rng: Rng) -> Make:
     return lambda size: [Delay(SERVOS, size, 0.001, JOINTS.split())]
 
 
 CASES = (
     Case("leg_none", LEG, "null", cost=70),
-    Case("leg_joint", LEG, "single", _at_a_joint, sizes=(0.1, 3.0), shown=(8, 80), cost=180),
-    Case("biped_delay", BIPED, "single", _late, sizes=(0.005, 0.04), shown=(20, 100), cost=160),
+    Case(
+        "leg_joint",
+        LEG,
+        "single",
+        _at_a_joint,
+        what="times 0.4 N m of dry friction, 0.01 kg m^2 of rotor or 3 N m/rad of spring, at hip or knee",
+        sizes=(0.1, 3.0),
+        shown=(8, 80),
+        cost=180,
+    ),
+    Case(
+        "biped_delay",
+        BIPED,
+        "single",
+        _late,
+        what="s of delay of all servos",
+        sizes=(0.005, 0.04),
+        shown=(20, 100),
+        cost=160,
+    ),
 )

@@ -1,10 +1,12 @@
 """What rolls: a skid-steer rover and a robot of two wheels on casters."""
 
+import mujoco
+
 from ..bodies import Slope
 from ..channels import Channel, controls, speeds
 from ..drives import Loss
 from ..effect import Rng
-from ..machine import Case, Hide, Machine, Motion, either_way, waves
+from ..machine import Case, Machine, Make, Motion, either_way, waves
 from ..parameters import Parameter
 
 WHEELS = ("fl", "fr", "rl", "rr")
@@ -14,7 +16,7 @@ def driving(rng: Rng) -> Motion:
     """Wheel speeds of a course that bends."""
     goal = waves(rng, [5.0, 3.0], 0.1, 0.9)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         ahead, turn = goal(t)
         return [ahead - turn, ahead + turn] * 2
 
@@ -38,7 +40,7 @@ ROVER = Machine(
 )  # fmt: skip
 
 
-def _weak_wheel(rng: Rng) -> Hide:
+def _weak_wheel(rng: Rng) -> Make:
     wheel = str(rng.choice(WHEELS))
     return lambda size: [Loss(f"{wheel}_drive", size, [wheel])]
 
@@ -47,7 +49,7 @@ def rolling(rng: Rng) -> Motion:
     """Torques that follow wheel speeds softly."""
     goal = waves(rng, [3.5, 2.5], 0.15, 1.0)
 
-    def policy(t: float, d) -> list[float]:
+    def policy(t: float, d: mujoco.MjData) -> list[float]:
         ahead, turn = goal(t)
         return [0.03 * (ahead - turn - d.qvel[6]), 0.03 * (ahead + turn - d.qvel[7])]
 
@@ -69,13 +71,31 @@ DIFFBOT = Machine(
 )  # fmt: skip
 
 
-def _leans(rng: Rng) -> Hide:
+def _leans(rng: Rng) -> Make:
     roll, pitch = either_way(rng, 0.3, 1), either_way(rng, 0.3, 1)
     return lambda size: [Slope(size * roll, size * pitch, "chassis")]
 
 
 CASES = (
     Case("rover_none", ROVER, "null", cost=140),
-    Case("rover_loss", ROVER, "single", _weak_wheel, sizes=(0.1, 0.9), shown=(8, 60), cost=280),
-    Case("diffbot_slope", DIFFBOT, "single", _leans, sizes=(0.01, 0.06), shown=(6, 40), cost=250),
+    Case(
+        "rover_loss",
+        ROVER,
+        "single",
+        _weak_wheel,
+        what="of a wheel drive's force lost",
+        sizes=(0.1, 0.9),
+        shown=(8, 60),
+        cost=280,
+    ),
+    Case(
+        "diffbot_slope",
+        DIFFBOT,
+        "single",
+        _leans,
+        what="rad times 0.3 to 1 of roll and of pitch of the floor",
+        sizes=(0.01, 0.06),
+        shown=(6, 40),
+        cost=250,
+    ),
 )
