@@ -118,6 +118,7 @@ def run(args: argparse.Namespace, place: str, name: str, flags: list[str], gpu: 
         sys.executable, str(TABLE), "--robots", robot, "--terrain", terrain, "--windows",
         str(args.windows.get(place, args.residual_windows)), "--device", device, "--stop", f"{left:.0f}", *flags,
         "--seeds", *map(str, args.seeds), *(["--small"] if args.small else []), *(["--mirror"] if args.mirror else []),
+        *(["--adamw"] if args.adamw else []),
     ]  # fmt: skip
     command += [part for name in PASSED for part in (f"--{name}", str(getattr(args, name.replace("-", "_"))))]
     env = os.environ | ({} if gpu in (None, "cpu") else {"CUDA_VISIBLE_DEVICES": gpu})
@@ -275,7 +276,7 @@ def _arguments() -> argparse.Namespace:
     add("--budget", type=number(0), default=60, metavar="SECONDS", help="of training a cell (default %(default)s)")
     add("--epochs", type=count(1), default=200, help="passes over the windows at most (default %(default)s)")
     add("--batch", type=count(1), default=1024, help="windows a training step (default %(default)s)")
-    add("--rate", type=number(0), default=1e-3, help="largest step size of AdamW (default %(default)s)")
+    add("--rate", type=number(0), default=1e-3, help="largest step size (default %(default)s)")
     add("--draws", type=count(1), default=8,
         help="of noise a window and training step, of score models (default %(default)s)")  # fmt: skip
     add("--few", type=count(1), default=50,
@@ -283,6 +284,7 @@ def _arguments() -> argparse.Namespace:
     add("--ceiling-windows", type=count(1), default=8, help="that a ceiling is the mean of (default %(default)s)")
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
     parser.add_argument("--mirror", action="store_true", help="show half of each step's windows in each mirror")
+    parser.add_argument("--adamw", action="store_true", help="change matrices by AdamW too, in place of Muon")
     args = parser.parse_args()
     if args.quick:
         args.windows, args.methods, args.inputs, args.gpus = ["JackalFlat=256"], ["mdn-rff"], ["summaries"], ["cpu"]

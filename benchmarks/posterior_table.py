@@ -92,7 +92,9 @@ def main() -> None:
         args.data = args.data or args.out
         device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device
                               if args.device != "auto" else "cpu")  # fmt: skip
-        plan = Plan(args.epochs, args.budget, args.batch, args.rate, args.draws, args.small, args.mirror)
+        plan = Plan(
+            args.epochs, args.budget, args.batch, args.rate, args.draws, args.small, args.mirror, muon=not args.adamw
+        )  # fmt: skip
         kept = Kept(args.out, {"judges": args.judges, "samples": args.samples, **plan.settings})
         run = Run(args, kept, plan, device, time.monotonic() + args.stop if args.stop else float("inf"))
         print(f"torch {torch.__version__} on {device}, {torch.get_num_threads()} threads, {args.out}", flush=True)
@@ -218,7 +220,7 @@ def _arguments() -> argparse.Namespace:
         help="begin nothing new after these; default 0 sets no end",
     )
     parser.add_argument("--batch", type=count(1), default=256, help="windows a training step (default %(default)s)")
-    parser.add_argument("--rate", type=number(0), default=5e-4, help="largest step size of AdamW (default %(default)s)")
+    parser.add_argument("--rate", type=number(0), default=5e-4, help="largest step size (default %(default)s)")
     parser.add_argument(
         "--draws",
         type=count(1),
@@ -231,6 +233,7 @@ def _arguments() -> argparse.Namespace:
         action="store_true",
         help="show half of each step's windows in each mirror of the robot; sbi's methods see none",
     )
+    parser.add_argument("--adamw", action="store_true", help="change matrices by AdamW too, in place of Muon")
     parser.add_argument(
         "--jobs", type=count(0), default=0, help="processes of the simulation; default 0 takes all cores"
     )

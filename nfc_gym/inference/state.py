@@ -23,8 +23,7 @@ def save_state(path: Path, run: Any, description: dict[str, Any]) -> None:
     tensors: dict[str, Tensor] = {}
     for name in ("network", "average", "best"):
         tensors |= {f"{name}/{k}": t for k, t in getattr(run, name).state_dict().items()}
-    for i, entry in run.optimiser.state_dict()["state"].items():
-        tensors |= {f"optimiser/{i}/{k}": t for k, t in entry.items()}
+    tensors |= {f"optimiser/{k}": t for k, t in run.optimiser.tensors().items()}
     plain = {"step": run.step, "loss_sum": run.loss_sum, "outcome": asdict(run.outcome), "of": description}
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {k: t.detach().cpu().contiguous().clone() for k, t in tensors.items()}
@@ -48,22 +47,21 @@ def load_state(path: Path, run: Any, description: dict[str, Any]) -> None:
             f"{path} is of another run ({'; '.join(differ)}): remove it to train anew, or train to another place"
         )
     for name in ("network", "average", "best"):
-        own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
         try:
-            getattr(run, name).load_state_dict(own)
+            getattr(run, name).load_state_dict(_part(tensors, name))
         except RuntimeError:  # the configuration is the same, so that the shapes follow from the windows' own
             raise InputError(f"{path} is of windows of other sizes: remove it to train anew") from None
-    state = run.optimiser.state_dict()
-    for key, tensor in tensors.items():
-        if key.startswith("optimiser/"):
-            _, i, name = key.split("/")
-            state["state"].setdefault(int(i), {})[name] = tensor
-    run.optimiser.load_state_dict(state)
+    run.optimiser.load(_part(tensors, "optimiser"))
     run.step, run.loss_sum = plain["step"], plain["loss_sum"]
     try:
         run.outcome = type(run.outcome)(**plain["outcome"])
     except TypeError as e:
         raise InputError(f"{path}: damaged ({e}): remove it to train anew") from None
+
+
+def _part(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    """Those whose names begin with a name and a slash, without them."""
+    return {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
 
 
 def _described(path: Path, metadata: dict[str, str]) -> dict[str, Any]:

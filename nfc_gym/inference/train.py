@@ -16,6 +16,7 @@ from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.data import Batch, TensorWindows, WindowSet, resident
 from nfc_gym.inference.graphs import Graphs
 from nfc_gym.inference.learner import Learner
+from nfc_gym.inference.optimiser import Optimiser
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.random import mixed, seeded
 from nfc_gym.inference.reflection import Reflection
@@ -33,7 +34,8 @@ class TrainConfig:
     Attributes:
       epochs: passes over the windows at most; the cosine decay of the step size ends there.
       batch: windows a step.
-      rate: the step size after `warmup` steps; AdamW.
+      rate: the step size after `warmup` steps.
+      muon: whether matrices are changed by Muon, see `Optimiser`; else all is changed by AdamW.
       decay: of the weights.
       average: share of the averaged weights that a step keeps (exponential moving average).
       clip: largest norm of a gradient.
@@ -50,6 +52,7 @@ class TrainConfig:
     batch: int = 256
     rate: float = 5e-4
     warmup: int = 100
+    muon: bool = True
     decay: float = 1e-4
     average: float = 0.999
     clip: float = 1.0
@@ -170,12 +173,8 @@ class _Run:
         self.average = deepcopy(self.network).eval().requires_grad_(False)
         self.best = deepcopy(self.average)
         number = torch.zeros((), device=device)
-        self.optimiser = torch.optim.AdamW(
-            network.parameters(), lr=number + config.rate, weight_decay=config.decay, fused=True,
-            capturable=device.type == "cuda",
-        )  # fmt: skip
-        # 1 from the first loss or gradient on that is not finite: the optimiser changes nothing then.
-        self.lost = self.optimiser.found_inf = number.clone()  # type: ignore[attr-defined] (as torch's GradScaler)
+        self.lost = number.clone()  # 1 from the first loss or gradient on that is not finite: nothing is changed then
+        self.optimiser = Optimiser(self.network, config.rate, config.decay, self.lost, config.muon)
         self.pull = number.clone()  # of a step on the averaged weights
         self.tally = number.new_zeros(2, dtype=torch.float64)  # steps that were taken, and the epoch's losses
         self.judged = self.tally.new_zeros(())  # sum of the held-out losses
@@ -241,8 +240,7 @@ class _Run:
 
     def learn(self, batch: Batch) -> None:
         """One step: the device is told what is another in each, and does the rest by itself."""
-        for group in self.optimiser.param_groups:
-            group["lr"].fill_(self.rate())
+        self.optimiser.rate.fill_(self.rate())
         self.seed(0, self.step)
         self.step += 1
         self.pull.fill_(1 - min(self.config.average, (1 + self.step) / (10 + self.step)))
@@ -251,7 +249,7 @@ class _Run:
     def update(self, batch: Batch) -> None:
         """The law of a step; after a loss or a gradient that was not finite it changes nothing."""
         loss = self.loss(self.network, batch if self.mirror is None else self.mirror(batch))
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimiser.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
         value = loss.detach()
