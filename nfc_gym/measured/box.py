@@ -48,6 +48,10 @@ class Box:
         coordinates[..., self.free] = z * self.scale
         return np.clip(self.plant.unchart(coordinates), self.low, self.high)
 
+    def pulled(self, z: Array) -> Array:
+        """(...) what the weak priors take of scaled coordinates (..., f): the squares of how far they are pulled."""
+        return np.square((z - self.centre) * self.pull).sum(-1)
+
     def slopes(self, x: Array) -> Array:
         """(n, f) change of the parameters for each scaled free coordinate, at x (n,)."""
         z = self.at(x)

@@ -11,6 +11,7 @@ from scipy.special import chdtri
 from nfc_gym.measured.box import Box, box
 from nfc_gym.measured.metric import TURN, Metric, loss, loss_weight
 from nfc_gym.measured.problem import Problem
+from nfc_gym.measured.race import Race
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.rollout import Plant
 
@@ -263,10 +264,11 @@ def polish(problem: Problem, metric: Metric, plant: Plant, x: Array, evaluations
 
         bounds = [limits.floor.tolist(), limits.roof.tolist()]
         options = {"bounds": bounds, "maxfevals": evaluations, "verbose": -9, "seed": seed + 1}  # 0: the time of day
-        search = cma.CMAEvolutionStrategy(z, _SPREAD, options)
-        while not search.stop():
+        search, race = cma.CMAEvolutionStrategy(z, _SPREAD, options), Race(problem, metric)
+        while not search.stop():  # who is best counts, and roughly how the others follow
             draws = np.array(search.ask())
-            search.tell(list(draws), objective(problem, metric, limits, draws, x).tolist())
+            values = race.ranked(plant, limits.x(draws, x)) + limits.pulled(draws)
+            search.tell(list(draws), values.tolist())
         best, value = np.asarray(search.result.xbest), float(search.result.fbest)
     if value >= objective(problem, metric, limits, z[None], x)[0]:
         return x
@@ -276,7 +278,7 @@ def polish(problem: Problem, metric: Metric, plant: Plant, x: Array, evaluations
 def objective(problem: Problem, metric: Metric, limits: Box, z: Array, around: Array) -> Array:
     """(P,) what a fit minimises, at scaled coordinates (P, f)."""
     white = metric.whiten(problem.residual(limits.plant, limits.x(z, around)))
-    return loss(white).sum(-1) + (((z - limits.centre) * limits.pull) ** 2).sum(-1)
+    return loss(white).sum(-1) + limits.pulled(z)
 
 
 def uncertainty(result: Fit, blocks: NDArray[np.intp]) -> Array:

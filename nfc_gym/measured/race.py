@@ -1,6 +1,7 @@
 """Which of many parameter vectors leaves least: who is far behind on some of the blocks is not asked of all.
 
-Maron and Moore (1994), Hoeffding races: most of what a wide search tries is far off, and a third of the blocks says so.
+Maron and Moore (1994), Hoeffding races: most of what a wide search tries is far off, and a third of the blocks says so,
+or two.
 Differences are taken block by block, so that what all leave alike does not blur them.
 """
 
@@ -12,7 +13,7 @@ from nfc_gym.measured.problem import Problem
 from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
-_FIRST, _FEWEST = 3, 4  # every so many blocks are asked first, where that leaves as many
+_PARTS, _FEWEST = 3, 4  # that blocks are asked in, where each has as many
 _BEHIND = 3.0  # standard errors that one is behind there to be lost, and one number so many deviations off
 
 
@@ -32,19 +33,31 @@ class Race:
     """
 
     def __init__(self, problem: Problem, metric: Metric) -> None:
-        every = np.arange(len(problem))
-        first = every % _FIRST == 0 if len(every) >= _FIRST * _FEWEST else every >= 0
-        self._parts = [(problem.part(i), metric.take(i)) for i in (every[first], every[~first]) if len(i)]
+        every, parts = np.arange(len(problem)), _PARTS if len(problem) >= _PARTS * _FEWEST else 1
+        split = [every[k::parts] for k in range(parts)]
+        self._parts = [(problem.part(i), metric.take(i)) for i in split] if parts > 1 else [(problem, metric)]
 
     def losses(self, plant: Plant, x: Array) -> Array:
         """(P,) losses of parameter vectors x (P, size) over all blocks; infinite for those lost on the way."""
-        told = self._told(0, plant, x)
-        if len(self._parts) == 1:
-            return told.sum(1)
-        running = np.flatnonzero(~lost(told))
-        out = np.full(len(x), np.inf)
-        out[running] = told[running].sum(1) + self._told(1, plant, x[running]).sum(1)
-        return out
+        return self._run(plant, x)[0]
+
+    def ranked(self, plant: Plant, x: Array) -> Array:
+        """(P,) the same, but those lost on the way have what the blocks they were asked of make likely."""
+        losses, likely = self._run(plant, x)
+        return np.where(np.isinf(losses), np.maximum(likely, losses.min()), losses)
+
+    def _run(self, plant: Plant, x: Array) -> tuple[Array, Array]:
+        """(P,) losses, infinite for those lost; (P,) what the blocks that each was asked of say of all."""
+        running, told = np.arange(len(x)), np.zeros((len(x), 0))
+        losses, likely = np.full(len(x), np.inf), np.zeros(len(x))
+        for k in range(len(self._parts)):
+            told = np.concatenate([told, self._told(k, plant, x[running])], 1)
+            likely[running] = told.mean(1) * sum(len(p) for p, _ in self._parts)
+            if k < len(self._parts) - 1:
+                left = ~lost(told)
+                running, told = running[left], told[left]
+        losses[running] = told.sum(1)
+        return losses, likely
 
     def _told(self, part: int, plant: Plant, x: Array) -> Array:
         problem, metric = self._parts[part]

@@ -75,17 +75,20 @@ class Hollows:
 
     rough = True
 
-    def __init__(self) -> None:
+    def __init__(self, index: Any = slice(None)) -> None:
         self.columns = SimpleNamespace(__len__=lambda: 2)
-        self.mask = np.ones((40, 2), bool)
         rng = np.random.default_rng(0)
-        self.phase, self.size = rng.uniform(0, 1, (40, 2)), 0.3
+        self.phase, self.size = rng.uniform(0, 1, (40, 2))[index], 0.3
+        self.mask = np.ones(self.phase.shape, bool)
 
     def __len__(self) -> int:
-        return 40
+        return len(self.phase)
+
+    def part(self, index: np.ndarray) -> "Hollows":
+        return Hollows(index)
 
     def residual(self, plant: Any, x: np.ndarray) -> np.ndarray:
-        off = x[:, None] - np.array([0.6, -0.4])
+        off = np.repeat(x[:, None], len(self), 1) - np.array([0.6, -0.4])
         jumps = np.floor(37 * x[:, None].sum(-1, keepdims=True) + self.phase) % 2
         return 10 * off + self.size * (jumps - 0.5)
 

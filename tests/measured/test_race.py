@@ -53,9 +53,27 @@ def test_those_that_stay_have_the_losses_of_all_blocks() -> None:
     running, problem = race(np.random.default_rng(1).normal(size=14))
     x = np.array([[0.0], [0.2], [-0.1]])
     whole = Race(problem, Metric(np.ones((14, 1, 1)), problem.mask))
-    np.testing.assert_allclose(
-        running.losses(PLANT, x), whole._told(0, PLANT, x).sum(1) + whole._told(1, PLANT, x).sum(1)
-    )
+    np.testing.assert_allclose(running.losses(PLANT, x), sum(whole._told(k, PLANT, x).sum(1) for k in range(3)))
+
+
+def test_who_is_lost_is_ranked_by_what_was_seen_of_it_and_behind_all_that_are_not() -> None:
+    running, problem = race(np.random.default_rng(3).normal(size=30))
+    x = np.array([0.0, 0.1, 9.0, 5.0, 7.0])[:, None]
+    ranked = running.ranked(PLANT, x)
+    np.testing.assert_array_equal(np.argsort(ranked)[2:], [3, 4, 2])
+    np.testing.assert_array_equal(ranked[:2], running.losses(PLANT, x)[:2])
+    whole = Race(Targets(problem.target[:3]), Metric(np.ones((3, 1, 1)), problem.mask[:3]))  # too few to race
+    np.testing.assert_allclose(ranked[2:], 10 * whole.losses(PLANT, x)[2:], rtol=0.3)
+
+
+def test_who_is_lost_on_the_second_third_is_not_asked_of_the_last() -> None:
+    running, _ = race(np.zeros(60))
+    told = {0: 1.0 + 0.9 * (-1.0) ** np.arange(20), 1: np.full(20, 3.0)}
+    rows = lambda k: np.stack([np.ones(20), told[k]])  # noqa: E731
+    asked: list[int] = []
+    running._told = lambda k, plant, x: asked.append(len(x)) or (rows(k) if k < 2 else np.ones((len(x), 20)))  # type: ignore[method-assign]
+    assert np.isinf(running.losses(PLANT, np.zeros((2, 1)))).tolist() == [False, True]
+    assert asked == [2, 2, 1]
 
 
 @pytest.mark.parametrize("count", [1, 2, 11])
