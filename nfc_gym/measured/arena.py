@@ -32,12 +32,12 @@ class Arena(Yardstick):
         """The arena under what another, better model leaves unexplained; where bodies touch, each by its own noise."""
         data, select, before = self.fit_data, self.select, self._heard
         if rough := data.problem.rough:
-            told = heard((than.plant, than.x), before)
+            told = heard(than, before)
             data, select = data.expected(told), select.expected(told)
         extra = slack(data.problem, data.sigma, than.plant, than.x)
         under = metric(data.problem, data.sigma, extra)
         current = fit(data.problem, under, self.current.plant, self.current.x, 6)
-        told = heard((current.plant, current.x), before)
+        told = heard(current, before)
         return Arena(data, select, current, under, extra, self.rng, self.say, own=rough, told=told)
 
     def halved(self) -> "Arena":

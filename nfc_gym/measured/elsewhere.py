@@ -86,7 +86,7 @@ def hollows(
         elif quiet == _SETTLED:
             break
     before: list[Told] = [] if told is None else [(plant, told)]
-    told_at = lambda x: heard((plant, x), before)[1]  # noqa: E731
+    told_at = lambda x: heard(found, before, x)[1]  # noqa: E731
     best = _likeliest(problem, extra, plant, apart, told_at)
     away = np.stack([x for x in ends if x is not best] or [best]) - best
     return Ended(best, np.sqrt((away**2).mean(0)), told_at(best))

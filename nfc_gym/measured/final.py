@@ -105,7 +105,7 @@ def _settled(
         else:
             tick = lambda k: run.say(f"fitting the {name} model from elsewhere, start {k}")  # noqa: E731
             ended = hollows(whole, under, extra, fitted, run.seed, others, starts, tick, start.x)
-        told = _told(whole, plant, start.x, ended)
+        told = _told(fitted, start.x, ended) if whole.rough else start.x
         kept = {"x": ended.x, "slack": extra, "unsure": ended.unsure, "told": told}
         run.stages.put(stage, {k: v.tolist() for k, v in kept.items()})
     return _Settled(
@@ -113,8 +113,6 @@ def _settled(
     )
 
 
-def _told(whole: Problem, plant: Plant, start: Array, ended: Ended) -> Array:
-    """(size,) where a model that began a fit at `start` (size,), which told its noise, tells that in the end."""
-    if not whole.rough:
-        return start
-    return heard((plant, ended.x), [(plant, start)])[1] if ended.told is None else ended.told
+def _told(fitted: Fit, start: Array, ended: Ended) -> Array:
+    """(size,) where a model tells its noise in the end; it told it before at `start` (size,), where its fit began."""
+    return heard(fitted, [(fitted.plant, start)], ended.x)[1] if ended.told is None else ended.told

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 Told = tuple[Plant, Array]  # a model, and the parameters (size,) at which it told the noise that it expects
 _ROUNDS, _TURNS = 6, 2  # iterations of each fit, with the slopes at hand; fits and slacks in turns
 _NEAR = 0.05  # of a parameter, within which a model expects the same noise: that is averaged over psi as far off
+_FELT = 0.1  # standard deviations, root mean square, by which a parameter's move changes nothing of it either
 
 
 @dataclass
@@ -31,23 +32,31 @@ class Data:
         return Data(self.problem, self.problem.covariance(*by), by)
 
 
-def heard(model: Told, before: Sequence[Told]) -> Told:
+def heard(model: Fit, before: Sequence[Told], x: Array | None = None) -> Told:
     """Where a model's noise was told before, if that was hardly elsewhere; else where it stands.
 
     What noise a model expects where bodies touch takes some forty roll-outs of every block. It is averaged over a few
-    psi near by, so that one that has moved by less than these are off expects the same.
+    psi near by, so that one that has moved by less than these are off expects the same, and so does one that moves the
+    motion by next to nothing: a damping that hardly shows may come to half as much in any fit.
+
+    Args:
+      model: with slopes at its parameters or near them.
+      before: where noise was told.
+      x: (size,) parameters that are asked about; default those of the model.
     """
-    plant, x = model
-    limits = box(plant)
+    plant, x = model.plant, model.x if x is None else x
+    limits, psi = box(plant), int(plant.space.free.sum())
+    felt = np.sqrt((model.jacobian**2).sum((0, 1)) / max(int((model.white != 0).sum()), 1))
     for told in before:
         other, at = told
         if other.space is not plant.space or other.effects != plant.effects:
             continue
-        here, there, psi = limits.at(x), limits.at(at), int(plant.space.free.sum())
-        room = np.concatenate([_NEAR * np.abs(there[:psi]), np.full(len(here) - psi, _NEAR)])
-        if (np.abs(here - there) <= room).all():
+        there = limits.at(at)
+        moved = np.abs(limits.at(x) - there)
+        room = np.concatenate([_NEAR * np.abs(there[:psi]), np.full(len(there) - psi, _NEAR)])
+        if ((moved <= room) | (felt * moved <= _FELT)).all():
             return told
-    return model
+    return plant, x
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class Yardstick:
         if not self.own:
             return Owned(fitted, (self.under, self.on), fitted, fitted, (fitted.plant, fitted.x))
         if id(fitted) not in self._owned:
-            told = told or heard((fitted.plant, fitted.x), self._heard)
+            told = told or heard(fitted, self._heard)
             self._heard.append(told)
             one = owned(fitted, self.fit_data, self.select, self.under, told)
             self._owned |= {id(fitted): one, id(one.seen): one}
