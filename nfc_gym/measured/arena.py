@@ -12,8 +12,9 @@ from nfc_gym.measured.owned import Data, Told, heard
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.screen import Screened
 from nfc_gym.measured.settle import slack
-from nfc_gym.measured.shooting import RolloutProblem, finer
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.starting import starts
+from nfc_gym.measured.steps import finer
 from nfc_gym.measured.yardstick import Yardstick
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.conditions import Conditioned

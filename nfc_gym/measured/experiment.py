@@ -18,8 +18,9 @@ from nfc_gym.measured.envelope import Envelope, envelope
 from nfc_gym.measured.motions import patterns
 from nfc_gym.measured.room import Room, let_go, room
 from nfc_gym.measured.segments import commanded, servos
-from nfc_gym.measured.shooting import RolloutProblem, interpolate
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import States, channel_noise
+from nfc_gym.measured.steps import interpolate
 from nfc_gym.physics.effects.generic import TIME
 from nfc_gym.physics.effects.lookup import actuator_names
 from nfc_gym.physics.rollout import Plant

@@ -14,7 +14,8 @@ from nfc_gym.measured.fit import Fit, fit
 from nfc_gym.measured.metric import Metric
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Problem
-from nfc_gym.measured.shooting import RolloutProblem, finer
+from nfc_gym.measured.shooting import RolloutProblem
+from nfc_gym.measured.steps import finer
 from nfc_gym.physics.effects.base import Effect
 
 Array = NDArray[np.float64]

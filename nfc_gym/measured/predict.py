@@ -18,7 +18,8 @@ from nfc_gym.measured.export import unpack
 from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.segments import servos
-from nfc_gym.measured.shooting import RolloutProblem, interpolate
+from nfc_gym.measured.shooting import RolloutProblem
+from nfc_gym.measured.steps import interpolate
 from nfc_gym.physics.quiet import no_warnings
 from nfc_gym.physics.rollout import Plant
 

@@ -1,41 +1,29 @@
 """Multiple shooting: segments of logs rolled out from their measured starts, and the noise that their errors have."""
 
-import copy
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.log import Log
-from nfc_gym.measured.buffers import require_room
 from nfc_gym.measured.cuts import Cut, Layout, cut
-from nfc_gym.measured.draws import across
+from nfc_gym.measured.draws import near_by, starts_off
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.recent import Blocks
 from nfc_gym.measured.segments import lay, pick, refine, repeat
 from nfc_gym.measured.states import States, channel_noise
+from nfc_gym.measured.steps import coarser, finer, interpolate
 from nfc_gym.physics.effects.base import overrides
 from nfc_gym.physics.rollout import Plant
 from nfc_gym.physics.segments import Segments, Servo, Trajectory
 from nfc_gym.physics.state import integrate, quat_multiply, vector_to_quat
 
 Array = NDArray[np.float64]
-_DRAWS = 24  # starts, at most, from which the noise where bodies touch is estimated; a step's error from two in three
-_NEAR, _OFF = 4, 0.05  # psi that this noise is averaged over, with the one asked for, and how far off, a share of it
 _RECENT = 64_000_000  # bytes of residuals that a problem keeps
-
-
-def interpolate(grid: Array, step: Array, quaternion: bool) -> Array:
-    """Values (P, S, K + 1, dim) on the physics grid at steps (S, h), linearly: (P, S, h, dim)."""
-    low = np.clip(np.floor(step + 1e-9).astype(int), 0, grid.shape[2] - 2)
-    part = np.clip(step - low, 0, 1)[None, :, :, None]
-    block = np.arange(grid.shape[1])[:, None]
-    out = grid[:, block, low] * (1 - part) + grid[:, block, low + 1] * part
-    return out / np.linalg.norm(out, axis=-1, keepdims=True) if quaternion else out
 
 
 @dataclass(frozen=True)
@@ -306,18 +294,8 @@ class RolloutProblem(Problem):
 
     @cached_property
     def _draws(self) -> tuple[Array, int]:
-        """(D, S, 2 nv) draws of the starts' noise, and how many of them tell the discretisation's error.
-
-        Draws at right angles carry the linear part of the noise as exactly as a difference for each coordinate would.
-        """
-        sd = np.concatenate(self._start_sd, 1)
-        noisy = (sd > 0).any(0)
-        draws = np.zeros((1, *sd.shape))
-        if noisy.any():
-            found = across(np.random.default_rng(len(self)), len(self), int(noisy.sum()), _DRAWS)
-            draws = np.zeros((len(found), *sd.shape))
-            draws[..., noisy] = found * sd[:, noisy]
-        return draws, -(-2 * len(draws) // 3)
+        """(D, S, 2 nv) draws of the starts' noise, and how many of them tell the discretisation's error."""
+        return starts_off(np.concatenate(self._start_sd, 1))
 
     def _drawn(self, plant: Plant, x: Array, draws: Array, few: int) -> tuple[Array, Array]:
         """See `_impacts`, rolled out from starts off by draws (D, S, 2 nv), of which few tell the error of a step."""
@@ -328,14 +306,10 @@ class RolloutProblem(Problem):
 
     def _near(self, plant: Plant, x: Array, base: Array, count: int) -> tuple[Array, Array]:
         """(count, size) parameters, in turn x and a few with a psi near by, and (count, S, m) residuals under each."""
-        free = np.flatnonzero(plant.space.free)
-        rows = np.repeat(x[None], _NEAR, 0)
-        off = np.random.default_rng(self._recent.size).normal(size=(_NEAR - 1, len(free)))
-        low, high = plant.space.low[free], plant.space.high[free]
-        rows[1:, free] = np.clip(x[free] * (1 + _OFF * off), np.minimum(low, x[free]), np.maximum(high, x[free]))
+        rows = near_by(plant.space, x, self._recent.size)
         bases = np.concatenate([base[None], self.residual(plant, rows[1:])])
         bases = np.where(np.isfinite(bases).all(-1, keepdims=True), bases, base)
-        turn = np.arange(count) % _NEAR
+        turn = np.arange(count) % len(rows)
         return rows[turn], bases[turn]
 
     def _begun(self, draws: Array) -> Segments:
@@ -457,26 +431,3 @@ class RolloutProblem(Problem):
 def _question(plant: Plant, x: Array) -> Hashable:
     """All that a block's residual depends on besides the block; x (size,)."""
     return plant.model, plant.space, plant.effects, x.tobytes()
-
-
-def finer(plant: Plant) -> Plant:
-    """The same plant with half the physics step.
-
-    Raises:
-      InputError: a native delay of the model would be shorter (see `buffers`).
-    """
-    return Plant(_stepped(plant.model, 0.5), plant.space, plant.effects, plant.nthread)
-
-
-def coarser(plant: Plant) -> Plant:
-    """The same plant with twice the physics step."""
-    return Plant(_stepped(plant.model, 2.0), plant.space, plant.effects, plant.nthread)
-
-
-@lru_cache(maxsize=8)
-def _stepped(model: mujoco.MjModel, times: float) -> mujoco.MjModel:
-    """The model at so many times its step; one and the same for who asks again, so that a residual is known again."""
-    model = copy.copy(model)
-    model.opt.timestep *= times
-    require_room(model, model.opt.timestep)
-    return model

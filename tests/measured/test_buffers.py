@@ -11,7 +11,7 @@ from nfc_gym import InputError
 from nfc_gym.measured.bench import make_bench
 from nfc_gym.measured.buffers import make_room, require_room, set_step
 from nfc_gym.measured.checks import check, require
-from nfc_gym.measured.shooting import finer
+from nfc_gym.measured.steps import finer
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 from nfc_gym.physics.segments import Segments

@@ -12,8 +12,9 @@ from nfc_gym.measured.fit import fit, uncertainty
 from nfc_gym.measured.halved import artefacts, step_error
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.settle import settle
-from nfc_gym.measured.shooting import RolloutProblem, finer
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
+from nfc_gym.measured.steps import finer
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant

@@ -9,8 +9,9 @@ import pytest
 from nfc_gym.core import Channel, Log
 from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.metric import metric
-from nfc_gym.measured.shooting import RolloutProblem, finer
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
+from nfc_gym.measured.steps import finer
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
@@ -102,12 +103,12 @@ def test_the_noise_of_impacts_is_that_of_several_psi_near_by(monkeypatch: pytest
         anew = problem.take(np.arange(len(problem)))  # which knows of no psi yet
         return np.einsum("sii->i", anew.covariance(plant, at)) / len(problem)
 
-    monkeypatch.setattr("nfc_gym.measured.shooting._OFF", 1.0)
+    monkeypatch.setattr("nfc_gym.measured.draws._OFF", 1.0)
     rows = problem._near(plant, x, problem.residual(plant, x[None])[0], 4)[0]
     together = noise(x)
     assert rows[0] == x
     assert np.ptp(rows) > 0.3
-    monkeypatch.setattr("nfc_gym.measured.shooting._OFF", 0.0)
+    monkeypatch.setattr("nfc_gym.measured.draws._OFF", 0.0)
     alone = np.stack([noise(row) for row in rows])
     assert (np.abs(np.log(alone / alone[0])) > 0.1).any(), "else this would test nothing"
     np.testing.assert_allclose(together, alone.mean(0), rtol=0.15)

@@ -14,8 +14,9 @@ from nfc_gym.measured.forward import ForwardProblem
 from nfc_gym.measured.inverse import InverseProblem
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.segments import Segments
-from nfc_gym.measured.shooting import RolloutProblem, finer, interpolate
+from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
+from nfc_gym.measured.steps import finer, interpolate
 from nfc_gym.physics.effects import FAMILIES, build
 from nfc_gym.physics.effects.inertial import complete_inertia
 from nfc_gym.physics.parameters import Parameter, ParameterSpace
