@@ -60,7 +60,7 @@ def by_group(rows: Sequence[Score]) -> str:
         "psi in interval",
         "median s",
     )
-    lines = [_line(head), _line(["---"] * len(head))]
+    lines = [_line(head), _rule(len(head))]
     for group, words in (*GROUPS.items(), ("", "all")):
         mine = [r for r in rows if r.group == group or not group]
         if not mine:
@@ -75,7 +75,7 @@ def by_group(rows: Sequence[Score]) -> str:
 def by_machine(rows: Sequence[Score]) -> str:
     """A table with a row for each machine, in Markdown; X is over that of a perfect model."""
     lines = [_line(("machine", "hidden", "outcome", "said", "X: psi alone", "X: after", "s"))]
-    lines.append(_line(["---"] * 7))
+    lines.append(_rule(7))
     for r in rows:
         said = "; ".join(r.claims) or r.verdict
         said += f", at {r.said}" if r.said else ""
@@ -86,3 +86,7 @@ def by_machine(rows: Sequence[Score]) -> str:
 
 def _line(cells: Sequence[object]) -> str:
     return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def _rule(columns: int) -> str:
+    return "|" + "---|" * columns

@@ -106,11 +106,13 @@ def test_an_effect_is_seen_where_it_is_hidden_and_nothing_is_where_nothing_is(na
     assert max(m.simulation.visible(case.machine, clean, runs).values()) < 1e-6
 
 
-def test_a_size_is_sought_until_it_shows_as_wanted() -> None:
-    m, case = modules(), short("pan_tilt_delay")
-    full = m.machines.CASES[case.name]
-    drawn = m.drawing.draw(replace(case, sizes=full.sizes, shown=(40.0, 40.0)), 2)
-    assert 20 < max(drawn.shown.values()) < 80
+@pytest.mark.parametrize("wanted", [10.0, 90.0])
+def test_a_size_is_sought_until_it_shows_as_wanted(wanted: float) -> None:
+    m, case = modules(), short("ankle_spring")
+    sizes = m.machines.CASES[case.name].sizes
+    drawn = m.drawing.draw(replace(case, sizes=sizes, shown=(wanted, wanted)), 2)
+    assert wanted / 1.6 < max(drawn.shown.values()) < wanted * 1.6
+    assert sizes[0] <= drawn.effects[0].forms[0].parameters["stiffness"] <= sizes[1]
 
 
 def test_truths_know_nothing_of_the_package() -> None:
