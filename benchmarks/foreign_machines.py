@@ -12,6 +12,7 @@ against the truth, which lies elsewhere. A loop that fails or exceeds its limit 
 
 import argparse
 import json
+import signal
 import sys
 import tempfile
 import time
@@ -111,7 +112,7 @@ def run_and_score(args: argparse.Namespace, seed: int, folders: Folders) -> int:
     """Run what has not ended, the longest first; print a line each and the tables."""
     names = sorted(args.only, key=lambda n: -CASES[n].cost)
     if args.kept:
-        names = [n for n in names if folders.ending(n) is not None]
+        names = [n for n in names if folders.ended(n)]
     print(f"seed {seed} (drawn at run time unless given); {len(names)} machines, {args.jobs} at a time", flush=True)
     command = [sys.executable, str(Path(__file__).resolve()), "--draw", "--out", str(args.out), "--only"]
     drawing = {n: [*command, n] for n in names}
@@ -121,7 +122,7 @@ def run_and_score(args: argparse.Namespace, seed: int, folders: Folders) -> int:
         rows += shown((scored(n, folders) for n in finished), len(names))
     except KeyboardInterrupt:
         print("stopped" + ("; the same command goes on from here" if args.out else ""))
-        rows = [scored(n, folders) for n in names if folders.ending(n) is not None]
+        rows = [scored(n, folders) for n in names if folders.ended(n)]
     rows.sort(key=lambda r: (list(GROUPS).index(r.group), r.name))
     figures = summarise(rows, seed)
     print("\n".join(("", by_machine(rows), "", by_group(rows), "")))
@@ -158,4 +159,6 @@ def shown(rows: Iterable[Score], total: int) -> Iterator[Score]:
 
 
 if __name__ == "__main__":
+    for how in (signal.SIGINT, signal.SIGTERM):  # loops are processes of their own: whoever ends this ends them, too
+        signal.signal(how, signal.default_int_handler)
     sys.exit(ended(main))

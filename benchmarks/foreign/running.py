@@ -45,6 +45,11 @@ class Folders:
         path = self.loop(name) / "ended.json"
         return json.loads(path.read_text()) if path.exists() else None
 
+    def ended(self, name: str) -> bool:
+        """Whether a loop has ended by itself or by its limit: one that was stopped is to go on."""
+        ending = self.ending(name)
+        return ending is not None and ending["code"] != STOPPED
+
     def done(self, name: str, limit: float) -> bool:
         """Whether there is nothing to run: a report, or a loop that had as much time as it may have."""
         ended = self.ending(name)
@@ -119,6 +124,7 @@ def run(
                 yield running[done]
         except BaseException:
             runner.stop()
+            pool.shutdown(cancel_futures=True)
             raise
 
 

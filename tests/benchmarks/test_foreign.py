@@ -274,6 +274,7 @@ def test_what_has_ended_is_not_run_again_and_what_has_failed_is(tmp_path: Path) 
         (folders.loop(name) / "ended.json").write_text(json.dumps({"code": code, "seconds": seconds}))
     assert [n for n in (*ends, "new") if folders.done(n, 60)] == ["fine", "slow"]
     assert [n for n in (*ends, "new") if folders.done(n, 600)] == ["fine"]  # more time than it had
+    assert [n for n in (*ends, "new") if folders.ended(n)] == ["fine", "slow", "broken"]  # rows of a table
 
 
 def test_a_run_that_cannot_begin_is_a_row(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
