@@ -14,18 +14,18 @@ _RMS = 0.2  # root mean square of an entry of AdamW's steps (Liu et al. 2025), s
 
 
 def orthogonal(matrices: Tensor) -> Tensor:
-    """(..., m, n) matrices with all their singular values brought near 1 (0.7 to 1.2), by Newton and Schulz.
+    """(k, m, n) matrices with all their singular values brought near 1 (0.7 to 1.2), by Newton and Schulz.
 
     A gradient of a layer has few large singular values. What it says of the other directions, by which narrow
     posteriors are told from one another, is lost in a step as large as those allow.
     """
     a, b, c = _QUINTIC
-    tall = matrices.shape[-2] > matrices.shape[-1]
+    tall = matrices.shape[1] > matrices.shape[2]
     x = matrices.mT if tall else matrices
-    x = x / x.norm(dim=(-2, -1), keepdim=True).clamp(min=1e-30)
+    x = x / x.norm(dim=(1, 2), keepdim=True).clamp(min=1e-30)
     for _ in range(_ROUNDS):
         gram = x @ x.mT
-        x = a * x + (b * gram + c * gram @ gram) @ x
+        x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
     return x.mT if tall else x
 
 
@@ -49,28 +49,54 @@ class Muon(optim.Optimizer):
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # type: ignore[override]
         """One step; the gradients are there, and no closure is called."""
-        kept = 1 - self.lost
         for group in self.param_groups:
-            alike: dict[tuple[int, ...], list[nn.Parameter]] = {}
-            for p in group["params"]:
-                if p.grad is not None:
-                    alike.setdefault((p.shape[0], p[0].numel()), []).append(p)
-            for (m, n), params in alike.items():
-                now = torch.stack([self._leaning(p, kept).flatten(1) for p in params])
-                steps = orthogonal(now) * (_RMS * math.sqrt(max(m, n)) * kept * group["lr"])
-                stay = 1 - kept * group["lr"] * group["weight_decay"]
-                for p, change in zip(params, steps, strict=True):
-                    p.mul_(stay).sub_(change.view_as(p))
+            params = [p for p in group["params"] if p.grad is not None]
+            rate = group["lr"] * (1 - self.lost)
+            changes = _orthogonal_all([g.flatten(1) for g in self._leaning(params)])
+            torch._foreach_mul_(params, 1 - rate * group["weight_decay"])  # type: ignore[attr-defined]
+            torch._foreach_mul_(changes, rate)  # type: ignore[attr-defined]
+            torch._foreach_sub_(params, [c.view_as(p) for c, p in zip(changes, params, strict=True)])  # type: ignore[attr-defined]
 
-    def _leaning(self, p: nn.Parameter, kept: Tensor) -> Tensor:
-        """The gradient, leaning towards the momentum, which follows it (Nesterov)."""
-        assert p.grad is not None  # the caller has asked
-        gradient = torch.where(self.lost == 0, p.grad, 0.0)
-        if "momentum" not in self.state[p]:
-            self.state[p]["momentum"] = torch.zeros_like(p)
-        momentum = self.state[p]["momentum"]
-        momentum.lerp_(gradient, (1 - _MOMENTUM) * kept)
-        return gradient.lerp(momentum, _MOMENTUM)
+    def _leaning(self, params: list[nn.Parameter]) -> list[Tensor]:
+        """Gradients, leaning towards their momentum, which follows them (Nesterov)."""
+        for p in params:
+            if "momentum" not in self.state[p]:
+                self.state[p]["momentum"] = torch.zeros_like(p)
+        momenta = [self.state[p]["momentum"] for p in params]
+        # Where all is lost the gradient may be no number, and the momentum stays.
+        fine = self.lost == 0
+        gradients = [torch.where(fine, p.grad, m) for p, m in zip(params, momenta, strict=True)]  # type: ignore[arg-type]
+        torch._foreach_lerp_(momenta, gradients, 1 - _MOMENTUM)  # type: ignore[attr-defined]
+        return list(torch._foreach_lerp(gradients, momenta, _MOMENTUM))  # type: ignore[attr-defined]
+
+
+def _orthogonal_all(matrices: list[Tensor]) -> list[Tensor]:
+    """Each made orthogonal, with entries as large as AdamW's steps have.
+
+    A GPU takes the time of a kernel for a small matrix: those of about one size are filled up with zeros, which stay
+    zeros, and done together.
+    """
+    alike: dict[tuple[int, int], list[int]] = {}
+    for i, matrix in enumerate(matrices):
+        alike.setdefault((_power(min(matrix.shape)), _power(max(matrix.shape))), []).append(i)
+    out = list(matrices)
+    for members in alike.values():
+        wide = [matrices[i].mT if _tall(matrices[i]) else matrices[i] for i in members]
+        m, n = (max(w.shape[k] for w in wide) for k in (0, 1))
+        done = orthogonal(torch.stack([nn.functional.pad(w, (0, n - w.shape[1], 0, m - w.shape[0])) for w in wide]))
+        for i, w, whole in zip(members, wide, done, strict=True):
+            part = whole[: w.shape[0], : w.shape[1]] * (_RMS * math.sqrt(max(w.shape)))
+            out[i] = (part.mT if _tall(matrices[i]) else part).contiguous()
+    return out
+
+
+def _tall(matrix: Tensor) -> bool:
+    return matrix.shape[0] > matrix.shape[1]
+
+
+def _power(size: int) -> int:
+    """The next power of two."""
+    return 1 << (size - 1).bit_length()
 
 
 class Optimiser:
