@@ -11,7 +11,7 @@ from nfc_gym.measured import marginal
 from nfc_gym.measured.contest import clusters
 from nfc_gym.measured.distances import Model
 from nfc_gym.measured.elsewhere import STARTS, Ended, hollows, resized
-from nfc_gym.measured.fit import TURNING, Fit, differs, stand
+from nfc_gym.measured.fit import Fit, differs, stand
 from nfc_gym.measured.halved import step_error
 from nfc_gym.measured.metric import Metric, metric
 from nfc_gym.measured.owned import heard
@@ -95,8 +95,7 @@ def _settled(
     plant, stage = start.plant, f"final {name}"
     if run.stages.get(stage) is None:
         run.say(f"fitting the {name} model on all {len(whole)} segments")
-        # Nothing is claimed any more of what this leaves: slopes may serve twice, and the last fit takes them anew.
-        fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x, serve=TURNING)
+        fitted, under, extra = settle(whole, whole.covariance(plant, start.x), plant, start.x)
         if not whole.rough and (other := resized(whole, under, fitted)) is not fitted:
             fitted, under, extra = settle(whole, whole.covariance(plant, other.x), plant, other.x)
         if run.bench.short:

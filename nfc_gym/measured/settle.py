@@ -29,7 +29,6 @@ def settle(
     seed: int | None = None,
     rounds: int = 12,
     tick: Callable[[int], None] = lambda turn: None,
-    serve: int = 1,
 ) -> tuple[Fit, Metric, Array]:
     """Refit every parameter and refresh the metric in turns until it hardly changes.
 
@@ -39,7 +38,6 @@ def settle(
       seed: of the polish that rough problems get; None for a start that needs none.
       rounds: iterations of each refit, at most.
       tick: called with the number of each turn, from 1.
-      serve: iterations that slopes serve, but for the last fit, see `fit`.
 
     Returns:
       The fit, the metric it was fitted under, and that metric's slack (m,).
@@ -50,7 +48,7 @@ def settle(
         tick(turn)
         under = metric(problem, sigma, extra)
         # Later turns start where the first one ended.
-        x = fitted(problem, under, plant, x, rounds if turn == 1 else rounds // 2, serve)
+        x = fitted(problem, under, plant, x, rounds if turn == 1 else rounds // 2)
         if problem.rough and seed is not None and turn == 1:
             x = polish(problem, under, plant, x, _EVALUATIONS, seed)
         before, extra = extra, slack(problem, sigma, plant, x)
