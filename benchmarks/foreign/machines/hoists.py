@@ -30,8 +30,8 @@ CRANE = Machine(
         Parameter("load_mass", "body_mass", ("hook",), "kg"),
         Parameter("bridge_damping", "dof_damping", ("bridge",), "N s/m", 0.25),
     ),
-    (*joints("bridge", 1e-3, "mm"), Channel("joint:swing:pos", ("swing",), "deg", 2e-3),
-     Channel("joint:hoist:pos", ("depth",), "cm", 1e-3)),
+    (*joints("bridge", 3e-4, "mm"), Channel("joint:swing:pos", ("swing",), "deg", 6e-4),
+     Channel("joint:hoist:pos", ("depth",), "cm", 3e-4)),
     (Control("drive", "force", "N"), Control("winch", "goal", "mm")), hauling, 50, 6.0,
 )  # fmt: skip
 
@@ -96,7 +96,7 @@ CASES = (
         _dry_and_slow,
         what="times 8 to 16 N of dry friction at the bridge and 40 to 100 ms of lag of its drive",
         sizes=(0.2, 1.2),
-        shown=(15, 80),
+        shown=(30, 120),
         cost=200,
     ),
     Case(
