@@ -221,7 +221,7 @@ def opened(out: Path, args: argparse.Namespace) -> tuple[Kept, int]:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robots", nargs="+", default=["Jackal", "Ant"],
+    parser.add_argument("--robots", nargs="+", type=str.capitalize, default=["Jackal", "Ant"],
                         choices=("Jackal", "Ant", "Quadruped", "Humanoid", "Quadcopter"),
                         help="default Jackal Ant")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="DIR", help="keeps finished parts: a stopped run goes on")

@@ -145,7 +145,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--quick", action="store_true", help="one robot, few steps")
-    add("--robots", nargs="+", choices=ROBOTS, default=ROBOTS[:4])
+    add("--robots", nargs="+", type=str.capitalize, choices=ROBOTS, default=ROBOTS[:4])
     add("--threads", type=count(0), default=2, help="of the replays' physics")
     add("--draws", type=count(1), default=100, help="of psi from the posterior, each step")
     add("--repeats", type=count(0), default=5)

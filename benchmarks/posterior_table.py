@@ -154,7 +154,9 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="folder for windows, cells and tables")
     parser.add_argument("--data", type=Path, help="folder for windows and ceilings, where several DIR share them")
-    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS), help="default all")
+    parser.add_argument(
+        "--robots", nargs="+", type=str.capitalize, choices=ROBOTS, default=list(ROBOTS), help="default all"
+    )
     parser.add_argument("--terrain", nargs="+", choices=TERRAINS, default=list(TERRAINS), help="default both")
     parser.add_argument(
         "--methods", nargs="*", choices=list(METHODS), default=list(METHODS),

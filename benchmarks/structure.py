@@ -60,7 +60,14 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--quick", action="store_true", help="a toy's head, one tiny trial of the Quadcopter")
-    add("--robots", nargs="+", choices=list(ENVIRONMENTS), default=["quadcopter"], help="default quadcopter")
+    add(
+        "--robots",
+        nargs="+",
+        type=str.lower,
+        choices=list(ENVIRONMENTS),
+        default=["quadcopter"],
+        help="default quadcopter",
+    )
     add("--trials", type=count(0), default=6, help="machines a robot, each with one effect (default 6)")
     add("--nulls", type=count(0), default=0, help="machines a robot without any")
     add("--windows", type=count(1), default=Course().windows, help="that a head is trained on")

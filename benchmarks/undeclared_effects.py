@@ -67,7 +67,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     families = sorted({f for r in ROBOTS.values() for f in r.kinds})
     add = parser.add_argument
     add("--quick", action="store_true", help="one tiny trial a robot, with one or two families in the contest")
-    add("--robots", nargs="+", choices=list(ROBOTS), help="default all; with --quick the Quadcopter")
+    add("--robots", nargs="+", type=str.lower, choices=list(ROBOTS), help="default all; with --quick the Quadcopter")
     add("--trials", "--seeds", type=count(0), default=1, help="machines of each single effect, a robot (default 1)")
     add("--effects", nargs="+", choices=families, metavar="FAMILY", help="only these single effects")
     add("--pairs", type=count(0), default=0, help="machines with two effects, a robot")

@@ -40,7 +40,7 @@ def test_a_step_is_as_of_torchs_own(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = a_network(), a_network()
     begin = [p.detach().clone() for p in ours.parameters()]
     matrices = [p for p in ours.parameters() if p.ndim > 1]
-    descend(ours, Muon(matrices, torch.tensor(3e-3), 0.1, torch.tensor(0.0)))
+    descend(ours, Muon(matrices, torch.tensor(1e-3), 0.3, torch.tensor(0.0)))  # a step is three times as large
     descend(theirs, torch.optim.Muon([p for p in theirs.parameters() if p.ndim > 1], 3e-3, 0.1,
                                      adjust_lr_fn="match_rms_adamw"))  # fmt: skip
     for before, a, b in zip(begin, ours.parameters(), theirs.parameters(), strict=True):
