@@ -13,6 +13,7 @@ _MOMENTUM = 0.95
 # Root mean square of an entry of a step over the step size. AdamW's have 1 at first and 0.2 in long runs (Liu et al.
 # 2025); with a third of this, posteriors of an Ant learned less in as many steps.
 _RMS = 0.6
+_WIDEST = 512  # of a matrix's smaller side: a larger one would cost a processor many times what the rest of a step does
 
 
 def orthogonal(matrices: Tensor) -> Tensor:
@@ -102,7 +103,9 @@ def _power(size: int) -> int:
 
 
 class Optimiser:
-    """Both as one: `Muon` for what has two axes or more, AdamW for the rest and for all where there is no Muon.
+    """Both as one: `Muon` for matrices and kernels, AdamW for the rest.
+
+    That is biases, matrices with more than 512 inputs and more than 512 outputs, and all where there is no Muon.
 
     Args:
       network: on its device.
@@ -114,8 +117,8 @@ class Optimiser:
 
     def __init__(self, network: nn.Module, rate: float, decay: float, lost: Tensor, muon: bool = True) -> None:
         params = [p for p in network.parameters() if p.requires_grad]
-        matrices = [p for p in params if p.ndim > 1] if muon else []
-        rest = [p for p in params if p.ndim <= 1 or not muon]
+        matrices = [p for p in params if muon and p.ndim > 1 and min(p.shape[0], p[0].numel()) <= _WIDEST]
+        rest = [p for p in params if all(p is not m for m in matrices)]
         self.rate = torch.full((), rate, device=lost.device)
         self.parts: list[optim.Optimizer] = []
         if rest:

@@ -13,6 +13,7 @@ _SEEN = 0.64  # of a squared error: where noise makes up more of it, the error i
 _NOTHING = 0.05  # of the noise's variance: a squared error that exceeds it by less counts as taken away whole
 _SHARES = (0.0, *10.0 ** np.arange(-5, 2))  # of the errors' variance, among which slack is looked for
 _PAST = 2  # of them in a row that do no better, after which no more is looked for
+_EXACT = 1e-4  # share of it to which an excess variance is found
 _TURN = 3.0  # standard deviations at which the loss turns from squared to linear
 
 
@@ -72,22 +73,44 @@ def beyond(error: Array, noise: Array) -> NDArray[np.bool_]:
 def unexplained_variance(problem: Problem, residual: Array, sigma: Array) -> Array:
     """(m,) variance of each kind of column (quantity, place, horizon) beyond what the noise explains.
 
-    It comes from the middle of the residuals' spread; residual (S, m) and sigma (S, m, m) are those of the best model
-    so far. Candidates of one round are compared under one such variance, so that no model is flattered by a metric of
-    its own.
+    It comes from the spread of the residuals, each by the noise of its own block; residual (S, m) and sigma (S, m, m)
+    are those of the best model so far. Candidates of one round are compared under one such variance, so that no model
+    is flattered by a metric of its own.
     """
     values = np.where(problem.mask & np.isfinite(residual), residual, np.nan)
     expected = np.where(problem.mask, np.einsum("sii->si", sigma), np.nan)
     out = np.zeros(len(problem.columns))
     for of in _kinds(problem):
-        errors, known = values[:, of], expected[:, of]
-        if not np.isfinite(errors).any():
+        there = np.isfinite(values[:, of])
+        if not there.any():
             continue
-        spread = _spread(errors)
-        # Where bodies touch, some blocks are far out for reasons of their own; they must not buy all the others slack.
-        heavy = 0.0 if problem.rough else np.nanmean(np.minimum(errors**2, 9 * spread if spread > 0 else np.inf))
-        out[of] = max(max(spread, heavy) - np.nanmedian(known), 0.0)
+        errors, known = values[:, of][there], expected[:, of][there]
+        # Where bodies touch, some blocks are far out for reasons of their own, and others expect landings to err more
+        # than any does; neither may buy all the others slack, and the middle of both is asked.
+        out[of] = max(_spread(errors) - np.median(known), 0.0) if problem.rough else _excess(errors, known)
     return out
+
+
+def _excess(errors: Array, known: Array) -> float:
+    """Variance, equal for all, that errors (n,) need beside the variances (n,) known of each to be of unit size.
+
+    Blocks of one log may differ a hundredfold in what noise they expect, as a fast motion does in what its start and
+    the step make of it. The mean square of their errors is then far above the middle of what is expected, though the
+    noise explains every one of them; and slack for that would hide what the precise blocks tell.
+    """
+    low, high = 0.0, _size(errors)
+    if _size(errors / np.sqrt(np.maximum(known, 1e-300))) <= 1:
+        return 0.0
+    while high - low > _EXACT * high:
+        middle = (low + high) / 2
+        low, high = (middle, high) if _size(errors / np.sqrt(known + middle)) > 1 else (low, middle)
+    return high
+
+
+def _size(errors: Array) -> float:
+    """Variance of errors (n,) by the middle of their spread, or by all of them, those far out as three deviations."""
+    spread = _spread(errors)
+    return max(spread, float(np.minimum(errors**2, 9 * spread if spread > 0 else np.inf).mean()))
 
 
 def likeliest_slack(problem: Problem, residual: Array, sigma: Array) -> Array:

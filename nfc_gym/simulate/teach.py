@@ -24,8 +24,9 @@ from nfc_gym.simulate.observed import require_unfeeling
 from nfc_gym.simulate.witness import MISFIT
 
 HELD_OUT = 0.05  # of the windows, by which epochs are compared
-# Few passes, since windows are shown several times in each: more, and their noise is learned by heart.
-TRAINING = TrainConfig(epochs=4, rate=1e-3, decay=0.02, patience=6)
+# Few passes, since windows are shown several times in each: more, and their noise is learned by heart. By AdamW: Muon
+# learns it sooner (held out 2.52, trained on 1.45, where AdamW has 2.46 and 2.00; 4000 windows, three showings).
+TRAINING = TrainConfig(epochs=4, rate=1e-3, muon=False, decay=0.02, patience=6)
 NETWORK = NetworkConfig(encoder="tcn", density="mixture", components=1, width=384, features=256, hidden=256)
 
 

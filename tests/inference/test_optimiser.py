@@ -58,6 +58,18 @@ def test_a_kernel_of_a_convolution_is_a_matrix_of_outputs() -> None:
     assert torch.equal(kernel.flatten(1), flat)
 
 
+def test_wide_matrices_and_biases_are_left_to_adamw() -> None:
+    net = nn.Sequential(nn.Linear(2000, 600), nn.Linear(600, 40))
+    for p in net.parameters():
+        p.grad = torch.ones_like(p)
+    optimiser = Optimiser(net, 1e-3, 0.0, torch.tensor(0.0))
+    optimiser.step()
+    moments = [name for name in optimiser.tensors() if name.endswith("/momentum")]
+    second = [t.shape for name, t in optimiser.tensors().items() if name.endswith("/exp_avg_sq")]
+    assert len(moments) == 1
+    assert second == [(600, 2000), (600,), (40,)]
+
+
 def test_nothing_is_changed_once_it_is_lost() -> None:
     lost = torch.tensor(0.0)
     net = a_network()

@@ -122,6 +122,21 @@ def test_unexplained_variance_is_what_the_noise_leaves() -> None:
     np.testing.assert_array_equal(unexplained_variance(problem, 0.1 * residual * mask, sigma)[1], 0)
 
 
+@pytest.mark.parametrize("rough", [False, True])
+def test_noise_that_differs_from_block_to_block_buys_no_slack(rough: bool) -> None:
+    """Blocks of 0.1 to 10 deviations, all as they are expected: their mean square is ten times the middle one's."""
+    rng, blocks = np.random.default_rng(6), 4000
+    problem = Plain(np.ones((blocks, 2), bool))
+    problem.rough = rough
+    deviations = 10 ** rng.uniform(-1, 1, (blocks, 1)) * [1, 3]
+    sigma = deviations[:, :, None] ** 2 * np.eye(2)
+    residual = deviations * rng.normal(size=(blocks, 2))
+    assert (unexplained_variance(problem, residual, sigma) < 0.05 * np.median(deviations**2, 0)).all()
+    more = residual + rng.normal(size=(blocks, 2)) * [2.0, 6.0]
+    if not rough:
+        np.testing.assert_allclose(unexplained_variance(problem, more, sigma), [4, 36], rtol=0.15)
+
+
 def test_what_one_metric_whitened_is_seen_by_another() -> None:
     problem, rng = Plain(np.ones((SIZE, WIDTH), bool)), np.random.default_rng(2)
     one, other = metric(problem, covariance()), metric(problem, covariance(), np.arange(1.0, WIDTH + 1))
