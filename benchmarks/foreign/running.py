@@ -90,12 +90,15 @@ class Runner:
         """End what is running, and begin nothing more."""
         self.stopping.set()
         for process in tuple(self.live):
-            _signal(process, signal.SIGINT)
+            _signal(process, signal.SIGTERM)
 
 
 def _end(process: subprocess.Popen) -> None:
-    """Ask, so that the loop keeps its finished stages; then end by force."""
-    for how in (signal.SIGINT, signal.SIGKILL):
+    """Ask, then end by force; a loop keeps its finished stages either way.
+
+    Not by SIGINT: what is begun in a shell's background is deaf to it, and so is all that it begins.
+    """
+    for how in (signal.SIGTERM, signal.SIGKILL):
         _signal(process, how)
         try:
             process.wait(PATIENCE)

@@ -2,7 +2,9 @@
 
 import ast
 import json
+import signal
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -255,6 +257,15 @@ def test_a_component_is_off_by_a_share_of_its_vector() -> None:
 # ---- running --------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def in_the_background() -> Iterator[None]:
+    """As of a shell's `&`: deaf to SIGINT, with all that is begun."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("in_the_background")
 def test_a_command_that_takes_too_long_is_ended_and_its_words_are_kept(tmp_path: Path) -> None:
     runner, log = modules().running.Runner(), tmp_path / "log.txt"
     slow = [sys.executable, "-c", "print('begun', flush=True); import time; time.sleep(60)"]
