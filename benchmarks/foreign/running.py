@@ -77,6 +77,8 @@ class Runner:
                 start_new_session=True,
             )  # fmt: skip
             self.live.add(process)
+            if self.stopping.is_set():  # between the question above and now
+                _signal(process, signal.SIGTERM)
             try:
                 code = process.wait(limit)
             except subprocess.TimeoutExpired:

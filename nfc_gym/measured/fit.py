@@ -255,10 +255,11 @@ def polish(problem: Problem, metric: Metric, plant: Plant, x: Array, evaluations
     if not len(limits.scale):
         return x
     z = np.clip(limits.at(x), limits.floor, limits.roof)
+    best, value = z, objective(problem, metric, limits, z[None], x)[0]
     if len(z) == 1:  # CMA-ES wants two dimensions: a scan does for one
         draws = np.linspace(limits.floor, limits.roof, evaluations)
         values = objective(problem, metric, limits, draws, x)
-        best, value = draws[values.argmin()], float(values.min())
+        best = draws[values.argmin()] if values.min() < value else best
     else:
         import cma  # where it is used: it imports matplotlib, a second that few commands need
 
@@ -267,10 +268,13 @@ def polish(problem: Problem, metric: Metric, plant: Plant, x: Array, evaluations
         search, race = cma.CMAEvolutionStrategy(z, _SPREAD, options), Race(problem, metric)
         while not search.stop():  # who is best counts, and roughly how the others follow
             draws = np.array(search.ask())
-            values = race.ranked(plant, limits.x(draws, x)) + limits.pulled(draws)
-            search.tell(list(draws), values.tolist())
-        best, value = np.asarray(search.result.xbest), float(search.result.fbest)
-    if value >= objective(problem, metric, limits, z[None], x)[0]:
+            losses, ranks = race.ranked(plant, limits.x(draws, x))
+            pulled = limits.pulled(draws)
+            first = (losses + pulled).argmin()
+            if losses[first] + pulled[first] < value:
+                best, value = draws[first], losses[first] + pulled[first]
+            search.tell(list(draws), (ranks + pulled).tolist())
+    if best is z:
         return x
     return fitted(problem, metric, plant, limits.x(best, x), 4)
 

@@ -41,10 +41,10 @@ class Race:
         """(P,) losses of parameter vectors x (P, size) over all blocks; infinite for those lost on the way."""
         return self._run(plant, x)[0]
 
-    def ranked(self, plant: Plant, x: Array) -> Array:
-        """(P,) the same, but those lost on the way have what the blocks they were asked of make likely."""
+    def ranked(self, plant: Plant, x: Array) -> tuple[Array, Array]:
+        """(P,) the same, and what to rank by: those lost have what the blocks they were asked of make likely."""
         losses, likely = self._run(plant, x)
-        return np.where(np.isinf(losses), np.maximum(likely, losses.min()), losses)
+        return losses, np.where(np.isinf(losses), np.maximum(likely, losses.min()), losses)
 
     def _run(self, plant: Plant, x: Array) -> tuple[Array, Array]:
         """(P,) losses, infinite for those lost; (P,) what the blocks that each was asked of say of all."""

@@ -11,6 +11,7 @@ from nfc_gym.measured.arena import alternatives, contains
 from nfc_gym.measured.box import box
 from nfc_gym.measured.fit import COARSE, TINY, TURNING, _Asked, fit, fitted, polish
 from nfc_gym.measured.metric import Metric, loss
+from nfc_gym.measured.race import Race
 from nfc_gym.measured.screen import probe_sets
 from nfc_gym.physics.effects.air import DragLinear
 from nfc_gym.physics.effects.base import Effect
@@ -151,6 +152,16 @@ def test_a_polish_is_never_worse_and_mends_a_poor_start(seed: int) -> None:
     better = polish(problem, under, flat, poor.x, 120, seed)
     assert loss(under.whiten(problem.residual(flat, better[None]))).sum() <= loss(poor.white).sum()
     np.testing.assert_allclose(better, [0.6, -0.4], atol=0.05)
+
+
+def test_a_polish_takes_no_draw_for_better_that_some_blocks_alone_speak_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(self: Race, plant: Plant, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(len(x), np.inf), np.zeros(len(x))
+
+    problem, under, flat = rugged()
+    start = np.array([-1.5, 1.5])
+    monkeypatch.setattr(Race, "ranked", lost)
+    np.testing.assert_array_equal(polish(problem, under, flat, start, 40, 0), start)
 
 
 def test_places_with_values_of_their_own_are_probed_at_one_shape() -> None:

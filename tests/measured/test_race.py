@@ -59,7 +59,8 @@ def test_those_that_stay_have_the_losses_of_all_blocks() -> None:
 def test_who_is_lost_is_ranked_by_what_was_seen_of_it_and_behind_all_that_are_not() -> None:
     running, problem = race(np.random.default_rng(3).normal(size=30))
     x = np.array([0.0, 0.1, 9.0, 5.0, 7.0])[:, None]
-    ranked = running.ranked(PLANT, x)
+    losses, ranked = running.ranked(PLANT, x)
+    assert np.isinf(losses[2:]).all()
     np.testing.assert_array_equal(np.argsort(ranked)[2:], [3, 4, 2])
     np.testing.assert_array_equal(ranked[:2], running.losses(PLANT, x)[:2])
     whole = Race(Targets(problem.target[:3]), Metric(np.ones((3, 1, 1)), problem.mask[:3]))  # too few to race

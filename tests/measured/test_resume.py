@@ -132,10 +132,8 @@ def test_an_interrupted_run_says_how_to_go_on(
         time.sleep(0.01)
     run.send_signal(sign)
     _, errors = run.communicate(timeout=30)
-    assert run.returncode == 3
-    assert errors.split("\n") == [
-        "nfc-gym close-loop: interrupted; the same command goes on from what it had finished", ""
-    ]  # fmt: skip
+    said = "nfc-gym close-loop: interrupted; the same command goes on from what it had finished\n"
+    assert (run.returncode, errors) == (3, said)
     assert not (tmp_path / "out" / "run_0" / "report.json").exists()
 
 
