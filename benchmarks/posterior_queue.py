@@ -118,7 +118,7 @@ def run(args: argparse.Namespace, place: str, name: str, flags: list[str], gpu: 
         sys.executable, str(TABLE), "--robots", robot, "--terrain", terrain, "--windows",
         str(args.windows.get(place, args.residual_windows)), "--device", device, "--stop", f"{left:.0f}", *flags,
         "--seeds", *map(str, args.seeds), *(["--small"] if args.small else []), *(["--mirror"] if args.mirror else []),
-        *(["--adamw"] if args.adamw else []),
+        *(["--adamw"] if args.adamw else []), *(["--compile"] if args.compile else []),
     ]  # fmt: skip
     command += [part for name in PASSED for part in (f"--{name}", str(getattr(args, name.replace("-", "_"))))]
     env = os.environ | ({} if gpu in (None, "cpu") else {"CUDA_VISIBLE_DEVICES": gpu})
@@ -285,10 +285,11 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--small", action="store_true", help="networks of a toy's size")
     parser.add_argument("--mirror", action="store_true", help="show half of each step's windows in each mirror")
     parser.add_argument("--adamw", action="store_true", help="change matrices by AdamW too, in place of Muon")
+    parser.add_argument("--compile", action="store_true", help="compile training steps first")
     args = parser.parse_args()
     if args.quick:
-        args.windows, args.methods, args.inputs, args.gpus = ["JackalFlat=256"], ["mdn-rff"], ["summaries"], ["cpu"]
-        args.per_gpu, args.jobs, args.judges, args.samples, args.small = 1, 1, 64, 64, True
+        args.windows, args.methods, args.inputs, args.gpus = ["JackalFlat=128"], ["mdn-rff"], ["summaries"], ["cpu"]
+        args.per_gpu, args.jobs, args.judges, args.samples, args.small = 1, 1, 32, 32, True
         args.epochs, args.budget, args.ceiling_windows, args.batch, args.residuals = 1, 1.0, 1, 64, []
     elif args.out is None:
         parser.error("name a folder: --out DIR")

@@ -93,7 +93,8 @@ def main() -> None:
         device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device
                               if args.device != "auto" else "cpu")  # fmt: skip
         plan = Plan(
-            args.epochs, args.budget, args.batch, args.rate, args.draws, args.small, args.mirror, muon=not args.adamw
+            args.epochs, args.budget, args.batch, args.rate, args.draws, args.small, args.mirror, not args.adamw,
+            args.compile,
         )  # fmt: skip
         kept = Kept(args.out, {"judges": args.judges, "samples": args.samples, **plan.settings})
         run = Run(args, kept, plan, device, time.monotonic() + args.stop if args.stop else float("inf"))
@@ -237,6 +238,9 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--adamw", action="store_true", help="change matrices by AdamW too, in place of Muon")
     parser.add_argument(
+        "--compile", action="store_true", help="compile training steps first, which takes part of the budget"
+    )
+    parser.add_argument(
         "--jobs", type=count(0), default=0, help="processes of the simulation; default 0 takes all cores"
     )
     parser.add_argument(
@@ -272,7 +276,7 @@ def _arguments() -> argparse.Namespace:
     if args.quick:
         args.robots, args.terrain, args.inputs, args.extras = ["Jackal"], ["Flat"], ["window"], ["ceiling"]
         args.methods = [m for m in args.methods if m != "sbi-npse"]  # its 500 steps a draw take minutes on a processor
-        args.windows, args.judges, args.samples, args.epochs, args.small = 512, 64, 64, 2, True
+        args.windows, args.judges, args.samples, args.epochs, args.small = 128, 32, 32, 1, True
         args.ceiling_windows, args.ceiling_draws, args.jobs, args.peer_judges = 1, [16, 4], 1, 8
     return args
 

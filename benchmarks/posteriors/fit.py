@@ -36,6 +36,7 @@ class Plan(NamedTuple):
       draws: of noise a window and step, of score models.
       small: networks of a toy's size.
       muon: whether matrices are changed by Muon, else by AdamW as all else is; no peer's are.
+      compiled: whether a training step is compiled first, see `TrainConfig`; no peer's is.
       mirror: whether half of the windows of each step are shown in each mirror; no peer's are, and none with maps.
     """
 
@@ -47,11 +48,14 @@ class Plan(NamedTuple):
     small: bool
     mirror: bool = False
     muon: bool = True
+    compiled: bool = False
 
     @property
     def settings(self) -> dict[str, Any]:
         """What a finished cell depends on; what is not there is not named, as by earlier versions, which had none."""
-        return {name: value for name, value in self._asdict().items() if name not in ("mirror", "muon") or value}
+        return {
+            name: value for name, value in self._asdict().items() if name not in ("mirror", "muon", "compiled") or value
+        }
 
 
 class Cell(NamedTuple):
@@ -86,7 +90,8 @@ def fit_network(
     network = Network(config, sizes, prior, seed).to(device)
     first, held_out = windows.split(HELD_OUT)
     training = TrainConfig(
-        epochs=plan.epochs, batch=plan.batch, rate=plan.rate, muon=plan.muon, seed=seed, save_every=_SAVE,
+        epochs=plan.epochs, batch=plan.batch, rate=plan.rate, muon=plan.muon, compiled=plan.compiled, seed=seed,
+        save_every=_SAVE,
         mixed=config.elevation, budget=plan.budget, patience=plan.epochs if plan.budget else TrainConfig.patience,
     )  # fmt: skip
     mirror = _mirror(prior) if plan.mirror and not config.elevation else None

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.whole import require_whole
+from nfc_gym.inference.compiled import Compiled, Losses
 from nfc_gym.inference.data import Batch, TensorWindows, WindowSet, resident
 from nfc_gym.inference.graphs import Graphs
 from nfc_gym.inference.learner import Learner
@@ -46,6 +47,7 @@ class TrainConfig:
       budget: seconds that training takes at most, 0 for any number; where epochs take longer, the decay of the step
         size follows the clock, and what is learned is no function of the seed alone.
       graph: whether a GPU replays steps as CUDA graphs (`Graphs`); without, it is told every kernel of every step.
+      compiled: whether whole batches' losses are compiled first (`Compiled`), which takes half a minute and more.
     """
 
     epochs: int = 100
@@ -62,6 +64,7 @@ class TrainConfig:
     seed: int = 0
     budget: float = 0.0
     graph: bool = True
+    compiled: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (("epochs", 1), ("batch", 1), ("patience", 1), ("warmup", 0), ("seed", 0)):
@@ -123,7 +126,7 @@ def train(
     device = torch.device(device)
     if scales:
         _fit_scales(network, windows, config.seed)
-    run = _Run(network, windows, held_out, config, device, mirror)
+    run = _Run(network, windows, held_out, config, device, mirror, report)
     file = None if folder is None else folder / "training.safetensors"
     if file is not None and file.is_file():
         load_state(file, run, run.describe())
@@ -160,7 +163,7 @@ class _Run:
 
     def __init__(
         self, network: Learner, windows: WindowSet, held_out: WindowSet, config: TrainConfig, device: torch.device,
-        mirror: Reflection | None = None,
+        mirror: Reflection | None = None, report: Report = quiet,
     ) -> None:  # fmt: skip
         if not len(windows) or not len(held_out):
             raise InputError(f"training: {len(windows)} windows to train on and {len(held_out)} held out; want both")
@@ -179,6 +182,7 @@ class _Run:
         self.tally = number.new_zeros(2, dtype=torch.float64)  # steps that were taken, and the epoch's losses
         self.judged = self.tally.new_zeros(())  # sum of the held-out losses
         self.graphs = Graphs(device, config.graph)
+        self.losses = Compiled(self.network.losses, config.batch, report) if config.compiled else self.network.losses
         self.step, self.loss_sum = 0, 0.0
         self.outcome = Outcome()
 
@@ -186,8 +190,9 @@ class _Run:
         """What a saved state must agree in."""
         config, told = asdict(replace(self.config, save_every=0.0)), getattr(self.given, "told", {})
         del config["graph"]  # which leads to the same weights
-        if not self.config.budget:
-            del config["budget"]
+        for name in ("budget", "compiled"):
+            if not config[name]:
+                del config[name]
         if not told and isinstance(self.given, TensorWindows):
             told = {"contents of the windows": self.given.contents}
         if self.mirror is not None:
@@ -248,7 +253,7 @@ class _Run:
 
     def update(self, batch: Batch) -> None:
         """The law of a step; after a loss or a gradient that was not finite it changes nothing."""
-        loss = self.loss(self.network, batch if self.mirror is None else self.mirror(batch))
+        loss = self.loss(self.losses, batch if self.mirror is None else self.mirror(batch))
         self.optimiser.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -294,10 +299,10 @@ class _Run:
         """On the device."""
         return {k: t.to(self.device, non_blocking=True) for k, t in batch.items()}
 
-    def loss(self, network: Learner, batch: Batch) -> Tensor:
+    def loss(self, losses: Losses, batch: Batch) -> Tensor:
         """Sum of the heads' losses."""
         with torch.autocast(self.device.type, torch.bfloat16, self.config.mixed and self.device.type == "cuda"):
-            return torch.stack(list(network.losses(batch).values())).sum()
+            return torch.stack(list(losses(batch).values())).sum()
 
     def evaluate(self) -> float:
         """Held-out loss of the averaged weights; the same noise each time, so that epochs are comparable."""
@@ -310,7 +315,7 @@ class _Run:
     @torch.no_grad()
     def judge(self, batch: Batch) -> None:
         """Add a held-out batch's loss."""
-        self.judged.add_(self.loss(self.average, batch).double() * len(batch["psi"]))
+        self.judged.add_(self.loss(self.average.losses, batch).double() * len(batch["psi"]))
 
     def end_epoch(self, report: Report) -> None:
         """Compare, keep the best, and see whether it is over."""
