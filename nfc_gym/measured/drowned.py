@@ -35,14 +35,27 @@ def drowned(problem: Problem, under: Metric, plant: Plant, x: NDArray[np.float64
     """
     if problem.rough:
         return False
-    rng, shown = np.random.default_rng(seed), []
-    while len(shown) < _TWINS:
-        made = twin(problem, under, plant, x, rng)
-        if made is None:
-            return False
-        shown.append(mean_square(*made))
-        if sum(s < MAGNIFIED for s in shown) > _TWINS / 2:
+    # A covariance is most of what a twin costs, and by the one at hand a magnified noise shows as well.
+    shown: list[float] | None = []
+    for shared in (True, False):
+        shown = _magnified(problem, under, plant, x, np.random.default_rng(seed), shared)
+        if shown is None:
             return False
     own = mean_square(problem, under.whiten(problem.residual(plant, x[None]))[0])
     # The middle one: a single segment that comes apart in one of them is no measure of the others.
     return own <= float(np.median(shown))
+
+
+def _magnified(
+    problem: Problem, under: Metric, plant: Plant, x: NDArray[np.float64], rng: np.random.Generator, shared: bool
+) -> list[float] | None:
+    """What twins show, by the metric at hand if `shared`; None where most of them show noise as it is declared."""
+    shown = list[float]()
+    while len(shown) < _TWINS:
+        made = twin(problem, under, plant, x, rng, shared)
+        if made is None:
+            return None
+        shown.append(mean_square(*made))
+        if sum(s < MAGNIFIED for s in shown) > _TWINS / 2:
+            return None
+    return shown

@@ -20,6 +20,7 @@ from nfc_gym.physics.rollout import Plant
 
 Array = NDArray[np.float64]
 CAUSE = 0.5  # of the error beyond the noise: what claims must take away of it to be causes where something remains
+_OWNED, _AGREE = 2, 0.01  # twins that have covariances of their own; share of chi-squared that these may matter
 _WILD = 1e6  # of a squared whitened number: more counts as this much
 
 
@@ -40,8 +41,8 @@ class Models:
 class Verified:
     """Residuals on the verification logs, in their own units and whitened by the noise alone.
 
-    residual and white: stage -> (S, m); null: (K,) chi-squared of models without any unknown effect; floor: (m,) mean
-    square of each number, whitened, of such models.
+    residual and white: stage -> (S, m); null: (K,) chi-squared of models without any unknown effect; shares: (K, C)
+    what each cluster of blocks adds to it; floor: (m,) mean square of each number, whitened, of such models.
     """
 
     problem: Problem
@@ -49,6 +50,7 @@ class Verified:
     white: dict[str, Array]
     sigma: Array
     null: Array
+    shares: Array
     floor: Array
 
     def chi2(self, stage: str) -> float:
@@ -73,13 +75,15 @@ def column_means(problem: Problem, white: Array) -> Array:
 
 
 def twin(
-    problem: Problem, under: Metric, plant: Plant, x: Array, rng: np.random.Generator
+    problem: Problem, under: Metric, plant: Plant, x: Array, rng: np.random.Generator, shared: bool = False
 ) -> tuple[Problem, Array] | None:
     """A problem made of a model's own motion with fresh noise, and its whitened residual (S, m) under that model.
 
     Args:
       problem, under: what it is the twin of, and the metric of that at the model.
       plant, x: the model.
+      shared: take that metric for the twin's too, which begins within the noise of what it is the twin of; so it is
+        where bodies touch, since a covariance is dear there.
 
     Returns:
       None where the model is unstable on every segment.
@@ -87,10 +91,20 @@ def twin(
     made = problem.synthetic(plant, x, rng)
     if not len(made):
         return None
-    # Where bodies touch a covariance is dear, and a twin starts within the noise of what it is the twin of.
-    alike = problem.rough and len(made) == len(problem)
-    measure = under if alike else metric(made, made.covariance(plant, x))
+    measure = _shared(problem, under, made) if shared or problem.rough else metric(made, made.covariance(plant, x))
     return made, measure.whiten(made.residual(plant, x[None]))[0]
+
+
+def _shared(problem: Problem, under: Metric, made: Problem) -> Metric:
+    """The metric of a problem for its twin, which lacks the blocks that came apart."""
+    return under if len(made) == len(problem) else under.take(_rows(problem, made))
+
+
+def _rows(problem: Problem, made: Problem) -> NDArray[np.intp]:
+    """(S',) which blocks of a problem its twin has."""
+    key = lambda of: zip(of.log_of.tolist(), of.time_of.tolist(), strict=True)  # noqa: E731
+    rows = {k: i for i, k in enumerate(key(problem))}
+    return np.array([rows[k] for k in key(made)], np.intp)
 
 
 def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Generator) -> Verified:
@@ -104,22 +118,43 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
     plant, x = models.extended
     sigma = problem.covariance(plant, x)
     measure = metric(problem, sigma)
-    residual, white = {}, {}
+    residual, white_of = {}, {}
     for stage, p, v in models.items():
         r = problem.residual(p, v[None])
-        residual[stage], white[stage] = r[0], measure.whiten(r)[0]
-    null, floors = [], []
+        residual[stage], white_of[stage] = r[0], measure.whiten(r)[0]
+    null, shares, floors = [], [], []
+    alike, owned = problem.rough, list[tuple[float, float]]()
     for _ in range(replicas):
-        made = twin(problem, measure, plant, x, rng)
+        made = twin(problem, measure, plant, x, rng, alike)
         if made is None:
             raise InputError(
                 "the model that fits the other logs is unstable on every segment that verifies, at half the physics "
                 "step: look whether these logs are of the same machine, in the same units (`nfc-gym check`)"
             )
         null.append(mean_square(*made))
+        shares.append(_shares(problem, *made))
         floors.append(column_means(*made))
+        if not alike:  # a covariance is most of what a twin costs: where the first twins' say nothing new they do
+            white = _shared(problem, measure, made[0]).whiten(made[0].residual(plant, x[None]))[0]
+            owned.append((null[-1], mean_square(made[0], white)))
+            alike = len(owned) == _OWNED and _agree(owned)
     floor = np.mean(floors, 0) if floors else np.ones(problem.mask.shape[1])
-    return Verified(problem, residual, white, sigma, np.array(null), floor)
+    told = np.array(shares).reshape(replicas, -1)
+    return Verified(problem, residual, white_of, sigma, np.array(null), told, floor)
+
+
+def _agree(owned: Sequence[tuple[float, float]]) -> bool:
+    """Whether twins show what they show by covariances of their own by the shared one, too."""
+    own, shared = np.sum(owned, 0)
+    return bool(abs(shared - own) <= _AGREE * own)
+
+
+def _shares(problem: Problem, made: Problem, white: Array) -> Array:
+    """(C,) what each cluster of a problem's blocks adds to the chi-squared of its twin, whitened (S, m)."""
+    blocks = clusters(problem)
+    squares = np.where(made.mask, squared(white), 0.0).sum(1)
+    of = blocks[_rows(problem, made)]
+    return np.bincount(of, squares, int(blocks.max()) + 1) / max(int(made.mask.sum()), 1)
 
 
 def errors(v: Verified) -> dict[str, Any]:
@@ -182,14 +217,26 @@ def _floor(v: Verified) -> float:
 
 
 def null_bound(v: Verified) -> float:
-    """95 % bound of chi-squared of a perfect model."""
-    if len(v.null) == 0:
-        return 1.0
+    """95 % bound of chi-squared of a perfect model.
+
+    What a twin's clusters of blocks add to it is drawn for each by itself, so that the variance of the whole is the sum
+    of theirs, and its third moment too: few twins tell these better than their few sums would.
+    """
     count = len(v.null)
-    spread = max(float(v.null.std(ddof=1)), 0.01) if count > 1 else 0.05
-    # Of one more draw from a normal population of which few have been seen.
-    factor = float(stdtrit(count - 1, 0.95)) * np.sqrt(1 + 1 / count) if count > 1 else 1.645
-    return float(v.null.mean()) + factor * spread
+    if count == 0:
+        return 1.0
+    if count == 1:
+        return float(v.null[0]) + 1.645 * 0.05
+    each = v.shares.var(0, ddof=1)
+    whole = max(float(each.sum()), 0.01**2)
+    # Degrees of freedom of a sum of variances (Satterthwaite 1946): no fewer than those of one cluster that is all.
+    freedom = (count - 1) * max(whole**2 / max(float((each**2).sum()), 1e-12 * whole**2), 1.0)
+    at = float(stdtrit(freedom, 0.95))
+    if count > 2:  # squares have the longer tail above (Cornish and Fisher 1938)
+        third = float(((v.shares - v.shares.mean(0)) ** 3).sum()) * count / ((count - 1) * (count - 2))
+        at += max(third, 0.0) / whole**1.5 * (at**2 - 1) / 6
+    # Of one more draw from a population of which few have been seen.
+    return float(v.null.mean()) + at * np.sqrt((1 + 1 / count) * whole)
 
 
 def spread(fitted: Fit, problem: Problem, step: Array) -> Array:

@@ -91,10 +91,10 @@ def test_noise_that_is_magnified_is_told_from_noise_that_is_not(
 def test_one_twin_decides_nothing(
     monkeypatch: pytest.MonkeyPatch, twins: tuple[float, ...], own: float, lost: bool
 ) -> None:
-    made = iter(twins)
+    made = {shared: iter(twins) for shared in (True, False)}
     problem: Any = SimpleNamespace(rough=False, residual=lambda *_: np.zeros((1, 1, 1)))
     under: Any = SimpleNamespace(whiten=lambda residual: [own])
-    monkeypatch.setattr("nfc_gym.measured.drowned.twin", lambda *_: (problem, next(made)))
+    monkeypatch.setattr("nfc_gym.measured.drowned.twin", lambda *asked: (problem, next(made[asked[-1]])))
     monkeypatch.setattr("nfc_gym.measured.drowned.mean_square", lambda problem, shown: shown)
     assert drowned(problem, under, SimpleNamespace(), np.zeros(1), seed=0) is lost  # pyright: ignore[reportArgumentType]
 

@@ -22,7 +22,7 @@ def judged(
 ) -> Any:
     """Of models that leave `after` beyond a noise of 1, where calibration leaves 5, with this chi-squared."""
     row = {"calibrated": [5.0], "extended": [after], "noise_floor": [1.0]}
-    v: Any = SimpleNamespace(null=np.ones(6), chi2=lambda stage: chi2)
+    v: Any = SimpleNamespace(null=np.ones(6), shares=np.ones((6, 1)), chi2=lambda stage: chi2)
     doubts = {f"{family}:base": ids for family, ids in doubted.items()}
     found: Any = SimpleNamespace(generic=generic, doubted=doubts, misshapen=misshapen or {})
     return _judge(v, rows, {"law_power:base"}, found, {"groups": {"angle": row}}, gain)

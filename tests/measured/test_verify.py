@@ -11,9 +11,10 @@ import pytest
 from nfc_gym.core import Channel, InputError, Log
 from nfc_gym.core.files import require_writable
 from nfc_gym.measured.cuts import Layout
+from nfc_gym.measured.outcome import _REPLICAS
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
-from nfc_gym.measured.verdict import Models, taken_away, verify
+from nfc_gym.measured.verdict import Models, null_bound, taken_away, verify
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -39,6 +40,31 @@ def test_a_model_that_is_unstable_on_every_segment_is_said_so() -> None:
     bare = (plant, plant.null)
     with pytest.raises(InputError, match="unstable on every segment that verifies"), np.errstate(all="ignore"):
         verify(problem, Models(bare, bare, bare), 2, rng)
+
+
+def test_a_perfect_model_is_above_its_bound_once_in_twenty_whatever_twins_were_drawn() -> None:
+    """Of a score of clusters, of unlike size and with long tails, and with the number of twins that a run draws."""
+    rng, mean = np.random.default_rng(4), np.random.default_rng(5).gamma(4.0, size=20)
+    mean /= mean.sum()
+    draw = lambda *count: mean * rng.exponential(size=(*count, 20))  # noqa: E731
+    twins: list[Any] = [SimpleNamespace(null=s.sum(1), shares=s) for s in draw(2000, _REPLICAS)]
+    bounds, perfect = np.array([null_bound(v) for v in twins]), draw(8000).sum(1)
+    assert (perfect[:, None] > bounds).mean() == pytest.approx(0.05, abs=0.01)
+    assert bounds.std() < 0.4 * perfect.std()
+
+
+def test_what_clusters_add_is_the_whole_of_a_twin() -> None:
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    rng, time = np.random.default_rng(0), DT * np.arange(300)
+    angle = {"joint:hinge:pos": Channel(0.5 * np.sin(time) + 1e-3 * rng.normal(size=300), noise=1e-3)}
+    log = Log("run", time, {"ctrl:motor": np.zeros(300)}, angle)
+    layout = Layout(0.2, 0.0, (0.1, 0.2), 0.2, DT)
+    problem = RolloutProblem(model, [log], [estimate_states(model, log)], layout)
+    plant = Plant(model, ParameterSpace(model, []), nthread=1)
+    v = verify(problem, Models(*[(plant, plant.null)] * 3), 5, rng)
+    assert 1 < v.shares.shape[1] < len(problem)
+    assert v.shares.sum(1) == pytest.approx(v.null)
+    assert (v.shares.std(0) > 0).all()
 
 
 @pytest.mark.parametrize(
