@@ -129,6 +129,9 @@ class LawSearch:
             bare = bare.without(effect)
         if not refuted:
             bare = arena.facing(fit(arena.fit_data.problem, arena.under, calibrated.plant, calibrated.x, 6))
+            # More than the effects a law can gain only of what they leave: where that is too little none is looked for.
+            if (CLEARLY - 1) * bare.judge(arena.current).total > arena.remains:
+                return None
         rival = self._best(bare)
         if rival is None:
             return None

@@ -135,6 +135,11 @@ class Yardstick:
         """What the model that set the metric leaves beyond the noise: nats a number, 0 if nothing."""
         return self._beyond(self.extra)
 
+    @property
+    def remains(self) -> float:
+        """Loss that the model to beat leaves beyond the noise, at most: of columns' slack, or of single blocks'."""
+        return max(2 * self.leftover, self.misfit / max(self._numbers, 1) - 1, 0.0) * self._numbers
+
     def leaves(self, fitted: Fit) -> float:
         """The same for a fitted model, whoever set the metric."""
         data = self.fit_data

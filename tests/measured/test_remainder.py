@@ -13,7 +13,7 @@ import yaml
 from hidden_laws import WHEEL, Machine, record, swing
 from rich.console import Console
 
-from nfc_gym.measured import choice, rounds
+from nfc_gym.measured import choice, remainder, rounds
 from nfc_gym.measured.bench import candidates, make_bench
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.loop import close_loop
@@ -116,11 +116,28 @@ def test_effects_yaml_carries_it_marked_as_a_proposal(closed: Closed) -> None:
 
 
 def test_a_law_never_makes_a_verdict_explained() -> None:
-    fine = SimpleNamespace(chi2=lambda stage: 1.0, null=np.array([0.99, 1.0, 1.01]))
+    null = np.array([0.99, 1.0, 1.01])
+    fine = SimpleNamespace(chi2=lambda stage: 1.0, null=null, shares=null[:, None])
     assert verdict(fine, 0, False) == "nothing missing"
     assert verdict(fine, 1, False) == "explained"
     assert verdict(fine, 0, True) == "unexplained"
     assert verdict(fine, 1, True) == "partly explained"
+
+
+@pytest.mark.parametrize(("gain", "asked"), [(399.0, True), (401.0, False)])
+def test_no_law_is_looked_for_where_effects_leave_too_little_for_it(
+    monkeypatch: pytest.MonkeyPatch, gain: float, asked: bool
+) -> None:
+    """To gain a quarter more than 400 that effects gain it would have to gain all of 100 that they leave."""
+    seen: list[Any] = []
+    monkeypatch.setattr(remainder, "fit", lambda *_: None)
+    monkeypatch.setattr(remainder.LawSearch, "_best", lambda self, arena: seen.append(arena))
+    bare = SimpleNamespace(judge=lambda fitted: SimpleNamespace(total=gain))
+    data = SimpleNamespace(problem=None)
+    arena: Any = SimpleNamespace(facing=lambda _: bare, fit_data=data, under=None, current=None, remains=100.0)
+    search = remainder.LawSearch([], 0.0, lambda f: arena, lambda a: a.current)
+    assert search._instead(arena, SimpleNamespace(plant=None, x=None), [SimpleNamespace()], False) is None  # pyright: ignore[reportArgumentType]
+    assert bool(seen) is asked
 
 
 def test_even_without_a_law_the_worst_place_is_named() -> None:
