@@ -1,6 +1,7 @@
-"""Windows of machines each with a fault, of a kind and a size that are drawn: what a `Judge` learns from."""
+"""Windows of machines each with a fault, of a kind and a size that are drawn: what detectors learn faults from."""
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,15 +10,18 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.inference.windows import Batch
 from nfc_gym.simulate.draws import geometric
 from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.pool import unordered
 from nfc_gym.simulate.residuals import candidates, sizes
 from nfc_gym.simulate.trials import trials
 
 Array = NDArray[np.float64]
+KINDS = ("none", "mass", "friction", "gain", "effect")
+_ROWS = 500  # windows that a process makes at once: a second or two
 _TOGETHER = 10  # windows with the same effect, whose edits of the model take longer than the windows
 _MASS, _FRICTION, _GAIN = (1.2, 2.5), (0.2, 0.8), (0.0, 0.5)  # a mass is more or less by that factor
 
 
-def faulty(machine: Machine, psi: Array, seed: int, *, nthread: int = 1) -> Batch:
+def faulty(machine: Machine, psi: Array, seed: int, *, noise: float = 1.0, nthread: int = 1) -> Batch:
     """One window on a plane for each row of psi, with sensor noise and one fault.
 
     Kinds are drawn alike: the main body heavier or lighter (x 1.2 to 2.5, or one by that), less friction (x 0.2 to 0.8)
@@ -27,10 +31,12 @@ def faulty(machine: Machine, psi: Array, seed: int, *, nthread: int = 1) -> Batc
       machine: the robot, on a plane.
       psi: (n, d) physical units, of the machines before their fault.
       seed: of faults, motion and noise.
+      noise: what multiplies the robot's sensor noise.
       nthread: threads.
 
     Returns:
-      As of `trials`: fewer windows than rows where faults throw the robot at once.
+      As of `trials`, and `kind` (m,), the fault's place in `KINDS`: fewer windows than rows where faults throw the
+      robot at once.
 
     Raises:
       InputError: the machine stands on rough ground, or psi has another shape.
@@ -39,23 +45,75 @@ def faulty(machine: Machine, psi: Array, seed: int, *, nthread: int = 1) -> Batc
     if psi.ndim != 2 or psi.shape[1] != len(machine.space) or not len(psi):
         raise InputError(f"faulty: psi has shape {psi.shape}, want (n, {len(machine.space)}) with n of 1 or more")
     scales = _scales(machine)
+    names = list(scales)
     kind = rng.integers(len(scales) + 1, size=len(psi))
     for row, k in enumerate(kind):
         if k < len(scales):
-            psi[row] *= scales[k](rng)
+            psi[row] *= scales[names[k]](rng)
     scaled, first = np.flatnonzero(kind < len(scales)), int(rng.integers(2**31))
-    parts = [trials(machine, psi[scaled], first, nthread=nthread)] if len(scaled) else []
+    how = {"noise": noise, "nthread": nthread}
+    parts = [_of(scaled, trials(machine, psi[scaled], first, **how))] if len(scaled) else []
     library, rest = candidates(machine), np.flatnonzero(kind == len(scales))
     for i in range(0, len(rest), _TOGETHER):
         rows, effect = rest[i : i + _TOGETHER], library[rng.integers(len(library))]
         theta = np.tile(sizes(effect, rng.random((1, 2 * len(effect.params)))), (len(rows), 1))
         effect.bind(machine.model)
-        given = {"effect": effect, "theta": theta}
-        parts.append(trials(machine, psi[rows], int(rng.integers(2**31)), nthread=nthread, **given))
-    return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+        found = trials(machine, psi[rows], int(rng.integers(2**31)), effect=effect, theta=theta, **how)
+        parts.append(_of(rows, found))
+    out = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    return out | {"kind": np.array([KINDS.index(k) for k in (*names, "effect")])[kind[out["row"]]]}
 
 
-def _scales(machine: Machine) -> list[Callable[[np.random.Generator], Array]]:
+def lessons(environment: str, psi: Array, seed: int, *, jobs: int = 1) -> Batch:
+    """Windows without sensor noise, of which every other machine has a fault: what a `FaultClassifier` learns from.
+
+    Args:
+      environment: id of a flat one.
+      psi: (n, d) physical units, of the machines before their fault: draws of what is believed.
+      seed: of faults and motion; the same bits for any `jobs`.
+      jobs: processes.
+
+    Returns:
+      `states` (m, H+1, s), `actions` (m, H, a) and `psi` (m, d) in [0, 1] of the prior's box, float32; `family` (m,),
+      place in `KINDS`.
+
+    Raises:
+      InputError: see `faulty`.
+    """
+    rows = range(0, len(psi), _ROWS)
+    tasks = ((environment, psi[i : i + _ROWS], seed, i) for i in rows)
+    found: list[Batch] = [{}] * len(rows)
+    made = unordered(_lesson, tasks, jobs) if jobs > 1 else enumerate(_lesson(*task) for task in tasks)
+    for number, part in made:
+        found[number] = part
+    return {name: np.concatenate([p[name] for p in found]) for name in found[0]}
+
+
+@lru_cache(maxsize=1)
+def _machine(environment: str) -> Machine:
+    return Machine(environment)
+
+
+def _lesson(environment: str, psi: Array, seed: int, at: int) -> Batch:
+    """Of some rows, in an order that is drawn."""
+    machine, rng = _machine(environment), np.random.default_rng([seed, at])
+    sound, broken = (int(rng.integers(2**31)) for _ in range(2))
+    parts = [trials(machine, psi[::2], sound, noise=0.0)]
+    parts[0]["kind"] = np.zeros(len(parts[0]["row"]), int)
+    parts += [faulty(machine, psi[1::2], broken, noise=0.0)] if len(psi) > 1 else []
+    whole = {name: np.concatenate([p[name] for p in parts]) for name in ("states", "actions", "psi", "kind")}
+    order, space = rng.permutation(len(whole["kind"])), machine.space
+    inside = np.clip((whole["psi"] - space.low) / (space.high - space.low), 0, 1)
+    plain = {"states": whole["states"], "actions": whole["actions"], "psi": inside}
+    return {k: v[order].astype(np.float32) for k, v in plain.items()} | {"family": whole["kind"][order]}
+
+
+def _of(rows: NDArray[np.intp], found: Batch) -> Batch:
+    """Windows of some rows, whose rows are told among all."""
+    return found | {"row": rows[found["row"]]}
+
+
+def _scales(machine: Machine) -> dict[str, Callable[[np.random.Generator], Array]]:
     """Kinds of faults of psi: functions that draw (d,) factors."""
     names = machine.space.names
     bodies = [n for n in names if n.endswith("_mass")][:1]
@@ -74,4 +132,5 @@ def _scales(machine: Machine) -> list[Callable[[np.random.Generator], Array]]:
     def gain(rng: np.random.Generator) -> Array:
         return scaled([servos[rng.integers(len(servos))]], rng.uniform(*_GAIN))
 
-    return [draw for draw, of in ((mass, bodies), (friction, rubbing), (gain, servos)) if of]
+    kinds = {"mass": (mass, bodies), "friction": (friction, rubbing), "gain": (gain, servos)}
+    return {name: draw for name, (draw, of) in kinds.items() if of}

@@ -41,7 +41,8 @@ def trials(
 
     Returns:
       `states` (m, H+1, s), noisy; `actions` (m, H, a); `psi` (m, d); `start` (m, nstate), free of noise; `delta_s`
-      (m, s). m is n less the windows whose episode ended early in every attempt: a fault may throw a robot at once.
+      (m, s); `row` (m,), the row of psi. m is n less the windows whose episode ended early in every attempt: a fault
+      may throw a robot at once.
 
     Raises:
       InputError: the machine stands on rough ground, or psi has another shape.
@@ -64,7 +65,7 @@ def trials(
     rows, states, actions, start, delta = (np.concatenate(p) for p in zip(*parts, strict=True))
     order = np.argsort(rows)
     states = states + noise * machine.noise * rng.standard_normal(states.shape)
-    found = {"states": states, "actions": actions, "psi": psi[rows], "start": start, "delta_s": delta}
+    found = {"states": states, "actions": actions, "psi": psi[rows], "start": start, "delta_s": delta, "row": rows}
     return {name: value[order] for name, value in found.items()}
 
 

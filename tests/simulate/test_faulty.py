@@ -1,0 +1,46 @@
+"""Lessons for a fault classifier: half of the machines are sound, the others have a fault of the kind that is said."""
+
+import numpy as np
+import pytest
+
+from nfc_gym.core import InputError
+from nfc_gym.simulate import faulty as module
+from nfc_gym.simulate.faulty import KINDS, faulty, lessons
+from nfc_gym.simulate.machine import Machine
+
+JACKAL = "nfc_gym/JackalFlat-v0"
+
+
+def test_lessons_say_what_is_wrong_and_do_not_depend_on_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_ROWS", 40)
+    space = Machine(JACKAL).space
+    psi = np.tile(space.nominal, (100, 1))
+    made = lessons(JACKAL, psi, 5)
+    kind, psi_of = made["family"], made["psi"] * (space.high - space.low) + space.low
+    assert (kind == 0).sum() == 50
+    assert (kind > 0).sum() == pytest.approx(50, abs=2)  # a fault may throw a robot at once
+    assert set(kind) == set(range(len(KINDS)))
+    assert made["states"].dtype == made["actions"].dtype == made["psi"].dtype == np.float32
+    scaled = {"none": "", "mass": "base_mass", "friction": "_friction", "gain": "_damping", "effect": ""}
+    for k, name in enumerate(KINDS):
+        changed = np.abs(psi_of[kind == k] / space.nominal - 1) > 1e-4
+        meant = np.array([bool(scaled[name]) and n.endswith(scaled[name]) for n in space.names])
+        assert not changed[:, ~meant].any()
+        assert (changed.any(1) == bool(scaled[name])).all()
+    again = lessons(JACKAL, psi, 5, jobs=2)
+    for name, value in made.items():
+        assert np.array_equal(value, again[name]), name
+    assert not np.array_equal(lessons(JACKAL, psi[:40], 6)["states"], made["states"][:40])
+
+
+def test_faults_are_told_apart_by_their_kind() -> None:
+    machine = Machine(JACKAL)
+    found = faulty(machine, np.tile(machine.space.nominal, (30, 1)), 2)
+    assert len(found["kind"]) == len(found["row"]) == len(found["states"])
+    assert sorted(found["row"]) == sorted(set(found["row"]))
+    heavier = found["psi"][:, list(machine.space.names).index("base_mass")] != machine.space.nominal[
+        list(machine.space.names).index("base_mass")
+    ]  # fmt: skip
+    assert np.array_equal(heavier, found["kind"] == KINDS.index("mass"))
+    with pytest.raises(InputError, match="psi has shape"):
+        lessons(JACKAL, np.zeros((4, 2)), 0)
