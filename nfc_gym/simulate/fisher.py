@@ -144,6 +144,12 @@ def _interpolated(sigma: Array) -> tuple[Array, Array]:
 
 
 @cache
+def _panel() -> tuple[Array, Array]:
+    """Nodes in [-1, 1] and weights of a panel's quadrature; to find them takes longer than to use them."""
+    return np.polynomial.legendre.leggauss(80)
+
+
+@cache
 def _table() -> tuple[Array, Array, Array]:
     """log sigma -> log of the expected variance, and the gain, by quadrature over what is observed."""
     x = np.linspace(np.log(_LEAST), np.log(_MOST), 1201)
@@ -156,7 +162,7 @@ def _exact(sigma: float) -> tuple[float, float]:
     # Panels: the two edges, where the density bends within a few sigma, and the middle, where nothing changes.
     reach = 8 * sigma
     cuts = [-reach, 0.0, min(reach, 0.5), max(1 - reach, 0.5), 1.0, 1 + reach]
-    node, weight = np.polynomial.legendre.leggauss(80)
+    node, weight = _panel()
     y = np.concatenate([(a + b) / 2 + (b - a) / 2 * node for a, b in pairwise(cuts)])
     w = np.concatenate([(b - a) / 2 * weight for a, b in pairwise(cuts)])
     # Seen from the nearer half, both edges are to the left in the tail that ndtr resolves.

@@ -27,10 +27,10 @@ def bank(machine: Machine) -> ReplayBank:
 
 @pytest.fixture(scope="module")
 def level(machine: Machine, bank: ReplayBank) -> ReplayBank:
-    return bank.levelled(*windows(machine, 8, 40), rate=0.05)
+    return bank.levelled(*windows(machine, 8, 20), rate=0.05)
 
 
-def windows(machine: Machine, seed: int, n: int = 16, **scale: float) -> tuple[np.ndarray, np.ndarray]:
+def windows(machine: Machine, seed: int, n: int = 10, **scale: float) -> tuple[np.ndarray, np.ndarray]:
     by = np.array([scale.get(name, 1.0) for name in machine.space.names])
     made = trials(machine, np.tile(machine.space.nominal * by, (n, 1)), seed)
     return made["states"], made["actions"]
@@ -48,7 +48,7 @@ def test_the_fault_that_there_is_is_the_likeliest(machine: Machine, bank: Replay
 
 def test_it_finds_what_a_mean_over_all_directions_hides(machine: Machine, level: ReplayBank) -> None:
     replay = Replay(JACKAL, draws=8)
-    healthy, heavy = windows(machine, 3, 24), windows(machine, 4, 24, base_mass=1.5)
+    healthy, heavy = windows(machine, 3, 12), windows(machine, 4, 12, base_mass=1.5)
     alone = auroc(replay.score(*healthy), replay.score(*heavy))[0]
     assert auroc(level.score(*healthy), level.score(*heavy))[0] > alone + 0.03
 
@@ -61,11 +61,11 @@ def test_something_else_is_told_by_errors_that_no_fault_explains(machine: Machin
 
 
 def test_levels_give_each_fault_the_same_rate(machine: Machine, bank: ReplayBank) -> None:
-    nominal = windows(machine, 6)
+    nominal = windows(machine, 6, 8)
     level = bank.levelled(*nominal, rate=0.25)
     assert (bank.offset == 0).all()  # the bank itself is as it was
     alone = bank.gains(*nominal) - level.offset
-    assert ((alone > 0).sum(0) == 4).all()
+    assert ((alone > 0).sum(0) == 2).all()
     np.testing.assert_array_equal(level.score(*nominal), alone.max(1))
     with pytest.raises(InputError, match=r"do not show a share of 0\.001"):
         bank.levelled(*nominal, rate=0.001)
@@ -90,7 +90,7 @@ def test_an_effect_of_the_library_may_be_the_fault() -> None:
 
 
 def test_it_is_a_score_for_a_detector(machine: Machine, bank: ReplayBank) -> None:
-    detector = WindowDetector(bank).calibrated(*windows(machine, 7, 60), rate=0.05)
+    detector = WindowDetector(bank).calibrated(*windows(machine, 7, 12), rate=0.25)
     assert detector.threshold is not None
     with pytest.raises(InputError, match="no faults"):
         ReplayBank(JACKAL, faults=[])
