@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import partial
 from math import ceil
 from typing import Any, Protocol
+from weakref import WeakKeyDictionary
 
 import mujoco
 import numpy as np
@@ -47,15 +48,30 @@ class _Unsensed(Batch):
     """
 
     def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int) -> None:
-        blind, flag = copy.copy(model), mujoco.mjtDisableBit
-        blind.opt.disableflags |= int(flag.mjDSBL_SENSOR) | (int(flag.mjDSBL_ISLAND) if model.ntree < 2 else 0)
-        super().__init__(blind, nsim, nthread)
+        super().__init__(model, nsim, nthread)
+        flag = mujoco.mjtDisableBit
+        # In the simulations: to copy the model for it costs several times what a batch does.
+        self.expand("opt.disableflags")[...] |= int(flag.mjDSBL_SENSOR) | (
+            int(flag.mjDSBL_ISLAND) if model.ntree < 2 else 0
+        )
 
     def bind(self, name: str) -> Array:
         """Raises `LookupError` for what a sensor would have read: it would be zero here."""
         if name == "sensordata":
             raise LookupError("a roll-out without sensors has no sensordata: effects read the state alone")
         return super().bind(name)
+
+
+_SHAPES: WeakKeyDictionary[mujoco.MjModel, mujoco.MjData] = WeakKeyDictionary()
+
+
+def _batch(model: mujoco.MjModel, nsim: int, nthread: int, sensors: bool) -> Batch:
+    """A batch that knows the shapes of its fields: each would make data of its own to find them, at twice its cost."""
+    out = (Batch if sensors else _Unsensed)(model, nsim, nthread)
+    if model not in _SHAPES:
+        _SHAPES[model] = mujoco.MjData(copy.copy(model))  # of a copy: data hold their model, which would stay for ever
+    out.__dict__["_data"] = _SHAPES[model]
+    return out
 
 
 class Run:
@@ -66,7 +82,7 @@ class Run:
         self.copies = np.tile(np.arange(len(segments)), count)
         model = plant.model
         self.thetas = plant.split(rows)[1]
-        self.batch = (Batch if sensors else _Unsensed)(model, len(rows), plant.nthread)
+        self.batch = _batch(model, len(rows), plant.nthread, sensors)
         self.fields = ModelFields(self.batch, model)
         self.varying = self._write_known()
         plant.write(self.fields, rows)
