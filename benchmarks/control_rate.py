@@ -155,19 +155,20 @@ def main() -> None:
     timing.use_clock(args.clock)
     torch.set_num_threads(1)
     robots, repeats = (["Jackal"], 0) if args.quick else (args.robots, args.repeats)
-    threads = 1 if args.quick else args.threads
+    threads, draws = (1, 10) if args.quick else (args.threads, args.draws)
+    timed = 3 if args.quick else EVERY
     table = Table()
     for robot in robots:
         with tempfile.TemporaryDirectory() as folder:
-            measure(table, robot, Path(folder), threads, args.draws, repeats)
+            measure(table, robot, Path(folder), threads, draws, repeats, timed)
     if args.json:
         write_json(args.json, [asdict(r) for r in table.rows])
 
 
-def measure(table: Table, robot: str, folder: Path, threads: int, draws: int, repeats: int) -> None:
-    """Rows of one robot."""
+def measure(table: Table, robot: str, folder: Path, threads: int, draws: int, repeats: int, timed: int) -> None:
+    """Rows of one robot, of so many timed steps."""
     named, horizon, policy = contestants(f"nfc_gym/{robot}Flat-v0", folder, threads, draws)
-    motion = recorded(f"nfc_gym/{robot}Flat-v0", policy, horizon + EVERY)
+    motion = recorded(f"nfc_gym/{robot}Flat-v0", policy, horizon + timed)
     taken: dict[str, list[list[float]]] = {name: [] for name in named}
     for _ in range(repeats + 1):
         for name, step in named.items():

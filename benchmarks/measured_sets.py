@@ -48,7 +48,7 @@ TITLES = {
     "nanobench_crazyflie": "Crazyflie 2.1",
     "quadruped_go2": "Unitree Go2 legs",
 }
-QUICK = ("coulomb", "lag")  # families that a quick run looks among
+QUICK = ("coulomb",)  # families that a quick run looks among
 # The scorer prints the figures of single groups first; the goals are about the last ones.
 STAGES = ("nominal", "calibrated", "extended")
 

@@ -73,13 +73,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=names)
     parser.add_argument("--windows", type=count(1), default=2048, help="of a shard")
-    parser.add_argument("--quick", action="store_true", help="Jackal alone, 256 windows: half a minute")
+    parser.add_argument("--quick", action="store_true", help="Jackal alone, 64 windows: seconds")
     parser.add_argument("--json", type=json_file, help="write the rows here")
     args = parser.parse_args()
     print(f"mujoco {mujoco.__version__}, numpy {np.__version__}, safetensors {safetensors.__version__}; one thread")
     table = Table()
     for name in args.only or (names[:2] if args.quick else names):
-        speed(table, name, 256 if args.quick else args.windows)
+        speed(table, name, 64 if args.quick else args.windows)
     if args.json:
         write_json(args.json, [asdict(r) for r in table.rows])
 

@@ -257,7 +257,7 @@ def single(table: Table, ids: list[str], turns: int) -> None:
         env.close()
 
 
-def torchrl(table: Table, turns: int) -> None:
+def torchrl(table: Table, n: int, turns: int) -> None:
     """TorchRL's GymEnv around the single environment, and its GymWrapper around the vector one."""
     try:
         import torch
@@ -266,7 +266,7 @@ def torchrl(table: Table, turns: int) -> None:
         print("TorchRL is not installed, its rows are left out")
         return
     torch.set_num_threads(1)
-    name, n, steps = "nfc_gym/JackalFlat-v0", 256, 20
+    name, steps = "nfc_gym/JackalFlat-v0", 20
     plain = gymnasium.make(name, context=["psi"])
     plain.reset(seed=SEED)
     envs = gymnasium.make_vec(name, num_envs=n, context=["psi"], autoreset_mode="Disabled")
@@ -305,14 +305,14 @@ def _resident(kwargs: dict, out) -> None:
     envs.close()
 
 
-def memory(table: Table, sizes: list[int]) -> None:
-    """Resident memory per environment; each measured in a process of its own."""
+def memory(table: Table, sizes: list[int], workers: int) -> None:
+    """Resident memory per environment, with so many workers beside; each measured in a process of its own."""
     if not Path("/proc/self/statm").exists():
         print("memory: not measured, there is no /proc here")
         return
     context = multiprocessing.get_context("spawn")
     cases = [({"num_envs": n}, name) for name in ("JackalFlat", "JackalRough") for n in sizes]
-    cases.append(({"num_envs": 16, "vectorization_mode": "async"}, "JackalFlat"))
+    cases.append(({"num_envs": workers, "vectorization_mode": "async"}, "JackalFlat"))
     for kwargs, name in cases:
         out = context.Queue()
         call = {"id": f"nfc_gym:nfc_gym/{name}-v0", "context": ["psi"], **kwargs}
@@ -340,18 +340,18 @@ def main() -> None:
     turns = 2 if quick else 25
     robots = ["Jackal"] if quick else ["Jackal", "Quadcopter", "Quadruped", "Ant", "Humanoid"]
     grounds = [f"{robot}{ground}" for robot in robots for ground in ("Flat", "Rough")]
-    sizes = [64] if quick else [1, 16, 256, 1024]
+    sizes = [16] if quick else [1, 16, 256, 1024]
     versions = ", ".join(f"{m.__name__} {m.__version__}" for m in (mujoco, gymnasium, np))
     print(f"{versions}; {CORES} cores, {args.clock} time")
     table = Table()
     runs: dict[str, Callable[[], None]] = {
         "vector": lambda: vector(table, grounds, sizes, turns),
-        "elevation": lambda: elevation(table, 64 if quick else 1024, turns),
-        "async": lambda: asynchronous(table, 8 if quick else 64, turns),
-        "ant": lambda: ant(table, [64] if quick else [16, 256, 1024], turns),
+        "elevation": lambda: elevation(table, 16 if quick else 1024, turns),
+        "async": lambda: asynchronous(table, 2 if quick else 64, turns),
+        "ant": lambda: ant(table, [16] if quick else [16, 256, 1024], turns),
         "single": lambda: single(table, [f"{robot}Flat" for robot in robots] + ["Ant-v5"], turns),
-        "torchrl": lambda: torchrl(table, turns),
-        "memory": lambda: memory(table, [256 if quick else 1024]),
+        "torchrl": lambda: torchrl(table, 32 if quick else 256, turns),
+        "memory": lambda: memory(table, [256 if quick else 1024], 2 if quick else 16),
     }
     for section in args.only:
         runs[section]()

@@ -20,7 +20,7 @@ from .row import Row, Size, Task, from_json, to_json
 from .trial import trial
 
 QUICK = {
-    "quadcopter": ("wind", Size(3, 1.0, ("wind", "drag_linear"), 1)),
+    "quadcopter": ("wind", Size(3, 0.6, ("wind", "drag_linear"), 1)),
     "jackal": ("coulomb", Size(4, 1.7, ("coulomb", "slope"), 2)),
     "quadruped": ("offset", Size(3, 0.9, ("offset",), 2)),
     "ant": ("damping_poly", Size(3, 0.9, ("damping_poly",), 2)),
