@@ -34,7 +34,7 @@ try:
 finally:
     sys.path.remove(_BENCHMARKS)
 
-MODEST = settings(max_examples=60, print_blob=True, suppress_health_check=list(HealthCheck))
+MODEST = settings(max_examples=25, print_blob=True, suppress_health_check=list(HealthCheck))
 CHOICES = st.randoms(use_true_random=False)
 
 

@@ -53,12 +53,12 @@ COMMAND = [sys.executable, "-c", "from nfc_gym.cli import main; main()", "close-
 
 
 def machine(folder: Path) -> Path:
-    """Three logs of 1.5 s of a joint with dry friction, a model without, the mapping; returns the last one's path."""
+    """Three logs of 1 s of a joint with dry friction, a model without, the mapping; returns the last one's path."""
     model = mujoco.MjModel.from_xml_string(MODEL.format(loss=' frictionloss="0.3"'))
     for seed in range(3):
         rng, data, rows = np.random.default_rng(seed), mujoco.MjData(model), []
         data.qpos[0] = rng.uniform(-0.5, 0.5)
-        for k in range(150):
+        for k in range(100):
             data.ctrl[0] = np.sin(5 * k * 0.01 + seed)
             rows.append((k * 0.01, data.ctrl[0], data.qpos[0] + 0.002 * rng.normal()))
             mujoco.mj_step(model, data)
