@@ -33,7 +33,7 @@ def final_models(run: Run, found: Found, whole: Problem) -> tuple[Model, Fit, Ar
     last = found.rest.fitted
     effects = bool(last.plant.effects)
     # Psi alone began its way here from several places; its intervals are asked for only where there is nothing beside.
-    calibrated = extended = _settled(run, "calibrated", found.calibrated, whole, starts=1 if effects else STARTS)
+    calibrated = extended = _settled(run, "calibrated", found.calibrated, whole, starts=0 if effects else STARTS)
     if effects:
         # What psi alone went to is another place for the same psi to begin.
         psi = calibrated.x[: len(last.plant.space)]
