@@ -203,7 +203,7 @@ def main() -> None:
         kept, seed = opened(args.out or Path(folder), args)
         print(f"seed {seed}", flush=True)
         for robot in args.robots:
-            bench = Bench(Settings(robot, seed, args.width, args.draws, args.effects), args, kept)
+            bench = Bench(Settings(robot, seed, args.width, args.draws, args.effects, args.quick), args, kept)
             if scores := bench.run(ends):
                 measure(table, bench, scores)
     if args.json:
@@ -251,7 +251,7 @@ def _arguments() -> argparse.Namespace:
         metavar="SECONDS",
         help="begin no new part after that time; the net's training is not cut",
     )
-    parser.add_argument("--quick", action="store_true", help="Jackal alone, a few windows: a minute, and says little")
+    parser.add_argument("--quick", action="store_true", help="Jackal alone, a few windows and faults: says little")
     parser.add_argument(
         "--json",
         type=json_file,
@@ -260,7 +260,7 @@ def _arguments() -> argparse.Namespace:
     )
     args = parser.parse_args()
     if args.quick:
-        args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 10, 10, 2
+        args.robots, args.nominal, args.held_out, args.faulty = ["Jackal"], 4, 4, 2
         args.training, args.epochs, args.effects, args.draws, args.levels = 64, 1, 1, 2, 50
         args.lessons = 50
     return args

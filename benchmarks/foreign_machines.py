@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from foreign.drawing import draw
@@ -31,6 +32,7 @@ from standin.plan import seed_of
 from undeclared_effects import master_seed
 
 QUICK = ("urdf_none", "rov_drag")
+BRIEF = (3, 1.5)  # logs, and s of each at most, of a quick run
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         seed, folders = begun(args), Folders(args.out)
         if args.draw:
             for name in args.only:
-                drawn(name, seed, folders)
+                drawn(name, seed, folders, args.quick)
             return 0
         return run_and_score(args, seed, folders)
 
@@ -50,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("--quick", action="store_true", help=f"only {' and '.join(QUICK)}")
+    add("--quick", action="store_true", help=f"only {' and '.join(QUICK)}, with few and short logs")
     add("--only", nargs="+", choices=list(CASES), metavar="NAME", help="only these machines")
     add("--list", action="store_true", help="say which machines there are, and run nothing")
     add("--draw", action="store_true", help="write the machines' folders, and run nothing")
@@ -103,9 +105,13 @@ def _range(ends: tuple[float, float]) -> str:
     return " to ".join(f"{end:g}" for end in ends)
 
 
-def drawn(name: str, seed: int, folders: Folders) -> None:
+def drawn(name: str, seed: int, folders: Folders, brief: bool) -> None:
     """Draw a machine and write its folder and its truth."""
-    write(draw(CASES[name], seed_of(seed, "foreign", name)), folders.machine(name), folders.truth(name))
+    case = CASES[name]
+    if brief:
+        logs, seconds = BRIEF
+        case = replace(case, machine=replace(case.machine, logs=logs, seconds=min(seconds, case.machine.seconds)))
+    write(draw(case, seed_of(seed, "foreign", name)), folders.machine(name), folders.truth(name))
 
 
 def run_and_score(args: argparse.Namespace, seed: int, folders: Folders) -> int:
@@ -114,7 +120,8 @@ def run_and_score(args: argparse.Namespace, seed: int, folders: Folders) -> int:
     if args.kept:
         names = [n for n in names if folders.ended(n)]
     print(f"seed {seed} (drawn at run time unless given); {len(names)} machines, {args.jobs} at a time", flush=True)
-    command = [sys.executable, str(Path(__file__).resolve()), "--draw", "--out", str(args.out), "--only"]
+    command = [sys.executable, str(Path(__file__).resolve()), "--draw", "--out", str(args.out)]
+    command += [*(["--quick"] if args.quick else []), "--only"]
     drawing = {n: [*command, n] for n in names}
     began, rows = time.monotonic(), list[Score]()
     try:

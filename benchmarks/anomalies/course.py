@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from anomalies.faults import Fault, faults
 from nfc_gym.core import Fidelity
 from nfc_gym.inference.windows import Batch
-from nfc_gym.simulate.bank import ReplayBank
+from nfc_gym.simulate.bank import ReplayBank, faults_of
 from nfc_gym.simulate.faulty import faulty
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
@@ -34,6 +34,7 @@ class Settings:
       width: of psi about nominal, in the prior's range; what the replay believes.
       draws: replays a window; of each machine in the bank half.
       effects: of the library, drawn.
+      toy: whether every fourth fault is tried alone, with two in the bank.
     """
 
     robot: str
@@ -41,6 +42,7 @@ class Settings:
     width: float
     draws: int
     effects: int
+    toy: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,11 +72,13 @@ class Course:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.machine = Machine(f"nfc_gym/{settings.robot}Flat-v0")
-        self.faults: list[Fault] = faults(self.machine, settings.effects, np.random.default_rng([settings.seed, 0]))
+        found = faults(self.machine, settings.effects, np.random.default_rng([settings.seed, 0]))
+        self.faults: list[Fault] = found[::4] if settings.toy else found
+        asked = faults_of(self.machine)[:2] if settings.toy else None
         belief = Fidelity(psi=self._psi(512, np.random.default_rng([settings.seed, 1])))
         env, draws, seed = self.machine.environment, settings.draws, settings.seed
         self.replay = Replay(env, belief, draws=draws, seed=seed)
-        self.bank = ReplayBank(env, belief, draws=max(2, draws // 2), seed=seed)
+        self.bank = ReplayBank(env, belief, asked, draws=max(2, draws // 2), seed=seed)
 
     def windows(self, part: Part) -> Batch:
         """Of a part; fewer than its size where a fault throws the robot at once."""
