@@ -99,7 +99,7 @@ def test_a_watcher_of_the_motion_at_home_sees_another_motion(tmp_path: Path, mon
 
     policy = opened(untrained(tmp_path), "cpu")
     home = World("JackalFlat", "nominal", 0)
-    detector = watcher(policy, home, 0)
+    detector = watcher(policy, home, 0, 300)
     robots = windows(policy, seen_by(policy, home, 40, max_episode_steps=300), 15, 99, 300)
     assert robots[0][0].shape[1:] == (HORIZON + 1, 15)
     score, limit = detector.windows.scorer.score, detector.threshold

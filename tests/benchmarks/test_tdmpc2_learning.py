@@ -20,7 +20,7 @@ def test_losses_fall_on_a_batch_that_stays() -> None:
 
     learner = Learner(tiny(dropout=0.0, rate=2e-3), 0.9)
     first = learner.update(batch())
-    for _ in range(300):
+    for _ in range(150):
         last = learner.update(batch())
     assert float(last["loss"]) < 0.7 * float(first["loss"])
     assert float(last["reward"]) < 0.7 * float(first["reward"])
@@ -93,7 +93,7 @@ def test_sequences_never_cross_two_episodes_and_an_end_comes_last() -> None:
 def small_run(envs: Any = None, **change: Any) -> Any:
     from tdmpc2.run import Run, Schedule
 
-    given = {"first": 200, "ratio": 0.5, **change}
+    given = {"first": 100, "ratio": 0.5, **change}
     return Run(envs or rails(), tiny(batch=64), 0.9, Schedule(**given), most=4000)
 
 
@@ -110,8 +110,8 @@ def test_a_run_learns_to_stay_in_the_middle_of_a_rail() -> None:
     torch.manual_seed(0)
     settings = replace(NETS["tiny"], samples=64, elites=8, iterations=3, batch=64, rate=1e-3)
     model = WorldModel(Sizes(2, 1), settings).eval()
-    run = Run(rails(8), model, 0.9, Schedule(first=400, ratio=0.4), most=1600)
-    run.train(1600)
+    run = Run(rails(8), model, 0.9, Schedule(first=400, ratio=0.4), most=1200)
+    run.train(1200)
     agent, rng = Agent(model, 0.9), np.random.default_rng(0)
     agent.begin(16)
     learned = evaluate(agent, rails(16), seed=5).returns.mean()
@@ -122,17 +122,17 @@ def test_a_run_learns_to_stay_in_the_middle_of_a_rail() -> None:
 
 def test_a_run_goes_on_from_its_state_to_the_same_bits(tmp_path: Path) -> None:
     whole = small_run()
-    whole.train(300, state=tmp_path / "x.training")
+    whole.train(160, state=tmp_path / "x.training")
     kept = whole.chance.get_extra_state()
     resumed = small_run()
     resumed.load(tmp_path / "x.training")
-    assert (resumed.steps, resumed.learner.updates) == (whole.steps, whole.learner.updates) == (300, 150)
+    assert (resumed.steps, resumed.learner.updates) == (whole.steps, whole.learner.updates) == (160, 80)
     ends = []
     for run in (resumed, whole):  # the one that was loaded has the generators' state from the file
         if run is whole:
             run.chance.set_extra_state(kept)
         run._collector = None  # episodes begin anew
-        run.train(400)
+        run.train(200)
         ends.append(run.model.state_dict())
     assert all(torch.equal(v, ends[1][k]) for k, v in ends[0].items())
     other = small_run(ratio=0.25)

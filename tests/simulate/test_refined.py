@@ -1,5 +1,7 @@
 """From a posterior in a file to one window's own, as `nfc-gym infer --refine` makes it."""
 
+from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -55,6 +57,9 @@ def seen() -> Window:
 def test_a_posterior_is_refined_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refined, "BEGINNINGS", 220)
     monkeypatch.setattr(refine, "FRESH", 200)
+    small = replace(refine.NETWORK, width=64, features=32)
+    monkeypatch.setattr(refined, "refine", partial(refine.refine, network=small))
+    monkeypatch.setattr(refined, "halved", lambda *given: replace(refine.halved(*given), samples=300))
     posterior, window = untrained(), seen()
     window.actions[3, 0] = 1.2  # of which the machine makes 1
     once = TrainConfig(epochs=1, batch=128, warmup=2, average=0.5)
@@ -65,9 +70,9 @@ def test_a_posterior_is_refined_and_says_so(monkeypatch: pytest.MonkeyPatch) -> 
     assert told == [*beginnings, *2 * ["150 of 150 windows simulated"], *fresh]
     assert own.notes == posterior.notes | {"refined": 300, "kept": pytest.approx(own.notes["kept"])}
     assert 0.01 < own.notes["kept"] < 0.95  # the second of two rounds
-    u = own.prior.u_of(own.sample(2000, np.random.default_rng(0)).psi)
+    u = own.prior.u_of(own.sample(500, np.random.default_rng(0)).psi)
     prior = posterior.given(window)
-    before = prior.prior.u_of(prior.sample(2000, np.random.default_rng(0)).psi)
+    before = prior.prior.u_of(prior.sample(500, np.random.default_rng(0)).psi)
     assert u.std(0).min() < 0.8 * before.std(0).min()
 
 
