@@ -4,8 +4,9 @@
 
 A name is a folder of tests (`tests/core`), `tests` for what lies in none, a benchmark (`benchmarks/anomaly`), `check`.
 Each piece of Python runs in a fork of this process, which has the large libraries loaded: to load torch and torchrl
-takes longer than most of the pieces do. A piece's output is shown when it is over, with its seconds and those of the
-processor, which other work on the machine changes less. Exits with 1 where one fails, after all have run.
+takes longer than most of the pieces do. The linters, which want none, begin before. A piece's output is shown when it
+is over, with its seconds and those of the processor, which other work on the machine changes less. Exits with 1 where
+one fails, after all have run.
 """
 
 import atexit
@@ -33,8 +34,8 @@ ROOT = Path(__file__).parents[1]
 AT_ONCE = 2
 # Those that take longest, in order: begun last, they would be waited for.
 LONGEST = (
-    "tests/measured", "tests/adaptation", "tests/simulate", "tests/benchmarks", "check", "tests/inference",
-    "tests/conformance", "tests/wrappers", "tests/physics", "benchmarks/undeclared_effects", "benchmarks/anomaly",
+    "tests/measured", "tests/adaptation", "tests/inference", "tests/simulate", "tests/benchmarks",
+    "tests/conformance", "tests/wrappers", "tests/physics", "benchmarks/foreign_machines", "tests/envs",
 )  # fmt: skip
 
 Piece = Callable[[], int | str | None]  # what `sys.exit` takes
@@ -102,6 +103,12 @@ def begin(piece: Piece, said: IO[bytes]) -> int:
         os._exit(code if isinstance(code, int) else int(code is not None))
 
 
+def start(name: str, piece: Piece, running: dict[int, Running]) -> None:
+    """Begin a piece, and note it among those under way."""
+    said = tempfile.TemporaryFile()  # noqa: SIM115 (`end` closes it)
+    running[begin(piece, said)] = Running(name, time.monotonic(), said)
+
+
 def end(running: dict[int, Running]) -> str | None:
     """Wait until one is over, show it, and give its name if it failed."""
     child, status, used = os.wait4(-1, 0)
@@ -120,18 +127,20 @@ def main() -> None:
     if unknown := [name for name in sys.argv[1:] if name not in found]:
         sys.exit(f"no piece {', '.join(unknown)}; there are: {', '.join(found)}")
     os.chdir(ROOT)
+    running: dict[int, Running] = {}
+    failed: list[str | None] = []
+    wanted = list(dict.fromkeys(sys.argv[1:] or found))
+    if "check" in wanted:  # wants no library: it begins while they load
+        wanted.remove("check")
+        start("check", found["check"], running)
     for name in HEAVY:
         importlib.import_module(name)
     gc.freeze()  # the libraries' objects stay: no piece need look through them again at each collection
     print(f"== libraries: {time.monotonic() - began:.0f} s", flush=True)
-    running: dict[int, Running] = {}
-    failed: list[str | None] = []
-    for name in sys.argv[1:] or found:
+    for name in wanted:
         if len(running) == AT_ONCE:
             failed.append(end(running))
-        said = tempfile.TemporaryFile()  # noqa: SIM115 (`end` closes it)
-        child = begin(found[name], said)
-        running[child] = Running(name, time.monotonic(), said)
+        start(name, found[name], running)
     while running:
         failed.append(end(running))
     print(f"== all: {time.monotonic() - began:.0f} s")
