@@ -197,7 +197,7 @@ def main() -> None:
     args = parser.parse_args()
     use_clock(args.clock)
     if args.quick:
-        args.seeds, args.simulations, args.observations, args.samples, args.epochs = [0], 256, 1, 250, 1
+        args.seeds, args.simulations, args.observations, args.samples, args.epochs = [0], 256, 1, 100, 1
         args.base = "linear"
     print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
     table = Table()

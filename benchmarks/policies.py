@@ -118,7 +118,7 @@ def toy(args: argparse.Namespace, out: Path) -> None:
     args.places, args.grounds, args.seeds = ["JackalFlat"], ["Flat"], [0]
     args.methods = [m for m in args.methods if m in ("random", "unadapted", "nfc", "oracle", "falco")]
     args.episodes, args.envs, args.steps, args.budget, args.executed, args.scenarios = 2, 16, 2_000, 1.0, 1, ["axle"]
-    args.threads = 1
+    args.threads, args.scenario = 1, "psi"  # some effects push in every step, in Python
     args.posteriors = out / "toys"
     args.posteriors.mkdir(exist_ok=True)
     space = nominal_space(ROBOTS["jackal"])
