@@ -175,7 +175,8 @@ def processors(args: argparse.Namespace, queue: Queue) -> None:
 
 def ceiling(args: argparse.Namespace, place: str) -> None:
     """That of one environment, on the processors."""
-    run(args, place, "ceiling", ["--methods", "--extras", "ceiling"], None)
+    few = ["--ceiling-draws", "16", "4"] if args.quick else []
+    run(args, place, "ceiling", ["--methods", "--extras", "ceiling", *few], None)
 
 
 def cells(args: argparse.Namespace, i: int, place: str) -> list[Job]:
