@@ -35,7 +35,7 @@ def few() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def delayed(few: None) -> tuple[Assimilation, Trajectory, Assimilated]:
     """What is inferred of a rover whose commands are late: who infers, from what, and the belief."""
-    q, trajectory = Assimilation(ID), driven_in(late(0.08), {}, 140)
+    q, trajectory = Assimilation(ID), driven_in(late(0.08), {}, 100)
     return q, trajectory, q.infer(trajectory)
 
 

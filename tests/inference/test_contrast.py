@@ -46,9 +46,9 @@ def test_kinds_are_what_they_are_called() -> None:
 @pytest.fixture(scope="module")
 def trained() -> Contrast:
     torch.manual_seed(0)
-    windows = motion_windows(1500)
+    windows = motion_windows(1000)
     net = Contrast.of(windows.tensors, box(2), ContrastConfig(features=16), channels=("position", "velocity"))
-    train(net, *windows.split(0.1), TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10))
+    train(net, *windows.split(0.1), TrainConfig(epochs=3, batch=64, rate=2e-3, warmup=10, muon=False))
     return net
 
 

@@ -80,7 +80,7 @@ def coarse() -> NeuralPosterior:
 
 
 NETWORK = NetworkConfig(**SMALL | {"density": "mixture"}, components=2, aligned=True, linear=True)
-TRAINING = TrainConfig(epochs=30, batch=64, rate=2e-3, warmup=10, average=0.95)
+TRAINING = TrainConfig(epochs=20, batch=64, rate=2e-3, warmup=10, average=0.95)
 HOW = SequentialConfig(1, 3000, samples=300, oversampling=4)
 
 
