@@ -134,7 +134,6 @@ def test_what_is_loaded_is_to_the_bit_what_the_simulation_was(name: str, root: s
     kwargs = {"terrain_pool": 1} if "Rough" in name else {}
     env = Witness(RecordLog(gym.make(name, max_episode_steps=80, **kwargs), tmp_path))
     _drive(env, 3, 80)
-    assert [str(f) for f in check(tmp_path / "mapping.yaml") if f.severity == "error"] == []
     data = load(tmp_path / "mapping.yaml")
     model = env.unwrapped.model
     assert len(data.logs) == len(env.seen) == 3
