@@ -6,7 +6,7 @@
 The recordings, their splits and their scores are those of `score/recordings.py` in the data folder; everything that is
 particular to a machine is in its folder under `benchmarks/measured/`: the model to start from, and a mapping file.
 A run that was killed goes on in the same work folder; a set that is finished there is measured anew.
-Without the data the benchmark says so and ends. `--quick` runs one set, with a few families of effects, to show that
+Without the data the benchmark says so and ends. `--quick` runs one set, with one family of effects, to show that
 the way through works.
 """
 
@@ -48,7 +48,7 @@ TITLES = {
     "nanobench_crazyflie": "Crazyflie 2.1",
     "quadruped_go2": "Unitree Go2 legs",
 }
-QUICK = ("coulomb",)  # families that a quick run looks among
+QUICK = ("coulomb",)  # what a quick run looks for
 # The scorer prints the figures of single groups first; the goals are about the last ones.
 STAGES = ("nominal", "calibrated", "extended")
 
@@ -128,7 +128,7 @@ def main() -> None:
     parser.add_argument("--json", type=json_file)
     parser.add_argument("--figures", type=Path, metavar="FOLDER", help="draw one picture a set there")
     parser.add_argument(
-        "--quick", action="store_true", help="one set and few families of effects, as an end-to-end check"
+        "--quick", action="store_true", help="one set and one family of effects, as an end-to-end check"
     )
     args = parser.parse_args()
     if not (args.data / "score" / "recordings.py").exists():
