@@ -43,7 +43,7 @@ from nfc_gym.envs.single import RobotEnv
 from nfc_gym.wrappers import RandomizePsi
 
 CONFIG = AdaptConfig(missions=2, worlds=8, steps=512, episode=40, judged=0)
-ONCE = replace(ONWARD, epochs=1, minibatches=2)
+ONCE = replace(ONWARD, epochs=1, minibatches=2, together=256)  # a batch is of so many steps
 
 
 class Alarm:
@@ -254,7 +254,7 @@ def test_the_best_weights_of_all_missions_are_deployed(
     monkeypatch.setattr("nfc_gym.adaptation.algorithm.evaluate", judge)
     policy = load_policy(jackal)
     before = state(policy.network)
-    config = replace(CONFIG, judged=2, steps=3 * 1024, missions=1 + (len(judged) > 4))
+    config = replace(CONFIG, judged=2, steps=3 * 256, missions=1 + (len(judged) > 4))
     done = adapt(ppo_agent(policy, ONCE), world(), belief(), Alarm(20), config=config, threads=1)
     assert same(state(policy.network), before) != changes
     assert done.history[-1]["chosen"] == max(judged[4:] or judged)
