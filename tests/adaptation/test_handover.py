@@ -30,8 +30,14 @@ ROWS = [
     | {"parameters": {"fraction": {"value": 0.7, "low": 0.6, "high": 0.8, "unit": "1"}}},
     {"family": "sensor_bias", "where": "joint:rear_left_wheel:vel", "parameters": {"bias": 0.1}},
 ]  # fmt: skip
-SMALL: dict[str, Any] = {"envs": 4, "episode": 40, "every": 1, "curve": 2}  # 512 steps an iteration
-STEPS = 1536
+SMALL: dict[str, Any] = {"envs": 4, "episode": 40, "every": 1, "curve": 2}  # 128 steps an iteration
+STEPS = 384
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Iterations of a quarter of the control steps."""
+    monkeypatch.setattr("nfc_gym.adaptation.ppo._LONGEST", 32)
 
 
 @pytest.fixture
@@ -70,7 +76,7 @@ def test_from_effects_to_a_policy_and_a_page(tmp_path: Path, result: Path, jacka
     worth = loss["ablation"]["extended"]
     assert worth["worth"]["mean"] == pytest.approx(after["with"]["return"]["mean"] - worth["unaware"]["return"]["mean"])
     assert not bias["acts"]
-    assert [p["steps"] for p in report["curve"]] == [0, 512, 1024, 1536]
+    assert [p["steps"] for p in report["curve"]] == [0, 128, 256, 384]
     best = max(p["return"]["mean"] for p in report["curve"])
     assert report["curve"][report["kept"]]["return"]["mean"] == best
     adapted = load_policy(out / "policy.safetensors")
@@ -114,8 +120,8 @@ def test_a_true_world_is_judged_in_and_not_learned_from(tmp_path: Path, result: 
     row = {"family": "loss", "where": "front_left", "parameters": {"fraction": 0.9}}
     truth.write_text(yaml.safe_dump({"version": 1, "psi": {"base_mass": 20.0}, "effects": [row]}))
     out = tmp_path / "out"
-    first = handed(result, out, jackal, steps=512)
-    report = handed(result, out, jackal, steps=512, world=truth)
+    first = handed(result, out, jackal, steps=128)
+    report = handed(result, out, jackal, steps=128, world=truth)
     assert report["measured_in"] == "world"
     assert report["world"] == str(truth)
     assert report["curve"] == first["curve"]
@@ -123,7 +129,7 @@ def test_a_true_world_is_judged_in_and_not_learned_from(tmp_path: Path, result: 
     assert report["returns"]["world"]["after"] != report["returns"]["extended"]["after"]
     assert "not of the machine" not in (out / "report.html").read_text()
     # A function's world without a time limit is judged in over episodes of the same length.
-    plain = handed(result, out, jackal, steps=512, world=lambda n: vector_env("JackalFlat", n, threads=1, episode=-1))
+    plain = handed(result, out, jackal, steps=128, world=lambda n: vector_env("JackalFlat", n, threads=1, episode=-1))
     assert plain["returns"]["world"] == plain["returns"]["nominal"]
 
 
@@ -132,8 +138,8 @@ def test_functions_of_one_name_are_worlds_of_their_own(tmp_path: Path, result: P
         return lambda n: VectorRandomizePsi(vector_env("JackalFlat", n, threads=1, episode=40), psi)
 
     stuck = {f"{w}_wheel_friction": (0.0, 0.0) for w in ("front_left", "front_right", "rear_left", "rear_right")}
-    easy, hard = (handed(result, tmp_path / "out", jackal, steps=512, world=w) for w in (world(), world(**stuck)))
-    fresh = handed(result, tmp_path / "fresh", jackal, steps=512, world=world(**stuck))
+    easy, hard = (handed(result, tmp_path / "out", jackal, steps=128, world=w) for w in (world(), world(**stuck)))
+    fresh = handed(result, tmp_path / "fresh", jackal, steps=128, world=world(**stuck))
     assert hard["returns"]["world"] == fresh["returns"]["world"]
     assert hard["returns"]["world"] != easy["returns"]["world"]
     assert hard["curve"] == easy["curve"], "what was learned is kept"
@@ -190,11 +196,11 @@ def test_folders_of_others_are_left_alone(tmp_path: Path, result: Path, jackal: 
         with pytest.raises(InputError, match="holds the report of another command"):
             handed(result, folder, jackal)
         (folder / "report.json").unlink()
-    handed(result, tmp_path / "out", jackal, steps=512)
+    handed(result, tmp_path / "out", jackal, steps=128)
     with pytest.raises(InputError, match=r"is of another run \(seed 0, now 1\)"):
         hand_over(
             "JackalFlat", result, tmp_path / "out", policy=jackal, threads=1,
-            config=FineTuneConfig(steps=512, seed=1, **SMALL),
+            config=FineTuneConfig(steps=128, seed=1, **SMALL),
         )  # fmt: skip
 
 
@@ -208,7 +214,7 @@ def test_another_condition_or_signal_is_another_run(tmp_path: Path, jackal: Path
     given: dict[str, Any] = {"steps": 1, "condition": "calm", "signals": {"exo:supply": 20.0}}
     first, said = handed(file, out, jackal, **given), Console(record=True, width=200, file=open("/dev/null", "w"))  # noqa: SIM115
     assert handed(file, out, jackal, **given, console=said)["returns"] == first["returns"]
-    assert "finished before, at step 512 of 1" in said.export_text()
+    assert "finished before, at step 128 of 1" in said.export_text()
     with pytest.raises(InputError, match=r"is of another run \(condition"):
         handed(file, out, jackal, **{**given, "condition": "gale"})
     with pytest.raises(InputError, match=r"is of another run \(exo:supply 20.0, now 12.0"):
@@ -297,7 +303,7 @@ def test_the_best_point_is_kept(result: Path) -> None:
 
 @pytest.mark.parametrize("text", ["{broken", "[]", '{"of": "x", "scores": {"a": 3}}'])
 def test_a_damaged_file_of_what_was_judged_is_named(tmp_path: Path, result: Path, jackal: Path, text: str) -> None:
-    handed(result, tmp_path / "out", jackal, steps=512)
+    handed(result, tmp_path / "out", jackal, steps=128)
     (tmp_path / "out" / "judged.json").write_text(text)
     with pytest.raises(InputError, match=r"judged\.json: damaged, or none of this command's .*remove it to judge anew"):
-        handed(result, tmp_path / "out", jackal, steps=512)
+        handed(result, tmp_path / "out", jackal, steps=128)
