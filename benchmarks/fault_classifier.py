@@ -1,7 +1,7 @@
 """A network that was shown simulated windows with faults: which faults it finds, and at which price.
 
     python benchmarks/fault_classifier.py --out DIR [--robots Jackal] [--lessons N] [--nominal N] [--held-out N]
-                                          [--faulty N] [--effects N] [--epochs N] [--budget SECONDS] [--width W]
+                                          [--faulty N] [--effects N] [--encoder nn] [--epochs N] [--budget SECONDS] [--width W]
                                           [--seed S] [--jobs J] [--device cuda] [--compile] [--json FILE]
     python benchmarks/fault_classifier.py --quick
 
@@ -30,22 +30,18 @@ from anomalies.faults import Fault, faults
 from numpy.typing import NDArray
 from options import count, ended, json_file, number, write_json
 from posteriors.fit import rounded
-from posteriors.sets import Held
 from timing import Table
 
 from nfc_gym.core import InputError
-from nfc_gym.core.files import replacing
-from nfc_gym.inference.encoders.place import place_of
-from nfc_gym.inference.faults import FaultClassifier
+from nfc_gym.inference.faults import FaultClassifier, FaultConfig
 from nfc_gym.inference.progress import Spoken
 from nfc_gym.inference.rates import auroc, rate_above, threshold_at
-from nfc_gym.inference.reflection import Reflection
-from nfc_gym.inference.space import PriorBox
-from nfc_gym.inference.train import TrainConfig, train
+from nfc_gym.inference.train import TrainConfig
 from nfc_gym.simulate.faulty import lessons
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.pool import unordered
 from nfc_gym.simulate.trials import trials
+from nfc_gym.simulate.watch import TRAINING, learn_faults
 
 Array = NDArray[np.float64]
 Windows = dict[str, NDArray]
@@ -76,14 +72,8 @@ class Course:
 
     def lessons(self) -> Windows:
         """To learn from, kept in DIR."""
-        file = self.args.out / f"{self.machine.kind.name}_{self.args.lessons}_{self.seed}.npz"
-        if file.is_file():
-            return dict(np.load(file))
-        made = lessons(self.environment, self.psi(self.args.lessons, 1), self.seed, jobs=self.args.jobs)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as part, part.open("wb") as to:
-            np.savez(to, allow_pickle=False, **made)
-        return made
+        args = self.args
+        return lessons(self.environment, self.psi(args.lessons, 1), self.seed, jobs=args.jobs, folder=args.out)
 
     def judges(self) -> list[Windows]:
         """Noisy windows to judge by: held out, nominal, and of each fault, fewer where it throws the robot at once."""
@@ -118,21 +108,16 @@ def _windows(environment: str, psi: Array, seed: tuple[int, ...], fault: Fault |
 
 def learned(course: Course, args: argparse.Namespace) -> FaultClassifier:
     """The network, trained; says how that went."""
-    machine, device, made = course.machine, torch.device(args.device), course.lessons()
-    tensors = {k: torch.as_tensor(v).to(device) for k, v in made.items()}
-    names = tuple(machine.state_names)
-    held = Held(tensors, torch.as_tensor(machine.noise, dtype=torch.float32, device=device), names)
-    prior = PriorBox.of(machine.space, machine.kind.name)
-    net = FaultClassifier.of(tensors, prior, place=place_of(names), channels=names, seed=course.seed)
+    machine, device = course.machine, torch.device(args.device)
     config = TrainConfig(
         epochs=args.epochs, batch=args.batch, rate=args.rate, seed=course.seed, mixed=False, budget=args.budget,
-        patience=args.epochs, compiled=args.compile,
+        patience=args.epochs if args.budget else TRAINING.patience, compiled=args.compile,
     )  # fmt: skip
-    folder = args.out / f"{machine.kind.name}_training"
+    folder = args.out / f"{machine.kind.name}_{args.encoder}_training"
     with rounded(device):
-        out = train(
-            net, *held.split(0.05), config, folder=folder, device=device, report=Spoken(),
-            mirror=Reflection(machine.mirrors),
+        net, out = learn_faults(
+            machine, course.lessons(), config, FaultConfig(encoder=args.encoder), folder=folder, device=device,
+            report=Spoken(),
         )  # fmt: skip
     print(
         f"{machine.kind.name}: {out.stopped} after {len(out.train)} epochs, {out.seconds:.0f} s, best {out.best}, "
@@ -205,6 +190,7 @@ def _arguments() -> argparse.Namespace:
     add("--held-out", type=count(1), default=10_000, help="nominal windows that thresholds are taken from")
     add("--faulty", type=count(1), default=1000, help="windows of each fault and size")
     add("--effects", type=count(0), default=6, help="effects of the library, drawn")
+    add("--encoder", choices=("tcn", "nn"), default="tcn", help="of the motion (default %(default)s)")
     add("--epochs", type=count(1), default=60, help="passes over the lessons, at most")
     add("--budget", type=number(0), default=0, metavar="SECONDS", help="of training; 0 for any number")
     add("--batch", type=count(1), default=1024, help="windows a step")

@@ -94,7 +94,7 @@ def main() -> None:
                               if args.device != "auto" else "cpu")  # fmt: skip
         plan = Plan(
             args.epochs, args.budget, args.batch, args.rate, args.draws, args.small, args.mirror, not args.adamw,
-            args.compile,
+            args.compile, args.hidden, args.bf16,
         )  # fmt: skip
         kept = Kept(args.out, {"judges": args.judges, "samples": args.samples, **plan.settings})
         run = Run(args, kept, plan, device, time.monotonic() + args.stop if args.stop else float("inf"))
@@ -237,6 +237,10 @@ def _arguments() -> argparse.Namespace:
         help="show half of each step's windows in each mirror of the robot; sbi's methods see none",
     )
     parser.add_argument("--adamw", action="store_true", help="change matrices by AdamW too, in place of Muon")
+    parser.add_argument(
+        "--hidden", type=count(1), default=256, help="width of the densities' layers (default %(default)s)"
+    )
+    parser.add_argument("--bf16", action="store_true", help="train in bfloat16 on a GPU, in place of 19 bits")
     parser.add_argument(
         "--compile", action="store_true", help="compile training steps first, which takes part of the budget"
     )

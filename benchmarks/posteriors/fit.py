@@ -37,6 +37,8 @@ class Plan(NamedTuple):
       small: networks of a toy's size.
       muon: whether matrices are changed by Muon, else by AdamW as all else is; no peer's are.
       compiled: whether a training step is compiled first, see `TrainConfig`; no peer's is.
+      hidden: width of the densities' layers.
+      mixed: bfloat16 in the networks on a GPU, in place of 19 bits; those that see maps have it in any case.
       mirror: whether half of the windows of each step are shown in each mirror; no peer's are, and none with maps.
     """
 
@@ -49,13 +51,14 @@ class Plan(NamedTuple):
     mirror: bool = False
     muon: bool = True
     compiled: bool = False
+    hidden: int = 256
+    mixed: bool = False
 
     @property
     def settings(self) -> dict[str, Any]:
         """What a finished cell depends on; what is not there is not named, as by earlier versions, which had none."""
-        return {
-            name: value for name, value in self._asdict().items() if name not in ("mirror", "muon", "compiled") or value
-        }
+        as_before = {"mirror": False, "muon": False, "compiled": False, "hidden": 256, "mixed": False}
+        return {name: value for name, value in self._asdict().items() if value != as_before.get(name)}
 
 
 class Cell(NamedTuple):
@@ -74,9 +77,9 @@ def fit(
     if METHODS[method].peer:
         from posteriors.peers import fit_peer
 
-        warm(network_config(METHODS[method], inputs, plan.small, plan.draws), windows, prior, plan, device)
+        warm(network_config(METHODS[method], inputs, plan.small, plan.draws, plan.hidden), windows, prior, plan, device)
         return Cell(*fit_peer(METHODS[method], inputs, windows, prior, plan, seed, device))
-    config = network_config(METHODS[method], inputs, plan.small, plan.draws)
+    config = network_config(METHODS[method], inputs, plan.small, plan.draws, plan.hidden)
     return fit_network(config, windows, prior, plan, seed, folder, device, report)
 
 
@@ -91,8 +94,8 @@ def fit_network(
     first, held_out = windows.split(HELD_OUT)
     training = TrainConfig(
         epochs=plan.epochs, batch=plan.batch, rate=plan.rate, muon=plan.muon, compiled=plan.compiled, seed=seed,
-        save_every=_SAVE,
-        mixed=config.elevation, budget=plan.budget, patience=plan.epochs if plan.budget else TrainConfig.patience,
+        save_every=_SAVE, mixed=plan.mixed or config.elevation, budget=plan.budget,
+        patience=plan.epochs if plan.budget else TrainConfig.patience,
     )  # fmt: skip
     mirror = _mirror(prior) if plan.mirror and not config.elevation else None
     warm(config, windows, prior, plan, device)

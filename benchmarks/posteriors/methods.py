@@ -47,9 +47,11 @@ INPUTS: dict[str, dict[str, bool]] = {
 }
 
 
-def network_config(method: Method, inputs: str, small: bool = False, draws: int = 8) -> NetworkConfig:
-    """Of one method; `small` is for trying things out, `draws` are a score model's."""
-    size = {"width": 64, "features": 64, "hidden": 64, "depth": 2} if small else {}
+def network_config(
+    method: Method, inputs: str, small: bool = False, draws: int = 8, hidden: int = 256
+) -> NetworkConfig:  # fmt: skip
+    """Of one method; `small` is for trying things out, `draws` are a score model's, `hidden` is its layers' width."""
+    size = {"width": 64, "features": 64, "hidden": 64, "depth": 2} if small else {"hidden": hidden}
     density = "score" if method.peer else method.density
     return NetworkConfig(encoder=method.encoder, density=density, draws=draws, **INPUTS[inputs], **size)
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 import nfc_gym
-from nfc_gym.cli import measured, mission, policies, posteriors
+from nfc_gym.cli import detectors, measured, mission, policies, posteriors
 
 
 def flowing(text: str | None) -> str:
@@ -33,10 +33,11 @@ COMMANDS = {
         "excite": measured.excite,
         "demo": measured.demo,
     },
-    "Posteriors": {
+    "Posteriors and detectors": {
         "simulate": posteriors.simulate,
         "train": posteriors.train,
         "infer": posteriors.infer,
+        "watch": detectors.watch,
         "learn": mission.learn,
     },
     "Policies": {

@@ -75,7 +75,7 @@ def simulate(
         kinds.require_kind(out, kinds.WINDOWS)
         from nfc_gym.simulate import simulate as run
 
-        source = None if proposal is None else _proposal(proposal, environment)
+        source = None if proposal is None else belief_of(proposal, environment, "--proposal")
         run(
             environment, windows, out, seed=seed, jobs=jobs, effects=effects, proposal=source, policy=_mover(policy),
             policy_share=policy_share, motor=motor, ray=ray, console=Console(),
@@ -95,7 +95,7 @@ def _mover(policy: str | None) -> "Perceptron | str | None":
     return load_policy(policy).perceptron()
 
 
-def _proposal(file: Path, environment: str) -> Sampler:
+def belief_of(file: Path, environment: str, option: str) -> Sampler:
     """What psi is drawn from; of a posterior it is said here what is wrong with it, since here its file is known."""
     source = load_source(file)
     if file.suffix.lower() != ".safetensors":
@@ -107,12 +107,12 @@ def _proposal(file: Path, environment: str) -> Sampler:
         machine, robot = Machine(environment), source.prior.robot
         if robot != machine.kind.name:
             raise InputError(
-                f"--proposal {file}: a posterior of the robot {robot!r}, and {machine.environment} is of "
+                f"{option} {file}: a posterior of the robot {robot!r}, and {machine.environment} is of "
                 f"{machine.kind.name!r}: choose one of that robot"
             )
         if source.kept is None:
             raise InputError(
-                f"--proposal {file}: this posterior was given no window: give what "
+                f"{option} {file}: this posterior was given no window: give what "
                 f"`nfc-gym infer {file} window.npz --out given.safetensors` writes"
             )
     return source
@@ -169,7 +169,7 @@ def train(
         _require_used(not structure, "for a posterior: give it without --structure", **of_posteriors)
         kinds.require_kind(out, kinds.STRUCTURE if structure else kinds.POSTERIOR)
         require_writable(out.absolute().parent)
-        jobs = _learning()
+        jobs = learning()
         from nfc_gym.inference.config import NetworkConfig
         from nfc_gym.inference.progress import Spoken
         from nfc_gym.inference.reflection import Reflection
@@ -193,7 +193,7 @@ def train(
         say_written(out, f"{_learned(done)} ({done.seconds:.0f} s){'' if structure else _told(out)}")
 
 
-def _learning() -> ModuleType:
+def learning() -> ModuleType:
     """`inference.jobs`, which needs an extra."""
     from nfc_gym.core import MissingExtra
 
@@ -284,7 +284,7 @@ def infer(
         mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
         _require_used(mapped, f"of a mapping's logs, and {window} is no mapping file", log=log, until=until)
         _require_used(refine is not None, "for --refine: give --refine N too", device=device, jobs=jobs)
-        learning = _learning()
+        inference = learning()
         from nfc_gym.inference.progress import Spoken
 
         seen = _window(posterior, window, log, until) if mapped else window
@@ -294,11 +294,13 @@ def infer(
             from nfc_gym.simulate.refined import refined
 
             anew = partial(
-                refined, simulations=refine, seed=seed, jobs=jobs or 0, device=learning.device_of(device or "auto"),
+                refined, simulations=refine, seed=seed, jobs=jobs or 0, device=inference.device_of(device or "auto"),
                 report=report,
             )  # fmt: skip
-        drawn, found = learning.infer(posterior, seen, samples=samples, seed=seed, out=out, refined=anew, report=report)
-        _print_table(found, learning.AS_WIDE)
+        drawn, found = inference.infer(
+            posterior, seen, samples=samples, seed=seed, out=out, refined=anew, report=report
+        )
+        _print_table(found, inference.AS_WIDE)
         if out is not None and out.suffix == ".npz":
             parts = [part for part in ("psi", "delta_s") if getattr(drawn, part) is not None]
             say_written(out, f"{samples} draws of {' and '.join(parts)}")

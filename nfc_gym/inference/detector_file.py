@@ -1,4 +1,4 @@
-"""A contrastive detector as one safetensors file: weights, scales, threshold, and all that rebuilds it."""
+"""A detector that is a network as one safetensors file: weights, scales, threshold, and all that rebuilds it."""
 
 import json
 import os
@@ -16,15 +16,17 @@ from nfc_gym.inference import posterior
 from nfc_gym.inference.config import Sizes
 from nfc_gym.inference.contrast import Contrast, ContrastConfig
 from nfc_gym.inference.detector import WindowDetector
+from nfc_gym.inference.faults import FaultClassifier, FaultConfig
 from nfc_gym.inference.rates import Threshold
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.state import read, require_format
 
 FORMAT = "nfc_gym-detector-1"
+_SCORERS = {"contrast": (Contrast, ContrastConfig), "faults": (FaultClassifier, FaultConfig)}
 
 
 def save(path: str | os.PathLike[str], detector: WindowDetector, notes: dict[str, Any] | None = None) -> None:
-    """Write a detector whose scorer is a `Contrast`, with its threshold.
+    """Write a detector whose scorer is a `Contrast` or a `FaultClassifier`, with its threshold.
 
     Args:
       path: ends in `.safetensors`.
@@ -37,11 +39,13 @@ def save(path: str | os.PathLike[str], detector: WindowDetector, notes: dict[str
     path, net = Path(path), detector.scorer
     if path.suffix.lower() != ".safetensors":
         raise InputError(f"{path}: a detector is kept in a file that ends in .safetensors")
-    if not isinstance(net, Contrast) or detector.calibration is None:
+    if not isinstance(net, Contrast | FaultClassifier) or detector.calibration is None:
         raise InputError(
-            "save: want a detector with a Contrast as its scorer and a threshold: detector.calibrated(...)"
+            "save: want a detector with a Contrast or a FaultClassifier as its scorer, and a threshold: "
+            "detector.calibrated(...)"
         )
     about = {
+        "scorer": next(name for name, (kind, _) in _SCORERS.items() if isinstance(net, kind)),
         "nfc_gym": __version__, "torch": str(torch.__version__), "config": net.config.to_dict(),
         "every": detector.every,
         "sizes": asdict(net.sizes), "prior": net.prior.to_dict(), "channels": net.channels,
@@ -65,7 +69,8 @@ def load(path: str | os.PathLike[str], prior: PriorBox | None = None) -> WindowD
     try:
         about = json.loads(metadata["about"])
         own, sizes = PriorBox.from_dict(about["prior"]), Sizes(**about["sizes"])
-        net = Contrast(ContrastConfig(**about["config"]), sizes, own, tuple(about["channels"]))
+        kind, config = _SCORERS[about.get("scorer", "contrast")]  # which earlier versions did not name
+        net = kind(config(**about["config"]), sizes, own, tuple(about["channels"]))
         threshold, every = Threshold(**about["threshold"]), int(about["every"])
     except (KeyError, TypeError, ValueError) as e:
         raise InputError(f"{path}: its metadata describe no detector that this version knows ({e})") from None

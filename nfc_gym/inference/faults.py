@@ -7,7 +7,7 @@ were drawn, to those that are believed: no test finds more of them at the same r
 Pearson). Of faults unlike those it was shown it promises nothing.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -75,7 +75,7 @@ class FaultClassifier(Learner):
     """
 
     def __init__(
-        self, config: FaultConfig, sizes: Sizes, prior: PriorBox, channels: Sequence[str] = (), seed: int = 0
+        self, config: FaultConfig, sizes: Sizes, prior: PriorBox, channels: tuple[str, ...] = (), seed: int = 0
     ) -> None:
         super().__init__()
         self.config, self.sizes, self.prior, self.channels = config, sizes, prior, tuple(channels)

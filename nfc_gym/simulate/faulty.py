@@ -1,12 +1,15 @@
 """Windows of machines each with a fault, of a kind and a size that are drawn: what detectors learn faults from."""
 
+import hashlib
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.core.files import replacing
 from nfc_gym.inference.windows import Batch
 from nfc_gym.simulate.draws import geometric
 from nfc_gym.simulate.machine import Machine
@@ -64,7 +67,7 @@ def faulty(machine: Machine, psi: Array, seed: int, *, noise: float = 1.0, nthre
     return out | {"kind": np.array([KINDS.index(k) for k in (*names, "effect")])[kind[out["row"]]]}
 
 
-def lessons(environment: str, psi: Array, seed: int, *, jobs: int = 1) -> Batch:
+def lessons(environment: str, psi: Array, seed: int, *, jobs: int = 1, folder: Path | None = None) -> Batch:
     """Windows without sensor noise, of which every other machine has a fault: what a `FaultClassifier` learns from.
 
     Args:
@@ -72,6 +75,7 @@ def lessons(environment: str, psi: Array, seed: int, *, jobs: int = 1) -> Batch:
       psi: (n, d) physical units, of the machines before their fault: draws of what is believed.
       seed: of faults and motion; the same bits for any `jobs`.
       jobs: processes.
+      folder: where parts of 500 are kept, so that a run that was stopped goes on; None keeps none.
 
     Returns:
       `states` (m, H+1, s), `actions` (m, H, a) and `psi` (m, d) in [0, 1] of the prior's box, float32; `family` (m,),
@@ -80,10 +84,33 @@ def lessons(environment: str, psi: Array, seed: int, *, jobs: int = 1) -> Batch:
     Raises:
       InputError: see `faulty`.
     """
-    rows = range(0, len(psi), _ROWS)
-    tasks = ((environment, psi[i : i + _ROWS], seed, i) for i in rows)
-    found: list[Batch] = [{}] * len(rows)
-    made = unordered(_lesson, tasks, jobs) if jobs > 1 else enumerate(_lesson(*task) for task in tasks)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        told = hashlib.sha256(f"{environment} {seed} {psi.shape} ".encode() + np.ascontiguousarray(psi).tobytes())
+        folder = folder / f"lessons_{told.hexdigest()[:16]}"
+    return _together(_lesson, [(environment, psi[i : i + _ROWS], seed, i, folder) for i in _starts(psi)], jobs)
+
+
+def nominal(environment: str, psi: Array, seed: int, *, jobs: int = 1) -> Batch:
+    """Noisy windows of machines as they are believed to be, from which a detector's threshold is taken.
+
+    Args:
+      environment, psi, seed, jobs: see `lessons`.
+
+    Returns:
+      `states` (n, H+1, s) and `actions` (n, H, a).
+    """
+    return _together(_nominal, [(environment, psi[i : i + _ROWS], seed, i) for i in _starts(psi)], jobs)
+
+
+def _starts(psi: Array) -> range:
+    return range(0, len(psi), _ROWS)
+
+
+def _together(function: Callable[..., Batch], tasks: list[tuple], jobs: int) -> Batch:
+    """What processes make of the tasks, in their order."""
+    found: list[Batch] = [{}] * len(tasks)
+    made = unordered(function, tasks, jobs) if jobs > 1 else enumerate(function(*task) for task in tasks)
     for number, part in made:
         found[number] = part
     return {name: np.concatenate([p[name] for p in found]) for name in found[0]}
@@ -94,7 +121,27 @@ def _machine(environment: str) -> Machine:
     return Machine(environment)
 
 
-def _lesson(environment: str, psi: Array, seed: int, at: int) -> Batch:
+def _nominal(environment: str, psi: Array, seed: int, at: int) -> Batch:
+    """Of some rows."""
+    made = trials(_machine(environment), psi, int(np.random.default_rng([seed, at]).integers(2**31)))
+    return {name: made[name] for name in ("states", "actions")}
+
+
+def _lesson(environment: str, psi: Array, seed: int, at: int, folder: Path | None) -> Batch:
+    """Of some rows, which may be kept already."""
+    if folder is None:
+        return _made(environment, psi, seed, at)
+    file = folder.with_name(f"{folder.name}_{at}.npz")
+    if file.is_file():
+        with np.load(file) as kept:
+            return dict(kept)
+    made = _made(environment, psi, seed, at)
+    with replacing(file) as part, part.open("wb") as to:
+        np.savez(to, allow_pickle=False, **made)
+    return made
+
+
+def _made(environment: str, psi: Array, seed: int, at: int) -> Batch:
     """Of some rows, in an order that is drawn."""
     machine, rng = _machine(environment), np.random.default_rng([seed, at])
     sound, broken = (int(rng.integers(2**31)) for _ in range(2))
