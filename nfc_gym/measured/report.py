@@ -6,6 +6,7 @@ outside, and the same report gives the same page.
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -76,6 +77,12 @@ def render_summary(summary: Row) -> str:
 
 def page(template: str, **values: Any) -> str:
     """One of `templates` with its values: a self-contained page."""
+    return _templates().get_template(template).render(**values)
+
+
+@cache
+def _templates() -> Environment:
+    """The pages' templates, each compiled once: that takes longer than to fill it in."""
     # autoescape for every file: `select_autoescape` would pass over names that end in .j2
     env = Environment(
         loader=PackageLoader("nfc_gym.measured", "templates"),
@@ -86,7 +93,7 @@ def page(template: str, **values: Any) -> str:
     )
     words = (wording.number, wording.quantity, wording.plain, wording.percent, wording.unit, wording.counted)
     env.filters |= {f.__name__: f for f in words}
-    return env.get_template(template).render(**values)
+    return env
 
 
 def _values(row: Row, stage: str) -> list[Any]:

@@ -45,15 +45,24 @@ def local_polynomial(time: Array, values: Array, at: Array, points: int = POINTS
     window = first[:, None] + np.arange(points)
     span = np.maximum(time[window[:, -1]] - time[window[:, 0]], 1e-12)
     scaled = (time[window] - at[:, None]) / span[:, None]
-    basis = scaled[..., None] ** np.arange(degree + 1)
-    solve = np.linalg.pinv(basis)  # (T, degree + 1, points)
-    fitted = solve @ values[window]
+    alike, of = _alike(scaled)  # of samples at even times few differ
+    basis = alike[..., None] ** np.arange(degree + 1)
+    solve = np.linalg.pinv(basis)  # (kinds, degree + 1, points)
+    gain = np.linalg.norm(solve, axis=-1)[of]
+    basis, fitted = basis[of], solve[of] @ values[window]
     rows = [fitted[:, i] if i <= degree else np.zeros_like(fitted[:, 0]) for i in range(3)]
-    gain = np.linalg.norm(solve, axis=-1)
     slope_gain = gain[:, 1] / span if degree >= 1 else np.zeros(len(at))
     off = np.square(values[window] - basis @ fitted).mean(-1).sum(-1) / max(points - degree - 1, 1)
     bend = 2 * rows[2] / span[:, None] ** 2
     return Local(rows[0], rows[1] / span[:, None], bend, gain[:, 0], slope_gain, np.sqrt(off))
+
+
+def _alike(rows: Array) -> tuple[Array, NDArray[np.intp]]:
+    """The rows (n, k) of an array (T, k) that differ in any bit, and which of them each of its rows is, (T,)."""
+    raw, width = np.ascontiguousarray(rows).tobytes(), rows.itemsize * rows.shape[1]
+    known: dict[bytes, int] = {}
+    of = [known.setdefault(raw[i : i + width], len(known)) for i in range(0, len(raw), width)]
+    return np.frombuffer(b"".join(known), rows.dtype).reshape(-1, rows.shape[1]), np.array(of, np.intp)
 
 
 def fresh_samples(time: Array, values: Array, rate: float | None) -> NDArray[np.intp]:
