@@ -1,8 +1,8 @@
 """A network that was shown simulated windows with faults: which faults it finds, and at which price.
 
     python benchmarks/fault_classifier.py --out DIR [--robots Jackal] [--lessons N] [--nominal N] [--held-out N]
-                                          [--faulty N] [--effects N] [--encoder nn] [--epochs N] [--budget SECONDS] [--width W]
-                                          [--seed S] [--jobs J] [--device cuda] [--compile] [--json FILE]
+                                          [--faulty N] [--effects N] [--encoder nn] [--epochs N] [--budget SECONDS]
+                                          [--width W] [--seed S] [--jobs J] [--device cuda] [--compile] [--json FILE]
     python benchmarks/fault_classifier.py --quick
 
 Machines and faults are those of `anomaly.py`: psi within `--width` of the prior's range about nominal; main mass, an

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from nfc_gym.inference.contrast import Contrast, ContrastConfig
     from nfc_gym.inference.data import StoredWindows, TensorWindows
     from nfc_gym.inference.detector import Either, WindowDetector
+    from nfc_gym.inference.faults import FaultClassifier, FaultConfig
     from nfc_gym.inference.jobs import infer, train_posterior
     from nfc_gym.inference.network import Network
     from nfc_gym.inference.posterior import NeuralPosterior, Window, load
@@ -25,6 +26,8 @@ _HOME = {
     "Contrast": "contrast",
     "ContrastConfig": "contrast",
     "Either": "detector",
+    "FaultClassifier": "faults",
+    "FaultConfig": "faults",
     "Network": "network",
     "NetworkConfig": "config",
     "NeuralPosterior": "posterior",
@@ -44,9 +47,9 @@ _HOME = {
     "train_posterior": "jobs",
 }
 __all__ = [
-    "Contrast", "ContrastConfig", "Either", "Network", "NetworkConfig", "NeuralPosterior", "PriorBox", "Sizes",
-    "Spoken", "StoredWindows", "TensorWindows", "TrainConfig", "Window", "WindowDetector", "Windows", "infer", "load",
-    "sequential", "train", "train_posterior",
+    "Contrast", "ContrastConfig", "Either", "FaultClassifier", "FaultConfig", "Network", "NetworkConfig",
+    "NeuralPosterior", "PriorBox", "Sizes", "Spoken", "StoredWindows", "TensorWindows", "TrainConfig", "Window",
+    "WindowDetector", "Windows", "infer", "load", "sequential", "train", "train_posterior",
 ]  # fmt: skip
 
 lazy.export(__name__, _HOME, "inference")
