@@ -112,6 +112,7 @@ class Bench:
         most: int | None = None,
         horizons: tuple[float, ...] | None = None,
         put_off: bool = True,
+        judged: bool = True,
     ) -> RolloutProblem:
         """The same as roll-outs, whatever the mapping's mode; `states` along each of the logs.
 
@@ -120,9 +121,11 @@ class Bench:
         Args:
           horizons: s, at which segments that end at the last are compared; default as the mapping says.
           put_off: see `Layout`.
+          judged: whether they are rough is found out, by roll-outs of all logs; residuals alone want to know nothing
+            of it.
         """
         whole = self._rollouts(logs, states, horizons, put_off)
-        whole.rough = whole.rough and self._touching
+        whole.rough = whole.rough and judged and self._touching
         if most is None or len(whole) <= most:
             return whole
         return whole.take(np.unique(np.linspace(0, len(whole) - 1, most).round().astype(int)))

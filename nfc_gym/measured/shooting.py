@@ -372,7 +372,7 @@ class RolloutProblem(Problem):
         """The same measurements, predicted along other segments: other starts, other signals, another step.
 
         Args:
-          signs: that the numbers of channels are multiplied by, channel -> (dim,).
+          signs: that the numbers of channels are multiplied by, channel -> (dim,), or (S, 1, dim) for each block.
         """
         out = object.__new__(RolloutProblem)
         out.__dict__.update(self.__dict__)

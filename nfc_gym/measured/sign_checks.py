@@ -24,6 +24,7 @@ from nfc_gym.physics.effects.lookup import actuator_names
 Array = NDArray[np.float64]
 
 LOGS, ROWS, BLOCKS = 4, 4000, 60  # of the data that are looked at: logs, rows from the middle of each, roll-outs
+TURNS = 8  # that are rolled out at once: a batch takes room
 AHEAD, SAMPLES = 0.1, 5  # s that roll-outs last, or so many sampling intervals where those are longer
 BETTER = 0.5  # of the error as the log is, to which a turn must bring it, in the median roll-out
 OFTEN, WORSE = 0.9, 0.05  # of the roll-outs, which a turn must make no worse than by so much
@@ -69,10 +70,12 @@ def turned_round(dataset: Dataset) -> Iterator[Finding]:
             return
         logs = bench.dataset.logs
         ahead = max(AHEAD, SAMPLES * max(log.interval for log in logs))
-        problem = bench.rollouts(logs, [bench.states[log.name] for log in logs], BLOCKS, (ahead,))
+        states = [bench.states[log.name] for log in logs]
+        problem = bench.rollouts(logs, states, BLOCKS, (ahead,), judged=False)
     except InputError:  # told elsewhere
         return
-    weighed = [(left, turn) for turn in _turns(bench) if (left := _left(bench, problem, turn)) < BETTER]
+    turns = list(_turns(bench))
+    weighed = [w for w in zip(_left(bench, problem, turns), turns, strict=True) if w[0] < BETTER]
     told: set[str] = set()
     for left, turn in sorted(weighed, key=lambda w: w[0]):
         if turn.place in told:
@@ -93,22 +96,38 @@ def _middles(logs: Sequence[Log]) -> Iterator[Log]:
         yield log.part(start, min(start + ROWS, len(log)), log.name)
 
 
-def _left(bench: Bench, problem: RolloutProblem, turn: _Turn) -> float:
-    """Share of the error that a turn leaves, in the median roll-out; 1 where it is no clear gain."""
-    started = problem.segments
-    ctrl, qpos, qvel = started.ctrl.copy(), started.qpos.copy(), started.qvel.copy()
-    for values, signs in ((ctrl, turn.ctrl), (qpos, turn.qpos), (qvel, turn.qvel)):
-        for index, sign in signs.items():
-            values[..., index] *= sign
-    other = problem.beginning(replace(started, ctrl=ctrl, qpos=qpos, qvel=qvel), turn.measured)
-    before, after = (p.residual(bench.plant, bench.plant.null[None])[0] for p in (problem, other))
-    own = np.array([not turn.place or place == turn.place for place in problem.columns.place])
-    if not own.any():
-        own[:] = True
-    stable = np.isfinite(before).all(1) & np.isfinite(after).all(1)
+def _left(bench: Bench, problem: RolloutProblem, turns: Sequence[_Turn]) -> Iterator[float]:
+    """Share of the error that each turn leaves, in the median roll-out; 1 where it is no clear gain."""
+    before = problem.residual(bench.plant, bench.plant.null[None])[0]
     noise = np.maximum(problem.sensor_sd, np.finfo(float).eps)  # of a channel that never moves it comes out as 0
-    rms = lambda residual, of: np.sqrt(np.mean((residual / noise)[:, of] ** 2, 1))  # noqa: E731
-    told = stable & (rms(before, own) > 0)
+    for first in range(0, len(turns), TURNS):
+        some = turns[first : first + TURNS]
+        other = _turned(problem, some).residual(bench.plant, bench.plant.null[None])[0]
+        for turn, after in zip(some, other.reshape(len(some), *before.shape), strict=True):
+            own = np.array([not turn.place or place == turn.place for place in problem.columns.place])
+            yield _share(before / noise, after / noise, own if own.any() else np.ones_like(own))
+
+
+def _turned(problem: RolloutProblem, turns: Sequence[_Turn]) -> RolloutProblem:
+    """The problem once for each turn, one after the other: roll-outs of all at once cost little more than of one."""
+    size = len(problem)
+    many = problem.take(np.tile(np.arange(size), len(turns)))
+    ctrl, qpos, qvel = (values.copy() for values in (many.segments.ctrl, many.segments.qpos, many.segments.qvel))
+    measured: dict[str, Array] = {}
+    for k, turn in enumerate(turns):
+        rows = slice(k * size, (k + 1) * size)
+        for values, signs in ((ctrl, turn.ctrl), (qpos, turn.qpos), (qvel, turn.qvel)):
+            for index, sign in signs.items():
+                values[rows, ..., index] *= sign
+        for name, signs in turn.measured.items():
+            measured.setdefault(name, np.ones((len(many), 1, len(signs))))[rows] = signs
+    return many.beginning(replace(many.segments, ctrl=ctrl, qpos=qpos, qvel=qvel), measured)
+
+
+def _share(before: Array, after: Array, own: NDArray[np.bool_]) -> float:
+    """What of errors (S, m) before, in units of their noise, is left after, by the numbers (m,) of a turn's own."""
+    rms = lambda residual, of: np.sqrt(np.mean(residual[:, of] ** 2, 1))  # noqa: E731
+    told = np.isfinite(before).all(1) & np.isfinite(after).all(1) & (rms(before, own) > 0)
     if not told.any():
         return 1.0
     whole, share = (rms(after, of)[told] / rms(before, of)[told] for of in (np.full_like(own, True), own))
