@@ -1,6 +1,7 @@
 """One thread and one seed, so that runs agree to the bit; a policy of the Jackal, as `nfc-gym pretrain` makes it."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,11 +32,13 @@ def detector() -> "WindowDetector":
 
 @pytest.fixture(scope="session")
 def jackal(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file of a policy that has learned for a second."""
+    """The file of a policy that has learned from 512 steps."""
     from nfc_gym.adaptation import pretrain
+    from nfc_gym.adaptation.worlds import vector_env
 
     path = tmp_path_factory.mktemp("policies") / "jackal.safetensors"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nfc_gym.adaptation.pretraining.EPISODES", 2)
-        pretrain("JackalFlat", path, steps=2048, envs=32, threads=1, device="cpu")
+        patch.setattr("nfc_gym.adaptation.pretraining.vector_env", partial(vector_env, episode=100))
+        pretrain("JackalFlat", path, steps=512, envs=32, horizon=16, threads=1, device="cpu")
     return path

@@ -42,8 +42,14 @@ from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.envs.single import RobotEnv
 from nfc_gym.wrappers import RandomizePsi
 
-CONFIG = AdaptConfig(missions=2, worlds=8, steps=512, episode=40, judged=0)
-ONCE = replace(ONWARD, epochs=1, minibatches=2, together=256)  # a batch is of so many steps
+CONFIG = AdaptConfig(missions=2, worlds=8, steps=256, episode=40, judged=0)  # an iteration is of 256 steps
+ONCE = replace(ONWARD, epochs=1, minibatches=2)
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Iterations of a quarter of the control steps."""
+    monkeypatch.setattr("nfc_gym.adaptation.ppo._LONGEST", 32)
 
 
 class Alarm:

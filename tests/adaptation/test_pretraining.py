@@ -23,12 +23,13 @@ from nfc_gym.adaptation.record import Episodes, Record
 from nfc_gym.adaptation.sight import VectorSight
 from nfc_gym.adaptation.worlds import vector_env
 
-SMALL = {"envs": 32, "threads": 1, "device": "cpu"}
+SMALL = {"envs": 32, "horizon": 16, "threads": 1, "device": "cpu"}  # 512 steps an iteration
 
 
 @pytest.fixture(autouse=True)
 def _few_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nfc_gym.adaptation.pretraining.EPISODES", 2)
+    monkeypatch.setattr("nfc_gym.adaptation.pretraining.vector_env", partial(vector_env, episode=100))
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -70,26 +71,26 @@ def test_a_task_other_than_the_first_is_what_is_trained_judged_and_resumed(tmp_p
         Record(None, None),
     )
     assert (run.envs.unwrapped.robot.task, run.recipe.episode) == ("figure8", 1000)
-    policy = pretrain("JackalFlat", path, steps=2048, task="figure8", **SMALL)
+    policy = pretrain("JackalFlat", path, steps=512, task="figure8", **SMALL)
     assert policy.about["training"]["task"] == "figure8"
     with pytest.raises(InputError, match="another run"):
-        pretrain("JackalFlat", path, steps=4096, **SMALL)
+        pretrain("JackalFlat", path, steps=1024, **SMALL)
     with pytest.raises(InputError, match="it has: goal, figure8"):
-        pretrain("JackalFlat", tmp_path / "q.safetensors", steps=2048, task="fly", **SMALL)
+        pretrain("JackalFlat", tmp_path / "q.safetensors", steps=512, task="fly", **SMALL)
 
 
 def test_a_run_that_stopped_goes_on_and_one_with_other_arguments_does_not(tmp_path: Path) -> None:
     path = tmp_path / "p.safetensors"
-    pretrain("JackalFlat", path, steps=2048, **SMALL)
+    pretrain("JackalFlat", path, steps=512, **SMALL)
     first = weights(path)
-    policy = pretrain("JackalFlat", path, steps=4096, **SMALL)
-    assert policy.about["steps"] == 4096
+    policy = pretrain("JackalFlat", path, steps=1024, **SMALL)
+    assert policy.about["steps"] == 1024
     assert any((first[k] != v).any() for k, v in weights(path).items())
     count = policy.network.scale.count
-    again = pretrain("JackalFlat", path, steps=4096, **SMALL)
+    again = pretrain("JackalFlat", path, steps=1024, **SMALL)
     assert again.network.scale.count == count, "nothing was left to do"
     with pytest.raises(InputError, match=r"another run .*seed 0, now 1"):
-        pretrain("JackalFlat", path, steps=4096, seed=1, **SMALL)
+        pretrain("JackalFlat", path, steps=1024, seed=1, **SMALL)
 
 
 def test_another_policy_to_begin_with_is_another_run(
@@ -145,7 +146,7 @@ def test_the_state_on_disk_is_all_that_going_on_needs(tmp_path: Path) -> None:
 
 def test_a_loss_that_comes_apart_leaves_the_last_good_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "p.safetensors"
-    pretrain("JackalFlat", path, steps=2048, **SMALL)
+    pretrain("JackalFlat", path, steps=512, **SMALL)
     good, learn = weights(path), Run.iterate
 
     def broken(self: Run, batch):
@@ -154,8 +155,8 @@ def test_a_loss_that_comes_apart_leaves_the_last_good_weights(tmp_path: Path, mo
         return learn(self, batch)
 
     monkeypatch.setattr(Run, "iterate", broken)
-    with pytest.raises(Diverged, match=r"not finite.*weights of step 2,048"):
-        pretrain("JackalFlat", path, steps=8192, **SMALL)
+    with pytest.raises(Diverged, match=r"not finite.*weights of step 512"):
+        pretrain("JackalFlat", path, steps=2048, **SMALL)
     assert all(torch.equal(v, good[k]) for k, v in weights(path).items())
     assert "not finite" in load_policy(path).about["diverged"]
 
@@ -175,8 +176,8 @@ def test_rough_ground_begins_with_a_flat_policy(tmp_path: Path, jackal: Path) ->
         taught(ActorCritic(flat.network.sizes), flat.sight, Policy(envs.sight, network))
     with pytest.raises(InputError, match=r"layers \(256, 128\)"):
         taught(ActorCritic(Sizes(17, 17, 2, (8,))), flat.sight, flat)
-    again = pretrain("JackalFlat", tmp_path / "p.safetensors", steps=2048, start=jackal, **SMALL)
-    assert again.about["started_from"] == {"environment": "nfc_gym/JackalFlat-v0", "steps": 2048}
+    again = pretrain("JackalFlat", tmp_path / "p.safetensors", steps=512, start=jackal, **SMALL)
+    assert again.about["started_from"] == {"environment": "nfc_gym/JackalFlat-v0", "steps": 512}
     assert again.network.scale.count > flat.network.scale.count
     assert again.about["ppo"] == asdict(ONWARD) != flat.about["ppo"]
 
