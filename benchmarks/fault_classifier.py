@@ -73,7 +73,9 @@ class Course:
     def lessons(self) -> Windows:
         """To learn from, kept in DIR."""
         args = self.args
-        return lessons(self.environment, self.psi(args.lessons, 1), self.seed, jobs=args.jobs, folder=args.out)
+        return lessons(
+            self.environment, self.psi(args.lessons, 1), self.seed, jobs=args.jobs, folder=args.out, report=Spoken()
+        )
 
     def judges(self) -> list[Windows]:
         """Noisy windows to judge by: held out, nominal, and of each fault, fewer where it throws the robot at once."""

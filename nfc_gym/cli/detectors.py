@@ -37,8 +37,8 @@ def watch(
     """Make an anomaly detector for a robot: a network that is shown simulated windows with and without faults.
 
     Faults are a main body heavier or lighter, less friction, a servo that is lost or weak, and effects that the model
-    lacks, all of drawn sizes. A window takes it 25 ms of a core, or 12 with
-    --encoder nn; `MonitorAnomaly(env, "FILE.safetensors")` opens it. Its threshold is taken from simulated windows without a fault.
+    lacks, all of drawn sizes. A window takes it 25 ms of a core, or 12 with --encoder nn;
+    `MonitorAnomaly(env, "FILE.safetensors")` opens it. Its threshold is taken from simulated windows without a fault.
 
     It knows the machines that it was shown. Give --belief where psi is known to be elsewhere than nominal: else a sound
     machine of another psi is an anomaly to it. Interrupted, even killed, the same command goes on: what was made lies

@@ -4,12 +4,14 @@ import hashlib
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
+from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.windows import Batch
 from nfc_gym.simulate.draws import geometric
 from nfc_gym.simulate.machine import Machine
@@ -67,7 +69,9 @@ def faulty(machine: Machine, psi: Array, seed: int, *, noise: float = 1.0, nthre
     return out | {"kind": np.array([KINDS.index(k) for k in (*names, "effect")])[kind[out["row"]]]}
 
 
-def lessons(environment: str, psi: Array, seed: int, *, jobs: int = 1, folder: Path | None = None) -> Batch:
+def lessons(
+    environment: str, psi: Array, seed: int, *, jobs: int = 1, folder: Path | None = None, report: Report = quiet
+) -> Batch:  # fmt: skip
     """Windows without sensor noise, of which every other machine has a fault: what a `FaultClassifier` learns from.
 
     Args:
@@ -76,6 +80,7 @@ def lessons(environment: str, psi: Array, seed: int, *, jobs: int = 1, folder: P
       seed: of faults and motion; the same bits for any `jobs`.
       jobs: processes.
       folder: where parts of 500 are kept, so that a run that was stopped goes on; None keeps none.
+      report: is told of parts as steps.
 
     Returns:
       `states` (m, H+1, s), `actions` (m, H, a) and `psi` (m, d) in [0, 1] of the prior's box, float32; `family` (m,),
@@ -88,31 +93,33 @@ def lessons(environment: str, psi: Array, seed: int, *, jobs: int = 1, folder: P
         folder.mkdir(parents=True, exist_ok=True)
         told = hashlib.sha256(f"{environment} {seed} {psi.shape} ".encode() + np.ascontiguousarray(psi).tobytes())
         folder = folder / f"lessons_{told.hexdigest()[:16]}"
-    return _together(_lesson, [(environment, psi[i : i + _ROWS], seed, i, folder) for i in _starts(psi)], jobs)
+    return _together(_lesson, [(environment, psi[i : i + _ROWS], seed, i, folder) for i in _starts(psi)], jobs, report)
 
 
-def nominal(environment: str, psi: Array, seed: int, *, jobs: int = 1) -> Batch:
+def nominal(environment: str, psi: Array, seed: int, *, jobs: int = 1, report: Report = quiet) -> Batch:
     """Noisy windows of machines as they are believed to be, from which a detector's threshold is taken.
 
     Args:
-      environment, psi, seed, jobs: see `lessons`.
+      environment, psi, seed, jobs, report: see `lessons`.
 
     Returns:
       `states` (n, H+1, s) and `actions` (n, H, a).
     """
-    return _together(_nominal, [(environment, psi[i : i + _ROWS], seed, i) for i in _starts(psi)], jobs)
+    return _together(_nominal, [(environment, psi[i : i + _ROWS], seed, i) for i in _starts(psi)], jobs, report)
 
 
 def _starts(psi: Array) -> range:
     return range(0, len(psi), _ROWS)
 
 
-def _together(function: Callable[..., Batch], tasks: list[tuple], jobs: int) -> Batch:
+def _together(function: Callable[..., Batch], tasks: list[tuple], jobs: int, report: Report) -> Batch:
     """What processes make of the tasks, in their order."""
     found: list[Batch] = [{}] * len(tasks)
+    began = monotonic()
     made = unordered(function, tasks, jobs) if jobs > 1 else enumerate(function(*task) for task in tasks)
-    for number, part in made:
+    for done, (number, part) in enumerate(made, 1):
         found[number] = part
+        report.step(done, len(tasks), monotonic() - began)
     return {name: np.concatenate([p[name] for p in found]) for name in found[0]}
 
 

@@ -98,10 +98,10 @@ def watch(
     rng = np.random.default_rng([training.seed, 0])
     psi = _believed(machine, belief, width, windows + enough, rng)
     report.message(f"simulates {windows} windows to learn from, {jobs} at a time")
-    made = lessons(environment, psi[:windows], training.seed, jobs=jobs, folder=folder)
+    made = lessons(environment, psi[:windows], training.seed, jobs=jobs, folder=folder, report=report)
     net, outcome = learn_faults(machine, made, training, config, folder=folder, device=device, report=report)
     report.message(f"simulates {enough} more without a fault, for the threshold")
-    sound = nominal(environment, psi[windows:], training.seed + 1, jobs=jobs)
+    sound = nominal(environment, psi[windows:], training.seed + 1, jobs=jobs, report=report)
     detector = WindowDetector(net.to("cpu")).calibrated(sound["states"], sound["actions"], rate)
     notes = {"environment": environment, "lessons": windows, "best": outcome.best, "held_out": outcome.held_out}
     detector_file.save(out, detector, notes)
