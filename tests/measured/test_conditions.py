@@ -21,13 +21,13 @@ from nfc_gym.physics.effects.conditions import Conditioned
 from nfc_gym.physics.effects.saved import from_row, to_row
 from nfc_gym.wrappers import ApplyEffects
 
-DT, SECONDS, NOISE = 0.005, 2.0, {"x": 0.002, "v": 0.01}
+DT, SECONDS, NOISE = 0.01, 2.0, {"x": 0.002, "v": 0.01}
 DRAG = 0.35  # N s/m
 WINDS = {"calm": 0.0, "breeze": 1.5, "gale": 4.0}  # m/s along x
 
 MODEL = """
 <mujoco>
-  <option timestep="0.005" integrator="implicitfast" gravity="0 0 0"/>
+  <option timestep="0.01" integrator="implicitfast" gravity="0 0 0"/>
   <worldbody>
     <body name="sled">
       <joint name="x" type="slide" axis="1 0 0"/>
