@@ -39,11 +39,11 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
 
 def test_a_rover_learns_to_approach_its_goal(tmp_path: Path) -> None:
     path = tmp_path / "jackal.safetensors"
-    policy = pretrain("JackalFlat", path, steps=20_000, envs=64, threads=1, device="cpu")
-    envs = VectorSight(vector_env("JackalFlat", 32, threads=1, episode=300))
+    policy = pretrain("JackalFlat", path, steps=10_000, envs=32, threads=1, device="cpu")
+    envs = VectorSight(vector_env("JackalFlat", 8, threads=1, episode=300))
     learned = evaluate(policy, envs).returns
-    still = evaluate(lambda obs: np.zeros((32, 2), np.float32), envs).returns
-    assert learned.mean() > still.mean() + 20.0  # three seeds earned 67 to 97 more
+    still = evaluate(lambda obs: np.zeros((8, 2), np.float32), envs).returns
+    assert learned.mean() > still.mean() + 20.0  # three seeds earned 63 to 73 more
     assert (tmp_path / "jackal.safetensors.log" / "csv" / "scalars" / "return.csv").is_file()
 
 
