@@ -79,6 +79,19 @@ def turned(findings: list[Finding]) -> list[Finding]:
     return [f for f in findings if "turned round" in f.message]
 
 
+def test_turns_that_are_rolled_out_at_once_are_told_as_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of an encoder, a command and a frame: each with its own signs and measurements, whatever is beside it."""
+    for name, xml, signs in (("arm", ARM, {"shoulder": -1.0, "u1": -1.0}), ("flier", FLIER, NED)):
+        (tmp_path / name).mkdir()
+        told = []
+        for at_once in (8, 1):
+            monkeypatch.setattr("nfc_gym.measured.sign_checks.TURNS", at_once)
+            told.append(turned(found(tmp_path / name, xml, signs)))
+        assert told[0] == told[1] != []
+
+
 LIFT = """
 <mujoco><option timestep="0.005"/><worldbody>
   <body name="cage"><joint name="mast" type="slide" axis="0 0 1"/><geom size=".05" mass="1"/></body>

@@ -1,5 +1,7 @@
 """Local polynomials reproduce what they can represent, say truly how noisy they are, and noise is read off a signal."""
 
+from dataclasses import fields
+
 import mujoco
 import numpy as np
 import pytest
@@ -38,6 +40,16 @@ def test_the_error_on_a_smooth_signal_is_of_fourth_order() -> None:
 
     # The slope of a cubic fit errs by step^3; half the step, an eighth of the error.
     assert 5 < worst(0.02) / worst(0.01) < 13
+
+
+def test_samples_at_even_times_are_fitted_as_each_would_be_alone() -> None:
+    """To the bit, though those whose neighbours are at the same distances share what is alike."""
+    time, values = 0.01 * np.arange(60), np.random.default_rng(2).normal(size=(60, 2))
+    whole = local_polynomial(time, values, time)
+    for k in range(60):
+        alone = local_polynomial(time, values, time[k : k + 1])
+        for f in fields(alone):
+            np.testing.assert_array_equal(getattr(whole, f.name)[k : k + 1], getattr(alone, f.name))
 
 
 @pytest.mark.parametrize("points", [5, 7, 11])
