@@ -35,9 +35,9 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable, write_whole
 from nfc_gym.core.whole import require_whole
 from nfc_gym.inference import detector_file
-from nfc_gym.inference.contrast import Contrast
 from nfc_gym.inference.data import WindowSet
 from nfc_gym.inference.detector import WindowDetector
+from nfc_gym.inference.detector_file import KEPT
 from nfc_gym.inference.jobs import device_of
 from nfc_gym.inference.posterior import NeuralPosterior, load
 from nfc_gym.inference.progress import Spoken, quiet
@@ -117,7 +117,7 @@ def learn_from_mission(
       config: see `LearnConfig`.
       folder: where what was learned is kept, and from where the same call goes on when it was interrupted; default
         `learned` in the mission's folder. A data set without one keeps nothing. What a detector came to whose scorer is
-        neither a `Contrast` nor a `Replay` is found anew each time.
+        neither a network's nor a `Replay` is found anew each time.
       jobs: processes of simulation; 0 takes all cores.
       device: of training: auto, cpu or cuda.
       console: is told.
@@ -235,7 +235,7 @@ def _says(what: str, found: dict[str, Any]) -> str:
 
 def _keep(folder: Path, out: Learned) -> None:
     """Write what was changed, then the report, which says that all is there."""
-    if out.detector is not None and isinstance(out.detector.scorer, Contrast) and out.report["detector"]["changed"]:
+    if out.detector is not None and isinstance(out.detector.scorer, KEPT) and out.report["detector"]["changed"]:
         detector_file.save(folder / "detector.safetensors", out.detector)
     if out.posterior is not None and out.report["posterior"]["changed"]:
         out.posterior.save(folder / "posterior.safetensors")
@@ -268,7 +268,7 @@ def _finished(
     if posterior is not None and report["posterior"]["changed"]:
         out.posterior = load(folder / "posterior.safetensors", posterior.prior)
     if detector is not None and report["detector"]["changed"]:
-        if isinstance(detector.scorer, Contrast):
+        if isinstance(detector.scorer, KEPT):
             out.detector = detector_file.load(folder / "detector.safetensors", detector.scorer.prior)
         else:
             threshold = Threshold(**report["detector"]["threshold"])

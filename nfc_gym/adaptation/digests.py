@@ -11,8 +11,8 @@ from nfc_gym.adaptation.weights import digest, flat
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.posterior import Sampler
-from nfc_gym.inference.contrast import Contrast
 from nfc_gym.inference.detector import WindowDetector
+from nfc_gym.inference.detector_file import KEPT
 from nfc_gym.inference.learner import Learner
 from nfc_gym.inference.posterior import NeuralPosterior
 from nfc_gym.physics.effects.saved import from_row, to_row
@@ -33,7 +33,7 @@ def of_detector(detector: Any) -> str | None:
     if not isinstance(detector, WindowDetector):
         return None
     scorer: Any = detector.scorer
-    if type(scorer) is Contrast:
+    if type(scorer) in KEPT:
         parts = of_network(scorer)
     elif type(scorer) is Replay:
         parts = [scorer.machine.environment, scorer.psi, scorer.jitter, scorer.start, scorer.eps]

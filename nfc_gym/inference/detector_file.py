@@ -23,6 +23,7 @@ from nfc_gym.inference.state import read, require_format
 
 FORMAT = "nfc_gym-detector-1"
 _SCORERS = {"contrast": (Contrast, ContrastConfig), "faults": (FaultClassifier, FaultConfig)}
+KEPT = (Contrast, FaultClassifier)  # scorers that a file holds
 
 
 def save(path: str | os.PathLike[str], detector: WindowDetector, notes: dict[str, Any] | None = None) -> None:
@@ -39,7 +40,7 @@ def save(path: str | os.PathLike[str], detector: WindowDetector, notes: dict[str
     path, net = Path(path), detector.scorer
     if path.suffix.lower() != ".safetensors":
         raise InputError(f"{path}: a detector is kept in a file that ends in .safetensors")
-    if not isinstance(net, Contrast | FaultClassifier) or detector.calibration is None:
+    if not isinstance(net, KEPT) or detector.calibration is None:
         raise InputError(
             "save: want a detector with a Contrast or a FaultClassifier as its scorer, and a threshold: "
             "detector.calibrated(...)"

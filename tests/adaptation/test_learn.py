@@ -5,9 +5,10 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from carts import cart, everything
+from carts import BOX, cart, everything
 from typer.testing import CliRunner, Result
 
 from nfc_gym import InputError
@@ -17,8 +18,10 @@ from nfc_gym.adaptation.normal import quiet_windows, windows_of, with_beside
 from nfc_gym.adaptation.trajectory import Dataset
 from nfc_gym.cli import app
 from nfc_gym.inference import detector_file
+from nfc_gym.inference.config import Sizes
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.detector import WindowDetector
+from nfc_gym.inference.faults import FaultClassifier, FaultConfig
 
 TRAJECTORIES = 16
 
@@ -78,6 +81,25 @@ def test_a_detector_learns_from_a_missions_folder_and_the_same_call_goes_on(
     changed = call(mission, tmp_path / "out", *given, "--seed", "7")
     assert changed.exit_code == 2
     assert "another mission or other settings (seed)" in plain(changed.stderr)
+
+
+def test_a_fault_classifier_gets_a_threshold_of_the_missions_own_motion(mission: Path, tmp_path: Path) -> None:
+    windows = windows_of([cart(400, k, 1.0) for k in range(10)], 10, everything)
+    states, actions = (np.concatenate([w[i] for w in windows]) for i in (0, 1))
+    config = FaultConfig(("none", "push"), encoder="nn", width=32, summaries=False, hidden=32)
+    net = FaultClassifier(config, Sizes(10, 2, 1), BOX, seed=1)
+    first, second = (torch.as_tensor(x, dtype=torch.float32) for x in (states, actions))
+    net.encoder.fit(first, second, None)
+    detector_file.save(tmp_path / "given.safetensors", WindowDetector(net).calibrated(states, actions, 0.05))
+    given = ("--detector", str(tmp_path / "given.safetensors"))
+    done = call(mission, tmp_path / "out", *given)
+    assert done.exit_code == 0, done.output
+    kept = detector_file.load(tmp_path / "out" / "detector.safetensors")
+    report = json.loads((tmp_path / "out" / "learned.json").read_text())["detector"]
+    assert kept.threshold == report["threshold"]["value"] != report["threshold_before"]
+    np.testing.assert_array_equal(kept.scorer.score(states, actions), net.score(states, actions))
+    again = call(mission, tmp_path / "out", *given)
+    assert again.stdout == done.stdout
 
 
 def test_options_reach_what_learns(mission: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
