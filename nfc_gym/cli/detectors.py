@@ -8,7 +8,7 @@ import typer
 
 from nfc_gym.cli.outcome import outcome, say_written
 from nfc_gym.cli.policies import Environment
-from nfc_gym.cli.posteriors import belief_of, learning
+from nfc_gym.cli.posteriors import belief_of, learned, learning
 
 
 def watch(
@@ -61,10 +61,9 @@ def watch(
             rate=rate, width=width, training=training, config=FaultConfig(encoder=encoder),
             jobs=jobs or os.cpu_count() or 1, device=inference.device_of(device), report=Spoken(),
         )  # fmt: skip
-        known, found = made.detector.calibration, made.outcome
+        known = made.detector.calibration
         assert known is not None  # the detector was calibrated
         say_written(
-            out, f"held-out loss {found.start:.3f} before, {min(found.held_out):.3f} in epoch {found.best} "
-            f"({found.seconds:.0f} s); alarms from {known.value:.2f} nats on, of sound windows {known.low:.2g} to "
-            f"{known.high:.2g}",
+            out, f"{learned(made.outcome)} ({made.outcome.seconds:.0f} s); alarms from {known.value:.2f} nats on, of "
+            f"sound windows {known.low:.2g} to {known.high:.2g}",
         )  # fmt: skip

@@ -190,7 +190,7 @@ def train(
             prior = PriorBox.of(machine.space, machine.kind.name)
             image = Reflection(machine.mirrors) if mirror else None
             done = jobs.train_posterior(windows, prior, out, config, training, device=device, mirror=image, **how)
-        say_written(out, f"{_learned(done)} ({done.seconds:.0f} s){'' if structure else _told(out)}")
+        say_written(out, f"{learned(done)} ({done.seconds:.0f} s){'' if structure else _told(out)}")
 
 
 def learning() -> ModuleType:
@@ -212,7 +212,7 @@ def _machine(windows: Path) -> "Machine":
     return Machine(Manifest.read(windows).environment)
 
 
-def _learned(done: "Outcome") -> str:
+def learned(done: "Outcome") -> str:
     """What training came to, by the windows that chose the epoch."""
     if not done.best:
         return "nothing that was learned held on the windows held out: simulate more of them"
