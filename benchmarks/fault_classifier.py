@@ -37,7 +37,7 @@ from nfc_gym.inference.faults import FaultClassifier, FaultConfig
 from nfc_gym.inference.progress import Spoken
 from nfc_gym.inference.rates import auroc, rate_above, threshold_at
 from nfc_gym.inference.train import TrainConfig
-from nfc_gym.simulate.faulty import lessons
+from nfc_gym.simulate.faulty import about_nominal, lessons
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.pool import unordered
 from nfc_gym.simulate.trials import trials
@@ -66,9 +66,7 @@ class Course:
 
     def psi(self, n: int, *stream: int) -> Array:
         """(n, d) about nominal."""
-        space, rng = self.machine.space, np.random.default_rng([self.seed, *stream])
-        width = self.args.width * (space.high - space.low)
-        return np.clip(space.nominal + width * rng.uniform(-1, 1, (n, len(space))), space.low, space.high)
+        return about_nominal(self.machine.space, self.args.width, n, np.random.default_rng([self.seed, *stream]))
 
     def lessons(self) -> Windows:
         """To learn from, kept in DIR."""

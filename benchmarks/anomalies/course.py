@@ -13,7 +13,7 @@ from anomalies.faults import Fault, faults
 from nfc_gym.core import Fidelity
 from nfc_gym.inference.windows import Batch
 from nfc_gym.simulate.bank import ReplayBank, faults_of
-from nfc_gym.simulate.faulty import faulty
+from nfc_gym.simulate.faulty import about_nominal, faulty
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
 from nfc_gym.simulate.start import disturbed
@@ -110,9 +110,7 @@ class Course:
 
     def _psi(self, n: int, rng: np.random.Generator) -> Array:
         """(n, d) about nominal."""
-        space = self.machine.space
-        width = self.settings.width * (space.high - space.low)
-        return np.clip(space.nominal + width * rng.uniform(-1, 1, (n, len(space))), space.low, space.high)
+        return about_nominal(self.machine.space, self.settings.width, n, rng)
 
 
 @lru_cache(maxsize=1)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from time import monotonic
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.windows import Batch
+from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.simulate.draws import geometric
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.pool import unordered
@@ -108,7 +110,15 @@ def nominal(environment: str, psi: Array, seed: int, *, jobs: int = 1, report: R
     return _together(_nominal, [(environment, psi[i : i + _ROWS], seed, i) for i in _starts(psi)], jobs, report)
 
 
+def about_nominal(space: ParameterSpace, width: float, n: int, rng: np.random.Generator) -> Array:
+    """(n, d) psi in physical units, even within a share `width` of the prior's range about nominal, inside its box."""
+    spread = width * (space.high - space.low)
+    return np.clip(space.nominal + spread * rng.uniform(-1, 1, (n, len(space))), space.low, space.high)
+
+
 def _starts(psi: Array) -> range:
+    if psi.ndim != 2 or not len(psi):
+        raise InputError(f"faulty: psi has shape {psi.shape}, want (n, d) with n of 1 or more")
     return range(0, len(psi), _ROWS)
 
 
@@ -140,8 +150,11 @@ def _lesson(environment: str, psi: Array, seed: int, at: int, folder: Path | Non
         return _made(environment, psi, seed, at)
     file = folder.with_name(f"{folder.name}_{at}.npz")
     if file.is_file():
-        with np.load(file) as kept:
-            return dict(kept)
+        try:
+            with np.load(file) as kept:
+                return dict(kept)
+        except (OSError, ValueError, EOFError, BadZipFile) as e:
+            raise InputError(f"{file}: damaged ({e}): remove it, and it is made anew") from None
     made = _made(environment, psi, seed, at)
     with replacing(file) as part, part.open("wb") as to:
         np.savez(to, allow_pickle=False, **made)

@@ -22,11 +22,11 @@ from nfc_gym.inference.reflection import Reflection
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
 from nfc_gym.inference.windows import Batch
-from nfc_gym.simulate.faulty import lessons, nominal
+from nfc_gym.simulate.faulty import about_nominal, lessons, nominal
 from nfc_gym.simulate.machine import Machine
 
 Array = NDArray[np.float64]
-TRAINING = TrainConfig(epochs=40, batch=256, rate=1e-3, patience=5)
+TRAINING = TrainConfig(epochs=40, batch=256, rate=1e-3, patience=5, mixed=False)
 HELD_OUT = 0.05  # of the lessons, by which epochs are compared
 _CERTAIN = 3  # times the windows that a threshold takes at least
 
@@ -114,7 +114,4 @@ def _believed(machine: Machine, belief: Sampler | None, width: float, n: int, rn
         return np.asarray(belief.sample(n, rng).psi, float)
     if not 0 <= width <= 1:
         raise InputError(f"watch: width is a share of the prior's range, 0 to 1, got {width:g}")
-    space = machine.space
-    return np.clip(
-        space.nominal + width * (space.high - space.low) * rng.uniform(-1, 1, (n, len(space))), space.low, space.high
-    )
+    return about_nominal(machine.space, width, n, rng)

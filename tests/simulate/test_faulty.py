@@ -1,5 +1,7 @@
 """Lessons for a fault classifier: half of the machines are sound, the others have a fault of the kind that is said."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -42,5 +44,19 @@ def test_faults_are_told_apart_by_their_kind() -> None:
         list(machine.space.names).index("base_mass")
     ]  # fmt: skip
     assert np.array_equal(heavier, found["kind"] == KINDS.index("mass"))
-    with pytest.raises(InputError, match="psi has shape"):
-        lessons(JACKAL, np.zeros((4, 2)), 0)
+    for shape in ((4, 2), (0, 17), (17,)):
+        with pytest.raises(InputError, match="psi has shape"):
+            lessons(JACKAL, np.zeros(shape), 0)
+
+
+def test_a_damaged_part_of_the_lessons_is_told_by_name(tmp_path: Path) -> None:
+    psi = np.tile(Machine(JACKAL).space.nominal, (4, 1))
+    made = lessons(JACKAL, psi, 0, folder=tmp_path)
+    (part,) = tmp_path.iterdir()
+    whole = part.read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"no archive"):
+        part.write_bytes(damaged)
+        with pytest.raises(InputError, match=rf"{part.name}: damaged .*remove it"):
+            lessons(JACKAL, psi, 0, folder=tmp_path)
+    part.unlink()
+    assert np.array_equal(lessons(JACKAL, psi, 0, folder=tmp_path)["states"], made["states"])
