@@ -19,6 +19,7 @@ from nfc_gym.inference.state import read, require_format
 
 from .planner import Planner
 from .settings import Settings
+from .speed import Speed
 from .world_model import Sizes, WorldModel
 
 FORMAT = "nfc_gym-tdmpc2-1"
@@ -33,18 +34,25 @@ class Agent:
       gamma: discount a control step.
       sight: what it looks at, and of which environment it is; None takes the vector under `observation`.
       about: plain values kept beside it.
+      speed: of its plans.
     """
 
     model: WorldModel
     gamma: float
     sight: Sight | None = None
     about: dict[str, Any] = field(default_factory=dict)
-    _planner: Planner | None = field(default=None, repr=False)
+    speed: Speed = field(default_factory=Speed, repr=False)
+    _planners: dict[int, Planner] = field(default_factory=dict, repr=False)  # by n: a GPU's are captured once
+    _rows: int = field(default=0, repr=False)
 
     def begin(self, n: int) -> None:
         """Episodes of n robots begin: what was planned before is forgotten."""
-        model = self.model
-        self._planner = Planner(model, model.settings, self.gamma, model.sizes.action, n, model.device)
+        model, self._rows = self.model, n
+        if n not in self._planners:
+            self._planners[n] = Planner(
+                model, model.settings, self.gamma, model.sizes.action, n, model.device, self.speed
+            )
+        self._planners[n].begin()
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
         """Actions (n, a) in [-1, 1], without exploring.
@@ -57,11 +65,11 @@ class Agent:
         """
         flat = self.sight.flat(observation) if self.sight is not None else observation["observation"]
         seen = torch.from_numpy(np.atleast_2d(np.asarray(flat, np.float32)))
-        if self._planner is None or len(self._planner.mean) != len(seen):
+        if self._rows != len(seen):
             self.begin(len(seen))
-        assert self._planner is not None
-        self.model.eval()
-        return self._planner.plan(seen.to(self.model.device)).cpu().numpy()
+        if self.model.training:
+            self.model.eval()
+        return self._planners[self._rows].plan(seen.to(self.model.device)).cpu().numpy()
 
     def require(self, envs: Any) -> None:
         """Refuse an environment, single or vector, that the model does not fit.
@@ -100,7 +108,7 @@ class Agent:
             save_file(tensors, part, {"format": FORMAT, "about": json.dumps(about)})
 
 
-def load_agent(path: str | Path, device: str | torch.device = "cpu") -> Agent:
+def load_agent(path: str | Path, device: str | torch.device = "cpu", speed: Speed | None = None) -> Agent:
     """Open what `Agent.save` wrote.
 
     Raises:
@@ -117,4 +125,4 @@ def load_agent(path: str | Path, device: str | torch.device = "cpu") -> Agent:
         seen = None if sight is None else Sight.from_dict(sight)
     except (KeyError, TypeError, ValueError, RuntimeError) as e:
         raise InputError(f"{path}: its metadata and weights are no world model that is known here ({e})") from None
-    return Agent(model.to(device).eval(), gamma, seen, about)
+    return Agent(model.to(device).eval(), gamma, seen, about, speed or Speed())

@@ -12,6 +12,7 @@ from nfc_gym.core.errors import InputError
 
 from .planner import Planner
 from .replay import Array, Replay, Windows
+from .speed import Speed
 from .world_model import Sizes, WorldModel
 
 RECENT = 100  # episodes that means are over
@@ -45,6 +46,7 @@ class Collector:
       gamma: discount a control step.
       replay: what is kept.
       seed: of episodes and of random actions.
+      speed: of the plans.
 
     Attributes:
       steps: control steps of all simulations together.
@@ -52,12 +54,14 @@ class Collector:
       recent: (return, length) of the last of them.
     """
 
-    def __init__(self, envs: VectorEnv, model: WorldModel, gamma: float, replay: Replay, seed: int) -> None:
+    def __init__(
+        self, envs: VectorEnv, model: WorldModel, gamma: float, replay: Replay, seed: int, speed: Speed | None = None
+    ) -> None:
         self.envs, self.model, self.replay = envs, model, replay
         sizes, n = sizes_of(envs), envs.num_envs
         if sizes != model.sizes:
             raise InputError(f"the world model is of {model.sizes}, the environment of {sizes}")
-        self.planner = Planner(model, model.settings, gamma, sizes.action, n, model.device)
+        self.planner = Planner(model, model.settings, gamma, sizes.action, n, model.device, speed)
         self.windows = Windows(n, sizes, model.settings.horizon)
         self.rng = np.random.default_rng(seed)
         self.steps = self.episodes = 0

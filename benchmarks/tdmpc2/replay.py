@@ -1,10 +1,11 @@
-"""Sequences of steps in TorchRL's replay buffer: each as long as the horizon, none across two episodes."""
+"""Sequences of steps that are learned from again and again: each as long as the horizon, none across two episodes."""
+
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torch import Tensor
 
 from .settings import Settings
 from .world_model import Sizes
@@ -36,7 +37,9 @@ class Windows:
         self.observations[which, -1] = observations[which]
         self.taken[which] = 0
 
-    def step(self, actions: Array, rewards: Array, ended: NDArray[np.bool_], observations: Array) -> TensorDict | None:
+    def step(
+        self, actions: Array, rewards: Array, ended: NDArray[np.bool_], observations: Array
+    ) -> dict[str, Tensor] | None:
         """A step of all of them; the sequences (m, ...) that are complete by it, or None.
 
         Returns:
@@ -52,11 +55,11 @@ class Windows:
         if not full.any():
             return None
         parts = {"observation": self.observations, "action": self.actions, "reward": self.rewards, "ended": self.ended}
-        return TensorDict({k: torch.from_numpy(v[full]) for k, v in parts.items()}, [int(full.sum())])
+        return {k: torch.from_numpy(v[full]) for k, v in parts.items()}
 
 
 class Replay:
-    """All sequences so far.
+    """All sequences so far, on the device that learns from them: nothing waits for the processor to draw a batch.
 
     Args:
       settings: of them capacity and batch are used.
@@ -65,22 +68,34 @@ class Replay:
     """
 
     def __init__(self, settings: Settings, device: torch.device, most: int | None = None) -> None:
-        capacity = settings.capacity if most is None else max(1, min(settings.capacity, most))
-        self.device = device
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(capacity, device=device), batch_size=settings.batch)
+        self.capacity = settings.capacity if most is None else max(1, min(settings.capacity, most))
+        self.device, self.batch = device, settings.batch
+        self._kept: dict[str, Tensor] = {}
+        self._size = self._next = 0
 
     def __len__(self) -> int:
-        return len(self.buffer)
+        return self._size
 
-    def add(self, sequences: TensorDictBase | None) -> None:
-        """Keep some more; the oldest make room."""
-        if sequences is not None:
-            self.buffer.extend(sequences.to(self.device))
+    def add(self, sequences: Mapping[str, Tensor] | None) -> None:
+        """Keep some more (m, ...); the oldest make room."""
+        if sequences is None:
+            return
+        for name, new in sequences.items():
+            if name not in self._kept:
+                self._kept[name] = torch.empty(self.capacity, *new.shape[1:], dtype=new.dtype, device=self.device)
+        m = len(next(iter(sequences.values())))
+        kept = min(m, self.capacity)  # of more than there is room for, the last ones
+        where = (self._next + m - kept + torch.arange(kept, device=self.device)) % self.capacity
+        for name, new in sequences.items():
+            self._kept[name].index_copy_(0, where, new[m - kept :].to(self.device))
+        self._next = (self._next + m) % self.capacity
+        self._size = min(self._size + m, self.capacity)
 
-    def sample(self) -> TensorDictBase:
+    def sample(self) -> dict[str, Tensor]:
         """A batch, each sequence as likely as any other."""
-        return self.buffer.sample()
+        rows = torch.randint(self._size, (self.batch,), device=self.device)
+        return {name: kept[rows] for name, kept in self._kept.items()}
 
-    def contents(self) -> dict[str, torch.Tensor]:
+    def contents(self) -> dict[str, Tensor]:
         """All of them, oldest first where nothing had to make room yet."""
-        return {} if not len(self) else dict(self.buffer[:].items())  # type: ignore[union-attr]
+        return {name: kept[: self._size] for name, kept in self._kept.items()}

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from gymnasium.vector import VectorEnv
 from safetensors.torch import save_file
-from tensordict import TensorDict
 from torch import Tensor, nn
 
 from nfc_gym.adaptation import resume
@@ -22,9 +21,10 @@ from nfc_gym.inference.state import read, require_format
 from .collecting import Collector
 from .learner import Learner
 from .replay import Replay
+from .speed import Speed
 from .world_model import WorldModel
 
-SAVE_EVERY = 300.0  # s between two states on disk; what was seen goes with them
+SAVE_EVERY = 120.0  # s between two states on disk; what was seen goes with them
 TELL_EVERY = 2.0  # s
 BURST = 64  # updates between two looks at the clock
 REPLAY = "nfc_gym-tdmpc2-replay-1"
@@ -86,6 +86,7 @@ class Run:
       schedule: see `Schedule`.
       most: control steps that there will ever be, so that no more room is taken than they need.
       record: what is written down; None writes nothing.
+      speed: see `Speed`.
 
     Attributes:
       steps: control steps of all simulations together.
@@ -94,10 +95,11 @@ class Run:
 
     def __init__(
         self, envs: VectorEnv, model: WorldModel, gamma: float, schedule: Schedule, *, most: int | None = None,
-        record: Record | None = None,
+        record: Record | None = None, speed: Speed | None = None,
     ) -> None:  # fmt: skip
+        self.speed = speed or Speed()
         self.envs, self.model, self.gamma, self.schedule = envs, model, gamma, schedule
-        self.learner = Learner(model, gamma)
+        self.learner = Learner(model, gamma, self.speed)
         self.replay = Replay(model.settings, model.device, most)
         self.record = record or Record(None, None)
         self.chance, self.steps, self.elapsed = Chance(model.device), 0, 0.0
@@ -107,7 +109,7 @@ class Run:
 
     def train(
         self, steps: int, seconds: float | None = None, state: Path | None = None,
-        mark: Callable[[int], Any] | None = None,
+        mark: Callable[[int], Any] | None = None, kept: Callable[[], Any] | None = None,
     ) -> None:  # fmt: skip
         """Go on up to so many control steps in all, or for so long.
 
@@ -116,6 +118,7 @@ class Run:
           seconds: None is without limit.
           state: file that is written now and then and at the end; None writes none.
           mark: called with the steps after each control step and all updates that are due by it.
+          kept: called after each state that is written on the way.
 
         Raises:
           Diverged: a loss is not finite; the weights are those from before, and the last state stays as it was.
@@ -136,6 +139,8 @@ class Run:
                 self.tell(values, steps, (self.steps - before) / (now - began))
             if state is not None and now - saved > SAVE_EVERY:
                 self.save(state)
+                if kept is not None:
+                    kept()
                 saved = time.monotonic()
         if values:
             self.tell(values, steps, (self.steps - before) / max(self.elapsed - spent, 1e-9), last=True)
@@ -146,7 +151,7 @@ class Run:
         """One control step of all simulations; after an interruption their episodes begin anew, with other seeds."""
         if self._collector is None:
             seed = mixed(self.schedule.seed, 1, self.steps) % 2**31
-            self._collector = Collector(self.envs, self.model, self.gamma, self.replay, seed)
+            self._collector = Collector(self.envs, self.model, self.gamma, self.replay, seed, self.speed)
         self._collector.step(self.schedule.random and self.steps < self.schedule.first)
         self.steps += self.envs.num_envs
         self._owed += self.schedule.ratio * self.envs.num_envs
@@ -161,8 +166,10 @@ class Run:
         for _ in range(BURST):
             if not self.due():
                 break
-            values = self.learner.update(self.replay.sample().to(self.model.device))
+            values = self.learner.update(self.replay.sample())
             self._owed -= 1
+        if values:
+            self.learner.check()
         return values
 
     def tell(self, values: dict[str, Tensor], steps: int, speed: float, last: bool = False) -> None:
@@ -198,10 +205,11 @@ class Run:
         seen, metadata = read(replay_of(path))
         require_format(replay_of(path), metadata, REPLAY)
         if seen:
-            self.replay.add(TensorDict(seen, [len(next(iter(seen.values())))]))
+            self.replay.add(seen)
         plain = resume.load(path, self._modules(), self.learner.optimiser, self.described())
         self.steps, self.elapsed, self._owed = plain["steps"], plain["elapsed"], plain["owed"]
-        self.learner.updates, self._collector = plain["updates"], None
+        self.learner.go_on(plain["updates"])
+        self._collector = None
 
     def described(self) -> dict[str, Any]:
         """What a run that goes on from this one's state must have in common with it."""

@@ -102,7 +102,7 @@ class WorldModel(nn.Module):
     def two_values(self, state: Tensor, action: Tensor, *, target: bool = False, frozen: bool = True) -> Tensor:
         """(2, ...) of two critics drawn at random; no gradient reaches frozen ones."""
         net = self.targets if target else self.critics
-        chosen = torch.randperm(net.count, device=state.device)[:2]
+        chosen = torch.rand(net.count, device=state.device).topk(2).indices  # any two as likely; `randperm` waits
         return self.two_hot.decode(net(torch.cat([state, action], -1), chosen, frozen))
 
     def propose(self, state: Tensor) -> Proposed:
@@ -137,13 +137,25 @@ class WorldModel(nn.Module):
     # ---- what follows slowly --------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def follow(self) -> None:
-        """Target critics move a little towards the critics."""
-        for target, critic in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
-            target.lerp_(critic, self.settings.follow)
+    def follow(self, lost: Tensor | None = None) -> None:
+        """Target critics move a little towards the critics; not where `lost` () is 1."""
+        targets = list(self.targets.parameters())
+        away = torch._foreach_sub(list(self.critics.parameters()), targets)  # type: ignore[attr-defined]
+        share = torch.full_like(self.scale, self.settings.follow)
+        torch._foreach_mul_(away, share if lost is None else share * (1 - lost))  # type: ignore[attr-defined]
+        torch._foreach_add_(targets, away)  # type: ignore[attr-defined]
 
     @torch.no_grad()
-    def rescale(self, values: Tensor) -> None:
-        """The scale moves a little towards that of a batch of values."""
-        low, high = values.flatten().quantile(values.new_tensor(SCALE_BETWEEN))
-        self.scale.lerp_((high - low).clamp(min=1), self.settings.follow)
+    def rescale(self, values: Tensor, lost: Tensor | None = None) -> None:
+        """The scale moves a little towards that of a batch of values; not where `lost` () is 1."""
+        ordered = values.flatten().sort().values
+        low, high = (quantile(ordered, q) for q in SCALE_BETWEEN)
+        moved = self.scale.lerp((high - low).clamp(min=1), self.settings.follow)
+        self.scale.copy_(moved if lost is None else torch.where(lost == 0, moved, self.scale))
+
+
+def quantile(ordered: Tensor, share: float) -> Tensor:
+    """() of values (n,) in ascending order, between two of them linearly; `Tensor.quantile` may ask the processor."""
+    place = share * (len(ordered) - 1)
+    low = int(place)
+    return ordered[low].lerp(ordered[min(low + 1, len(ordered) - 1)], place - low)

@@ -72,7 +72,7 @@ def test_sequences_never_cross_two_episodes_and_an_end_comes_last() -> None:
         ended = t == np.array([5, 2])  # the second one's episodes are too short for any sequence
         made = windows.step(t[:, None].astype(np.float32), t.astype(np.float32), ended,
                             np.stack([episode, t], 1).astype(np.float32))  # fmt: skip
-        found += [] if made is None else list(made)
+        found += [] if made is None else [dict(zip(made, row, strict=True)) for row in zip(*made.values(), strict=True)]
         if ended.any():
             episode[ended] += 1
             t[ended] = 0
