@@ -98,6 +98,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add(
         "--ratio", type=number(0), default=1.0, help="updates of TD-MPC2 a control step in the true world; published: 1"
     )
+    add("--points", type=count(0), default=10, help="of TD-MPC2's curve in the true world beyond its first")
+    add("--judged", type=count(1), default=32, help="episodes at each point of a curve")
+    add("--compile", action="store_true", help="torch's compiler fuses what TD-MPC2 computes; it takes a minute or two")
     add("--threads", type=count(0), default=0, help="of the physics; 0 is all")
     add("--device", default="cpu")
     add("--seed", type=count(0), help="of what is hidden; default drawn once, and kept in --out")
@@ -162,10 +165,10 @@ def asked(args: argparse.Namespace) -> Iterator[tuple[str, World, str | None, in
 def filled(args: argparse.Namespace, kept: Kept, out: Path, began: float) -> tables.Cells:
     """All cells that there are or are asked for."""
     cells = tables.Cells()
-    points, judged = (2, 2) if args.quick else (10, 32)
+    points, judged = (2, 2) if args.quick else (args.points, args.judged)
     home, watched = (40, 100) if args.quick else (Budget.home, Budget.watched)
     budget = Budget(args.envs, args.steps, args.budget, args.executed, judged, points, args.threads, args.device,
-                    args.ratio, home, watched)  # fmt: skip
+                    args.ratio, home, watched, args.compile)  # fmt: skip
     for table, world, task, seed in asked(args):
         left_out = REFERENCES if args.beside else (*ADAPTED, "oracle") if args.quick and table == "III" else ()
         for method in [m for m in args.methods if m not in left_out]:

@@ -1,11 +1,15 @@
 """World models of TD-MPC2 for the tables of `policies.py`, pretrained under random psi and terrain, one after another.
 
     python benchmarks/tdmpc2_pretrain.py --out DIR --only JackalFlat AntFlat --steps 1000000 --device cuda
+    python benchmarks/tdmpc2_pretrain.py --out DIR --only JackalRough --start DIR --seconds 300 --device cuda --compile
     python benchmarks/tdmpc2_pretrain.py --quick
 
 DIR gets `<Place>.safetensors` for each, its state and its curves; the same command goes on with what was stopped.
-Planning for one robot takes about 37 GFLOP a control step with the published network (`--net 5M`): use a GPU. Prints
-how each does in the nominal world, beside a policy of random actions. `--quick` is a tiny network that learns nothing.
+With `--start` each begins with the weights of its world model in that folder; one of rough ground, where there is
+none, with those of its flat twin. A GPU replays updates and plans as CUDA graphs (not with `--plain`); `--compile` has
+torch's compiler fuse their kernels first, a minute or two. Planning for one robot takes about 37 GFLOP a control step
+with the published network (`--net 5M`): use a GPU. Prints how each does in the nominal world, beside a policy of random
+actions. `--quick` is a tiny network that learns nothing.
 """
 
 import argparse
@@ -25,9 +29,11 @@ from pretrain import IDS, random_return
 from rich.console import Console
 from tdmpc2.pretraining import Pretraining, pretrain
 from tdmpc2.settings import NETS
+from tdmpc2.speed import Speed
 from timing import Table
 
 from nfc_gym.adaptation.ppo import Diverged
+from nfc_gym.core.errors import InputError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,7 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         torch.set_num_threads(args.threads)
     first = 500 if args.quick else 0
     arguments = Pretraining(seed=args.seed, envs=args.envs, first=first, ratio=args.ratio, net=args.net,
-                            episodes=args.episodes)  # fmt: skip
+                            episodes=args.episodes, task=args.task)  # fmt: skip
+    speed = Speed(graphs=not args.plain, compiled=args.compile)
     table, code = Table(), 0
     with tempfile.TemporaryDirectory() as folder:
         out = args.out or Path(folder)
@@ -44,7 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             try:
                 agent = pretrain(
                     place, out / f"{place}.safetensors", arguments, steps=args.steps, seconds=args.seconds,
-                    device=args.device, threads=args.threads, console=Console(),
+                    device=args.device, threads=args.threads, console=Console(), start=first_weights(place, args.start),
+                    speed=speed,
                 )  # fmt: skip
             except Diverged as error:
                 print(error, flush=True)
@@ -52,12 +60,22 @@ def main(argv: Sequence[str] | None = None) -> int:
                 continue
             found = agent.about["nominal"]
             table.add(f"{place}: TD-MPC2, return in the nominal world", found["return"], "1",
-                      baseline=random_return(place), seeds=(args.seed,))  # fmt: skip
+                      baseline=None if args.bare else random_return(place), seeds=(args.seed,))  # fmt: skip
             if "success" in found:
                 table.add(f"{place}: TD-MPC2, success", found["success"], "share", seeds=(args.seed,))
     if args.json:
         write_json(args.json, [asdict(row) for row in table.rows])
     return code
+
+
+def first_weights(place: str, folder: Path | None) -> Path | None:
+    """The world model in a folder that a place's training may begin with."""
+    if folder is None:
+        return None
+    for candidate in (place, place.replace("Rough", "Flat")):
+        if (folder / f"{candidate}.safetensors").is_file():
+            return folder / f"{candidate}.safetensors"
+    raise InputError(f"--start {folder}: no world model of {place} or of its flat twin is there")
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -71,7 +89,12 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--ratio", type=number(0), default=0.25, help="updates a control step; the published one is 1")
     add("--net", choices=list(NETS), default="5M")
     add("--episodes", type=count(1), default=16, help="that judge each")
+    add("--task", choices=("goal", "figure8"), help="of the Jackal")
+    add("--start", type=Path, metavar="DIR")
     add("--device", default="auto")
+    add("--bare", action="store_true", help="without the random policy beside, which has the first task")
+    add("--compile", action="store_true")
+    add("--plain", action="store_true", help="a GPU is told every kernel: for comparing")
     add("--threads", type=count(0), default=0, help="of the physics; 0 is all")
     add("--seed", type=count(0), default=0)
     add("--json", type=json_file, metavar="FILE")

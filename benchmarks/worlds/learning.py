@@ -33,12 +33,13 @@ class Budget:
       seconds: of wall-clock time, whichever is used up first.
       executed: episodes in the true world that learning may use, of those that adapt.
       judged: episodes at each point of a curve.
-      points: of a curve.
+      points: of a curve, beyond its first; TD-MPC2 may have none.
       threads: of the physics.
       device: of the networks.
       ratio: updates of TD-MPC2 a control step in the true world; the published one is 1.
       home: episodes at home, by which it is known what the policy earned before.
       watched: control steps of each robot at home that a detector is made of, where none is given.
+      compiled: whether torch's compiler fuses what TD-MPC2 computes.
     """
 
     envs: int = 1024
@@ -52,6 +53,7 @@ class Budget:
     ratio: float = 1.0
     home: int = 64
     watched: int = 750
+    compiled: bool = False
 
 
 @dataclass

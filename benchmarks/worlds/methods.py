@@ -202,12 +202,14 @@ def tdmpc2(job: Job) -> "Learned":
     if job.world_model is None:
         raise NotThere(f"needs a world model: --world-models DIR with {job.world.place}.safetensors, which "
                        "`benchmarks/tdmpc2_pretrain.py` makes")  # fmt: skip
+    from tdmpc2.speed import Speed
+
     from . import planned
     from .learning import EPISODE, true_world
 
     budget = job.budget
     envs = true_world(job.world, 1, budget, job.seed, **job.settings)
-    agent = planned.opened(job.world_model, envs, budget.device)
+    agent = planned.opened(job.world_model, envs, budget.device, Speed(compiled=budget.compiled))
     return planned.improve(agent, envs, job.mean_return, budget, job.seed, EPISODE * budget.executed)
 
 

@@ -7,19 +7,20 @@ import torch
 from gymnasium.vector import VectorEnv
 from tdmpc2.agent import Agent, load_agent
 from tdmpc2.run import Run, Schedule
+from tdmpc2.speed import Speed
 
 from nfc_gym.adaptation.ppo import Diverged
 
 from .learning import EPISODE, Budget, Learned
 
 
-def opened(file: str, envs: VectorEnv, device: str) -> Agent:
+def opened(file: str, envs: VectorEnv, device: str, speed: Speed | None = None) -> Agent:
     """A copy of the pretrained world model, which must fit the world.
 
     Raises:
       InputError: no such file, or it is of another robot or of other actions.
     """
-    agent = load_agent(file, device)
+    agent = load_agent(file, device, speed)
     agent.require(envs)
     return agent
 
@@ -43,7 +44,7 @@ def improve(
     torch.manual_seed(seed)
     curve, began, notes = [(0, judge(agent))], time.monotonic(), {}
     schedule = Schedule(seed=seed, first=min(EPISODE, steps), random=False, ratio=budget.ratio)
-    run = Run(envs, agent.model, agent.gamma, schedule, most=steps)
+    run = Run(envs, agent.model, agent.gamma, schedule, most=steps, speed=agent.speed)
     marks = [steps * (k + 1) // budget.points for k in range(budget.points)]
 
     def mark(done: int) -> None:
@@ -55,7 +56,7 @@ def improve(
         run.train(steps, budget.seconds, mark=mark)
     except Diverged as error:  # what was learned until then holds
         notes["diverged"] = str(error)
-    if curve[-1][0] < run.steps:
+    if budget.points and curve[-1][0] < run.steps:
         curve.append((run.steps, judge(agent)))
     notes |= {"steps": run.steps, "updates": run.learner.updates, "seconds": round(time.monotonic() - began, 1),
               "executed": run.returns()}  # fmt: skip

@@ -14,7 +14,7 @@ from .world import World
 
 NAMED = ("random", "falco")
 LONG = 1500  # control steps that are given for a lap of the figure of eight
-TIMED = (3, 100, 1.0)  # decisions that warm up, those that are timed at most, and s after which no more are
+TIMED = (5, 100, 1.0)  # decisions that warm up, those that are timed at most, and s after which no more are
 LAPS = {"jackal": 20.0, "quadcopter": 10.0}  # s, after which the point that is to be followed begins its second
 
 
