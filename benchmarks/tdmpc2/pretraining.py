@@ -137,6 +137,7 @@ def pretrain(
         if state.is_file():
             run.load(state)
     envs.close()
+    keep()  # judging takes its time too
     judged = nominal(agent, name, arguments, threads)
     agent.about = about(judged) | ({"diverged": diverged} if diverged else {})
     agent.save(path)
