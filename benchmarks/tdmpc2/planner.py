@@ -58,7 +58,9 @@ class Planner:
         self._none = torch.zeros(rows, dtype=torch.bool, device=device)
         self._action = torch.zeros(rows, action, device=device)
         speed = speed or Speed()
-        self._first, self._next = speed.fused(self.prior), speed.fused(self.round)
+        self._first, self._next = self.prior, self.round
+        if rows > 1:  # one robot's numbers are few: a graph alone does, and compiling takes longer than it saves
+            self._first, self._next = speed.fused(self.prior), speed.fused(self.round)
         self._graphs = speed.replayed(device)
 
     def begin(self) -> None:

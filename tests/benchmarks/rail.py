@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 torch = pytest.importorskip("torch", reason="TD-MPC2 learns with torch")
-pytest.importorskip("torchrl", reason="TD-MPC2 keeps what it saw in TorchRL's replay buffer")
+pytest.importorskip("torchrl", reason="TD-MPC2 writes its curves with TorchRL's loggers")
 
 
 class Rail(gymnasium.Env):
