@@ -31,12 +31,14 @@ class Remainder:
     Attributes:
       fitted: the model with the laws that were believed.
       scanned: of the laws' first scan, None where nothing was left to scan.
+      bare: the same without the effects that a law might have outdone, None where that was not asked.
       dropped: named effects that a law alone outdoes.
       rounds: of the laws, for the report.
     """
 
     fitted: Fit
     scanned: Scanned | None = None
+    bare: Scanned | None = None
     dropped: list[str] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
 
@@ -76,7 +78,9 @@ class LawSearch:
         if not self.laws or (arena.leftover < SILENT and not sure):
             return out
         effects = [e for e in arena.current.plant.effects if not refuted or e.id in refuted]
-        if effects and (rival := self._instead(arena, calibrated, effects, bool(refuted))) is not None:
+        rival = self._instead(arena, calibrated, effects, bool(refuted)) if effects else None
+        out.bare = self.scanned
+        if rival is not None:
             out.dropped = [e.id for e in effects]
             arena.say(f"a law explains more than {', '.join(out.dropped)}, which is not claimed")
             out.scanned = self.scanned

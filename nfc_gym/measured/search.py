@@ -191,7 +191,7 @@ class Search:
           calibrated: psi alone, fitted.
         """
         dropped: list[str] = []
-        odd = misshapen(arena, self.generics, self.options.worth)
+        odd = misshapen(arena, [g for g in self.generics if not g.wordless], self.options.worth)
         generic = self._generic(arena, screen, last) or max(odd.values(), key=lambda j: j.total, default=None)
         label = None if generic is None else arena.label(generic)
         if generic is not None and arena.current.plant.effects and self._outdone(arena, generic, calibrated):
@@ -235,15 +235,18 @@ class Search:
         laws = LawSearch(self.laws, self.options.worth, lambda f: self.settle(f.plant, f.x), self._prune)
         out = laws.run(arena, found.calibrated, found.misshapen, sure=found.generic is not None)
         out.dropped = out.dropped or found.dropped
-        ground = next((g for g in self.generics if g.id == found.generic and g.patchy), None)
+        ground = next((g for g in self.generics if g.id == found.generic and g.wordless), None)
         if ground is not None and out.laws and self._grounded(arena, ground, out.fitted):
             for law in out.rounds:
                 law.accepted, law.share, law.reason = [], 0.0, f"{ground.id} explains more"
-            out = Remainder(arena.current, out.scanned, found.dropped, out.rounds)
+            out = Remainder(arena.current, out.scanned, out.bare, found.dropped, out.rounds)
         return out
 
     def _grounded(self, arena: Arena, ground: Effect, laws: Fit) -> bool:
-        """Whether the ground's grip does better than proposed laws: pushes by place stand in for floors that slip."""
+        """Whether what acts on the ground does better than proposed laws.
+
+        Pushes by place stand in for floors that slip, and a torque on the base for a wheel that is out of true.
+        """
         screen = Screen(arena.fit_data.problem, arena.under, arena.current)
         grip, named = arena.enter([screen.try_one(ground)]), arena.judge(laws)
         if grip.total <= named.total:

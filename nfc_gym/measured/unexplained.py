@@ -11,10 +11,11 @@ from nfc_gym.measured.laws import Proposal
 from nfc_gym.measured.search import Found
 from nfc_gym.measured.verdict import Verified, column_means
 from nfc_gym.physics.effects.base import Effect
-from nfc_gym.physics.effects.generic import GenericMemory
-from nfc_gym.physics.effects.generic_ground import GenericGrip
+from nfc_gym.physics.effects.generic import GenericMemory, GenericVelocity
+from nfc_gym.physics.effects.generic_ground import GenericGrip, GenericTread
 from nfc_gym.physics.effects.ground import base_on_ground
 from nfc_gym.physics.effects.law import Law, degrees
+from nfc_gym.physics.effects.law_waves import LawHarmonic
 from nfc_gym.physics.rollout import Plant
 
 _SPEEDS = ("law_power", "law_friction", "law_cross")
@@ -48,22 +49,17 @@ def unexplained(
         else:
             near += ", too little to be the cause"
     assert found.rest is not None
-    scanned = found.rest.scanned
+    claimed = {e.id for e in plant.effects if not e.generic} - {r["id"] for r in weak}
+    # What is no cause explains nothing: where it all is guesses, what they mend is part of what is to be placed.
+    scanned = (None if claimed or not weak else found.rest.bare) or found.rest.scanned
     reason = found.rounds[-1].reason or "no effect of the library explains it"
     if laws:
         parts = [f"{law.what}: {_inner(r['sentence'])}" for law, r in zip(laws, rows, strict=True)]
         text = f"looks like {', and '.join(parts)}{near}"
         return _place(plant.model, laws[0]) | out | {"description": f"{text}; {reason}" if "alike" in reason else text}
-    family, _, joint = (found.generic or "").partition(":")
-    if family == GenericMemory.family:
-        text = f"looks like a force with memory in {joint}, of no law of the library{near}"
-        return {"coordinate": f"joint:{joint}:pos", "where": f"joint:{joint}"} | out | {"description": text}
-    if family == GenericGrip.family:
-        told = next(r["sentence"] for round_ in found.rounds for r in round_.ranking if r["id"] == found.generic)
-        root = mujoco.mj_id2name(plant.model, mujoco.mjtObj.mjOBJ_BODY, base_on_ground(plant.model))
-        text = f"looks like {_inner(told)}, of no law of the library{near}"
-        coordinate = f"body:{root}:pos" if root else "ground"  # a base without a name has no channel
-        return {"coordinate": coordinate, "where": "ground"} | out | {"description": text}
+    if found.generic is not None:
+        at, what = _smooth(plant.model, found)
+        return at | out | {"description": f"looks like {what}, of no law of the library{near}"}
     if scanned is not None:
         joint, guess = surest(scanned.evidence), scanned.nearest
         if joint is not None and (guess is None or _joint_of(guess.law) != joint):
@@ -72,7 +68,7 @@ def unexplained(
             return at | out | {"description": f"{text}{_elsewhere(v, at)}; {reason}{near}"}
         if guess is not None:
             guess.law.bind(plant.model)
-            at = _place(plant.model, guess.law)
+            at = _place(plant.model, guess.law, any(guess is p for p in scanned.proposals))
             return at | out | {"description": f"{_guess(guess)}{_elsewhere(v, at)}; {reason}{near}"}
     place, coordinate, times = _worst(v)
     text = f"furthest beyond the noise, with {times:.3g} times its mean square; {reason}{near}"
@@ -88,17 +84,41 @@ def _guess(near: Proposal) -> str:
     return f"depends most on {near.law.what}, which takes away {near.share:.0%} of it, but not surely on unseen logs"
 
 
-def _place(model: mujoco.MjModel, law: Effect) -> dict[str, str]:
-    """`coordinate` (a channel that shows the degree of freedom) and `where` of a law."""
-    name = law.where[0].removesuffix("@body")
-    joint, rest = _joint_of(law), name.partition("[")[2]
+def _smooth(model: mujoco.MjModel, found: Found) -> tuple[dict[str, str], str]:
+    """`coordinate` and `where` of the generic alternative that is believed, and what it is, in words."""
+    assert found.generic is not None
+    family, _, name = found.generic.partition(":")
+    if family == GenericMemory.family:
+        return _degree(model, name, False), f"a force with memory in {name}"
+    if family not in (GenericGrip.family, GenericTread.family):
+        return _degree(model, name, family == GenericVelocity.family), wording.smooth(found.generic)
+    told = next(r["sentence"] for round_ in found.rounds for r in round_.ranking if r["id"] == found.generic)
+    if family == GenericTread.family:
+        return _degree(model, name, False), _inner(told)
+    root = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, base_on_ground(model))
+    # a base without a name has no channel
+    return {"coordinate": f"body:{root}:pos" if root else "ground", "where": "ground"}, _inner(told)
+
+
+def _place(model: mujoco.MjModel, law: Effect, sure: bool = True) -> dict[str, str]:
+    """`coordinate` (a channel that shows the degree of freedom) and `where` of a law.
+
+    What repeats with the turn of a part comes from that part, whatever it pushes, if it is `sure` that it repeats.
+    """
+    if sure and law.family == LawHarmonic.family:
+        return _degree(model, law.where[-1].removesuffix("@body"), False)
+    return _degree(model, law.where[0].removesuffix("@body"), law.family in _SPEEDS)
+
+
+def _degree(model: mujoco.MjModel, name: str, speed: bool) -> dict[str, str]:
+    """The same of a degree of freedom: a joint's, or one of the six of a free one."""
+    joint, _, rest = name.partition("[")
     if not rest:
-        kind = "vel" if law.family in _SPEEDS else "pos"
-        return {"coordinate": f"joint:{joint}:{kind}", "where": f"joint:{joint}"}
+        return {"coordinate": f"joint:{joint}:{'vel' if speed else 'pos'}", "where": f"joint:{joint}"}
     i = int(rest[0])
     dof, _ = degrees(model)[name]
     body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.dof_bodyid[dof]))
-    kind = ("linvel" if i < 3 else "angvel") if law.family in _SPEEDS else ("pos" if i < 3 else "quat")
+    kind = ("linvel" if i < 3 else "angvel") if speed else ("pos" if i < 3 else "quat")
     # a body without a name has no channel
     return {"coordinate": f"body:{body}:{kind}[{i % 3}]" if body else f"joint:{name}", "where": f"joint:{name}"}
 

@@ -12,6 +12,7 @@ from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.remainder import Remainder
 from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.physics.effects.law_place import LawHeight
+from nfc_gym.physics.effects.law_waves import LawHarmonic
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -29,12 +30,16 @@ def said(
     evidence: dict[str, float] | None = None,
     nearest: Proposal | None = None,
     text: str = MODEL,
+    bare: Proposal | None = None,
+    sure: bool = False,
     **more: str,
 ) -> dict[str, Any]:
     model = mujoco.MjModel.from_xml_string(text)
     plant = Plant(model, ParameterSpace(model, []), nthread=1)
     rows = [RANKED] if ranked is None else [RANKED, ranked]
-    rest = Remainder(fitted=None, scanned=Scanned([], nearest, {}, evidence or {}))  # type: ignore[arg-type]
+    believable = [nearest] if sure and nearest else []
+    rest = Remainder(fitted=None, scanned=Scanned(believable, nearest, {}, evidence or {}))  # type: ignore[arg-type]
+    rest.bare = None if bare is None else Scanned([], bare, {}, {})
     found: Any = SimpleNamespace(generic=generic, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
     columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
@@ -54,6 +59,45 @@ def test_ground_that_grips_otherwise_in_places_is_said_as_such() -> None:
     found = said("generic_grip:ground", ranked={"id": "generic_grip:ground", "generic": True, "sentence": told})
     assert (found["coordinate"], found["where"]) == ("body:car:pos", "ground")
     assert "friction of the ground that depends on the place: beside the middle, 0.8 times" in found["description"]
+
+
+def test_a_force_that_repeats_with_a_wheels_turn_is_at_the_wheel() -> None:
+    told = "A force under a wheel that repeats with its turn, knee: 3 N ahead, 6 N across, 5 N up."
+    found = said("generic_tread:knee", ranked={"id": "generic_tread:knee", "generic": True, "sentence": told})
+    assert (found["coordinate"], found["where"]) == ("joint:knee:pos", "joint:knee")
+    assert found["description"].startswith("looks like a force under a wheel that repeats with its turn, knee: 3 N")
+
+
+@pytest.mark.parametrize(
+    ("generic", "coordinate", "where"),
+    [
+        ("generic_position:root[2]", "body:car:pos[2]", "joint:root[2]"),
+        ("generic_velocity:root[4]", "body:car:angvel[1]", "joint:root[4]"),
+        ("generic_velocity:knee", "joint:knee:vel", "joint:knee"),
+    ],
+)
+def test_a_smooth_force_that_is_believed_goes_before_a_law_that_is_not(
+    generic: str, coordinate: str, where: str
+) -> None:
+    near = Proposal(LawHeight(("root[2]",)), np.ones(2), 0.2)
+    found = said(generic, nearest=near, evidence={"root": 300.0, "knee": 0.0})
+    assert (found["coordinate"], found["where"]) == (coordinate, where)
+    assert found["description"].startswith("looks like a smooth force by ")
+
+
+def test_what_repeats_with_another_parts_turn_comes_from_that_part() -> None:
+    law = LawHarmonic(("root[5]", "knee"))
+    near = Proposal(law, law.null, 0.2)
+    assert said(None, nearest=near, sure=True)["coordinate"] == "joint:knee:pos"
+    # by chance any push may seem to repeat with something
+    assert said(None, nearest=near)["coordinate"] == "body:car:quat[2]"
+
+
+def test_what_is_no_cause_leaves_all_of_it_to_be_placed() -> None:
+    lift, knock = LawHeight(("root[2]",)), LawHarmonic(("knee",))
+    beside, alone = Proposal(lift, lift.null, 0.01), Proposal(knock, knock.null, 0.2)
+    assert said(None, ("wind:base",), nearest=beside, bare=alone)["coordinate"] == "joint:knee:pos"
+    assert said(None, (), nearest=beside, bare=alone)["coordinate"] == "body:car:pos[2]"
 
 
 def test_what_takes_away_too_little_is_named_as_the_nearest_and_no_cause() -> None:

@@ -9,7 +9,7 @@ from machines import make, plant_of, run, zoo
 from test_slip import WHEEL
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects import Scales
+from nfc_gym.physics.effects import Context, Forces, Scales, propose
 from nfc_gym.physics.effects.generic_ground import GenericGrip
 from nfc_gym.physics.effects.ground import FrictionPatch
 from nfc_gym.physics.fields import ModelFields
@@ -255,3 +255,35 @@ def test_a_gust_gives_its_impulse_within_its_time() -> None:
     with pytest.raises(InputError, match="exo:time"):
         run(model, effect, theta, 3)
     assert plant_of(model, effect).effects[0].signals == ("exo:time",)
+
+
+def test_a_tread_pushes_with_the_wheels_turn_ahead_across_and_up() -> None:
+    """A rover whose wheels hardly turn: the force on its base adds up, whichever way it heads."""
+    corners = enumerate([(0.4, 0.4), (0.4, -0.4), (-0.4, 0.4), (-0.4, -0.4)])
+    inside = "".join(WHEEL.format(i, x, y, 1e4, 0.6) for i, (x, y) in corners)
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep=".002"/><worldbody>
+    <geom type="plane" size="50 50 1"/><body name="rover" pos="0 0 2"><freejoint/>
+    <inertial pos="0 0 0" mass="20" diaginertia="1 1 1"/>{inside}</body></worldbody></mujoco>""")
+    names = ("ahead_cosine", "ahead_sine", "across_cosine", "across_sine", "up_cosine", "up_sine")
+    effect, theta = make("generic_tread", "w1", dict(zip(names, [1.0, 2.0, -3.0, 4.0, 5.0, -6.0], strict=True)))
+    data, angle, yaw = mujoco.MjData(model), 0.7, 0.4
+    data.qpos[3:7] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    data.qpos[model.joint("w1").qposadr[0]] = angle
+    mujoco.mj_forward(model, data)
+    effect.bind(model)
+    out = Forces(np.zeros(model.nv), np.zeros((model.nbody, 6)))
+    read = {"opt.gravity": model.opt.gravity}
+    effect.force(
+        Context(model, 0.002, data.qpos, data.qvel, data.ctrl, {}, lambda n: getattr(data, n), read.__getitem__),
+        theta,
+        out,
+    )
+    ahead, across, up = (a * np.cos(angle) + b * np.sin(angle) for a, b in zip(theta[::2], theta[1::2], strict=True))
+    want = [ahead * np.cos(yaw) - across * np.sin(yaw), ahead * np.sin(yaw) + across * np.cos(yaw), up]
+    np.testing.assert_allclose(out.xfrc[model.body("w1").id], [*want, 0, 0, 0], atol=1e-12)
+    assert np.count_nonzero(out.xfrc.any(1)) == 1
+    with pytest.raises(InputError, match=r"'knee' is no wheel's joint; there are: w0, w1, w2, w3"):
+        make("generic_tread", "knee", dict.fromkeys(names, 0.0))[0].bind(model)
+    proposed = {e.id: e for e in propose(model, Scales(*np.ones((2, model.nv)), np.ones(0), np.ones(0), 0.01))}
+    assert [i for i in proposed if "tread" in i] == [f"generic_tread:w{i}" for i in range(4)]
+    assert proposed["generic_tread:w0"].params[0].probes[0] == pytest.approx(0.1 * 22 * G / 4)

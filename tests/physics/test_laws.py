@@ -1,13 +1,15 @@
 """A law is the same for one robot and for each row of many, to the bit."""
 
+import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
-from machines import candidates, probe, zoo
+from machines import candidates, probe, zoo, zoo_scales
 
-from nfc_gym.physics.effects import Context, Effect, Forces
+from nfc_gym.physics.effects import FAMILIES, Context, Effect, Forces
 from nfc_gym.physics.effects.base import overrides
 from nfc_gym.physics.effects.lookup import index, limited
 
@@ -96,3 +98,33 @@ def test_limited_is_clip() -> None:
     x = np.array([-3.0, -1.0, 0.2, 5.0, np.nan])
     low, high = np.array([-1.0, -np.inf, 0.3, -1.0, -1.0]), np.ones(5)
     np.testing.assert_array_equal(limited(x, low, high), np.clip(x, low, high))
+
+
+def test_a_smooth_force_by_position_covers_where_the_logs_were() -> None:
+    """A craft that flew ten metres above where its model begins meets the bumps there."""
+    scales, height = zoo_scales(MODEL), MODEL.joint("flight").qposadr[0] + 2
+    assert scales.low is not None
+    assert scales.high is not None
+    low, high = scales.low.copy(), scales.high.copy()
+    low[height], high[height] = 12.0, 13.0
+    flown = dataclasses.replace(scales, low=low, high=high)
+    (effect,) = (e for e in FAMILIES["generic_position"].propose(MODEL, flown) if e.where == ("flight[2]",))
+    ctx = SimpleNamespace(q=np.zeros((7, MODEL.nq)))
+    ctx.q[:, height] = np.linspace(11.9, 13.1, 7)
+    effect.bind(MODEL)
+    for unit in np.eye(6)[1:5]:  # those whose middles lie within
+        out = Forces(np.zeros((7, MODEL.nv)), np.zeros((7, MODEL.nbody, 6)))
+        effect.force(ctx, unit, out)  # pyright: ignore[reportArgumentType]
+        assert out.qfrc[:, MODEL.joint("flight").dofadr[0] + 2].max() > 0.5
+
+
+def test_nothing_repeats_with_a_hinge_that_does_not_go_round() -> None:
+    scales, rest = zoo_scales(MODEL), MODEL.qpos0
+    wheel = MODEL.joint("wheel_l").qposadr[0]
+    high = rest.copy() + 1.0
+    high[wheel] += 20.0
+    propose = FAMILIES["law_harmonic"].propose
+    turned = {e.where[1] for e in propose(MODEL, dataclasses.replace(scales, high=high)) if len(e.where) == 2}
+    assert turned == {"wheel_l"}
+    unknown = {e.where[1] for e in propose(MODEL, dataclasses.replace(scales, low=None)) if len(e.where) == 2}
+    assert {"wheel_l", "wheel_r", "shoulder"} <= unknown

@@ -120,6 +120,8 @@ class Effect(ABC):
     generic: ClassVar[bool] = False
     # Whether it acts in some places of the world alone, so that medians over all of a log hide what it leaves.
     patchy: ClassVar[bool] = False
+    # Of a generic alternative, whether it acts where no law in words pushes: on what touches the ground.
+    wordless: ClassVar[bool] = False
     # Families that together do the same at the same place unless this law's own feature shows; else claimed instead.
     simpler: ClassVar[tuple[tuple[str, ...], ...]] = ()
     # Families that are special cases of this law at the same place: beside them it is no further alternative.

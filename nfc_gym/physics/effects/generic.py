@@ -94,16 +94,29 @@ class GenericPosition(_Generic):
             if q is None:
                 continue
             joint = int(model.dof_jntid[dof])
-            spread, _ = scales.channels.get(f"joint:{place}:pos", (0.0, 0.0))
             if model.jnt_limited[joint] and int(model.jnt_type[joint]) != _FREE:
                 low, high = (float(e) for e in model.jnt_range[joint])
             else:
-                middle, reach = float(model.qpos0[q]), max(2.5 * spread, 1.0)
-                low, high = middle - reach, middle + reach
+                low, high = _covered(model, scales, place, q)
             effect = cls._on(model, place, dof, scales, low, high)
             effect.turning = int(model.jnt_type[joint]) == _HINGE and not model.jnt_limited[joint]
             out.append(effect)
         return out
+
+
+def _covered(model: mujoco.MjModel, scales: Scales, place: str, q: int) -> tuple[float, float]:
+    """Ends of what a coordinate without limits covers, and a little more: never less than 2 m or rad.
+
+    Bumps as narrow as the little that a body on the ground rises and falls would be functions of noise. Where the
+    motion is unknown they lie about the model's own place; a craft that flies metres above it meets none of them there.
+    """
+    if scales.low is not None and scales.high is not None:
+        low, high = float(scales.low[q]), float(scales.high[q])
+        middle, reach = (low + high) / 2, max(0.6 * (high - low), 1.0)
+    else:
+        spread, _ = scales.channels.get(f"joint:{place}:pos", (0.0, 0.0))
+        middle, reach = float(model.qpos0[q]), max(2.5 * spread, 1.0)
+    return middle - reach, middle + reach
 
 
 class GenericVelocity(_Generic):

@@ -12,6 +12,7 @@ from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.effects.words import with_spread
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_ROUND = 0.9 * 2 * np.pi  # rad: a turn, less what lies between samples where angles begin anew with each
 _MOST = 1200  # values of one rate that are looked at
 
 
@@ -91,9 +92,16 @@ class LawHarmonic(OfVariable, _Wave):
             for other, (its, angle) in degrees(model).items():
                 joint = int(model.dof_jntid[its])
                 endless = angle is not None and kind_of(model, its) == _HINGE and not model.jnt_limited[joint]
-                if endless and its != dof and model.dof_treeid[its] == model.dof_treeid[dof]:
+                if endless and _turned(scales, angle) and its != dof and model.dof_treeid[its] == model.dof_treeid[dof]:
                     out.append(cls((place, other), sizes))
         return out
+
+
+def _turned(scales: Scales, angle: int) -> bool:
+    """Whether a hinge went round in the logs, as far as is known: an arm that bends a little repeats nothing."""
+    if scales.low is None or scales.high is None:
+        return True
+    return bool(scales.high[angle] - scales.low[angle] > _ROUND)
 
 
 class LawWave(_Wave):

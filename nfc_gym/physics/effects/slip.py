@@ -54,6 +54,16 @@ def wheels(model: mujoco.MjModel) -> list[int]:
     return out
 
 
+def headed(ctx: Context, joints: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+    """Unit vectors ahead (..., n, 3), across (..., n, 3) and up (..., 1, 3) of wheels about hinges (n,)."""
+    gravity = ctx.nominal("opt.gravity")
+    weight = np.linalg.norm(gravity, axis=-1)
+    up = (-gravity / np.maximum(weight, 1e-9)[..., None])[..., None, :]
+    across = ctx.data("xaxis")[..., joints, :]
+    across = _unit(across - (across * up).sum(-1, keepdims=True) * up)
+    return cross(across, up), across, up
+
+
 def _radius(model: mujoco.MjModel, geom: int) -> float:
     """Half extent of a geom across its body's hinge, m."""
     axis = np.zeros(3)
@@ -118,13 +128,9 @@ class Slip(Effect):
         ratio[...] = ratio / (1 + theta[..., 2])
 
     def force(self, ctx: Context, theta: Array, out: Forces) -> None:
-        gravity = ctx.nominal("opt.gravity")
-        weight = np.linalg.norm(gravity, axis=-1)
-        up = (-gravity / np.maximum(weight, 1e-9)[..., None])[..., None, :]
+        weight = np.linalg.norm(ctx.nominal("opt.gravity"), axis=-1)
         com = ctx.data("xipos")[..., self.bodies, :]
-        across = ctx.data("xaxis")[..., self.joints, :]
-        across = _unit(across - (across * up).sum(-1, keepdims=True) * up)
-        ahead = cross(across, up)
+        ahead, across, up = headed(ctx, self.joints)
         arm = ctx.data("geom_xpos")[..., self.geoms, :] - com - self.radius[:, None] * up
         spatial = ctx.data("cvel")[..., self.bodies, :]
         from_root = com + arm - ctx.data("subtree_com")[..., self.roots, :]
