@@ -367,8 +367,8 @@ class Search:
     def _generic(self, arena: Arena, screen: Screen, outcome: Round) -> Judged | None:
         """The smooth law that still adds most to the accepted effects, if it is believed.
 
-        Where next to nothing is left the ground's grip alone is asked: the medians by which that is measured hide what
-        is wrong in one part of the world.
+        Where next to nothing is left, the ground's grip and what moves in a body alone are asked: the medians by which
+        that is measured hide what is wrong in one part of the world, and what slides when it is shaken alone.
         """
         if arena.leftover > SILENT:
             screened = self.lookout.screen(screen, self.generics, _GENERICS)

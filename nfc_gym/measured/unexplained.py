@@ -13,6 +13,7 @@ from nfc_gym.measured.verdict import Verified, column_means
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.generic import GenericMemory, GenericVelocity
 from nfc_gym.physics.effects.generic_ground import GenericGrip, GenericTread
+from nfc_gym.physics.effects.generic_inner import GenericInner
 from nfc_gym.physics.effects.ground import base_on_ground
 from nfc_gym.physics.effects.law import Law, degrees
 from nfc_gym.physics.effects.law_waves import LawHarmonic
@@ -90,11 +91,13 @@ def _smooth(model: mujoco.MjModel, found: Found) -> tuple[dict[str, str], str]:
     family, _, name = found.generic.partition(":")
     if family == GenericMemory.family:
         return _degree(model, name, False), f"a force with memory in {name}"
-    if family not in (GenericGrip.family, GenericTread.family):
+    if family not in (GenericGrip.family, GenericTread.family, GenericInner.family):
         return _degree(model, name, family == GenericVelocity.family), wording.smooth(found.generic)
     told = next(r["sentence"] for round_ in found.rounds for r in round_.ranking if r["id"] == found.generic)
     if family == GenericTread.family:
         return _degree(model, name, False), _inner(told)
+    if family == GenericInner.family:
+        return _joint(model, name), _inner(told)
     root = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, base_on_ground(model))
     # a base without a name has no channel
     return {"coordinate": f"body:{root}:pos" if root else "ground", "where": "ground"}, _inner(told)

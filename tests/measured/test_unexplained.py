@@ -68,6 +68,13 @@ def test_a_force_that_repeats_with_a_wheels_turn_is_at_the_wheel() -> None:
     assert found["description"].startswith("looks like a force under a wheel that repeats with its turn, knee: 3 N")
 
 
+def test_what_moves_in_a_body_is_at_the_body() -> None:
+    told = "Something that moves in a body, root: it follows the body's speed late, and leans on it elsewhere then."
+    found = said("generic_inner:root", ranked={"id": "generic_inner:root", "generic": True, "sentence": told})
+    assert (found["coordinate"], found["where"]) == ("body:car:pos", "joint:root")
+    assert found["description"].startswith("looks like something that moves in a body, root: it follows")
+
+
 @pytest.mark.parametrize(
     ("generic", "coordinate", "where"),
     [

@@ -18,6 +18,7 @@ from nfc_gym.physics.effects.everywhere import ALL, everywhere
 from nfc_gym.physics.effects.friction import Coulomb, DirectionalFriction, LoadFriction, Stribeck
 from nfc_gym.physics.effects.generic import GenericMemory, GenericPosition, GenericTime, GenericVelocity
 from nfc_gym.physics.effects.generic_ground import GenericGrip, GenericTread
+from nfc_gym.physics.effects.generic_inner import GenericInner
 from nfc_gym.physics.effects.ground import Compliance, FrictionPatch
 from nfc_gym.physics.effects.gust import Gust
 from nfc_gym.physics.effects.hysteresis import Hysteresis
@@ -43,7 +44,7 @@ _TYPES: tuple[type[Effect], ...] = (
     Cogging, Gain, Loss, CommandGain, Offset, Lag, Delay, DeadZone, Saturation, TorqueSpeed, SupplySag, Thermal,
     Payload, ComShift, Inertia, DragLinear, DragQuadratic, Wind, Gust, RotorDrag, GroundEffect, ExternalForce, Slope,
     Slip, FrictionPatch, Compliance, Sinkage, SensorBias, SensorGain, SensorDelay, Misalignment,
-    GenericPosition, GenericVelocity, GenericTime, GenericMemory, GenericGrip, GenericTread,
+    GenericPosition, GenericVelocity, GenericTime, GenericMemory, GenericGrip, GenericTread, GenericInner,
     LawHarmonic, LawPower, LawPolynomial, LawPlace, LawFrictionByPlace, LawHeight, LawRamp, LawWave, LawCommand,
     LawCross,
 )  # fmt: skip

@@ -118,9 +118,10 @@ class Effect(ABC):
     remark: ClassVar[str] = ""
     # A member of the generic alternatives takes part in every contest but is never claimed by name.
     generic: ClassVar[bool] = False
-    # Whether it acts in some places of the world alone, so that medians over all of a log hide what it leaves.
+    # Whether it acts in some places of the world, or at some times, alone, so that medians over all of a log hide what
+    # it leaves.
     patchy: ClassVar[bool] = False
-    # Of a generic alternative, whether it acts where no law in words pushes: on what touches the ground.
+    # Of a generic alternative, whether it acts where no law in words pushes: under wheels and feet, inside a body.
     wordless: ClassVar[bool] = False
     # Families that together do the same at the same place unless this law's own feature shows; else claimed instead.
     simpler: ClassVar[tuple[tuple[str, ...], ...]] = ()
