@@ -25,6 +25,7 @@ from .speed import Speed
 from .world_model import WorldModel
 
 SAVE_EVERY = 120.0  # s between two states on disk; what was seen goes with them
+KEEP_EVERY = 30.0  # s between two calls of `kept`
 TELL_EVERY = 2.0  # s
 BURST = 64  # updates between two looks at the clock
 REPLAY = "nfc_gym-tdmpc2-replay-1"
@@ -118,12 +119,12 @@ class Run:
           seconds: None is without limit.
           state: file that is written now and then and at the end; None writes none.
           mark: called with the steps after each control step and all updates that are due by it.
-          kept: called after each state that is written on the way.
+          kept: called now and then, to keep what is there.
 
         Raises:
           Diverged: a loss is not finite; the weights are those from before, and the last state stays as it was.
         """
-        began = saved = told = time.monotonic()
+        began = saved = told = asked = time.monotonic()
         spent, before = self.elapsed, self.steps
         values: dict[str, Tensor] = {}
         while (self.steps < steps or self.due()) and (seconds is None or time.monotonic() - began < seconds):
@@ -139,9 +140,10 @@ class Run:
                 self.tell(values, steps, (self.steps - before) / (now - began))
             if state is not None and now - saved > SAVE_EVERY:
                 self.save(state)
-                if kept is not None:
-                    kept()
                 saved = time.monotonic()
+            if kept is not None and now - asked > KEEP_EVERY:
+                kept()
+                asked = time.monotonic()
         if values:
             self.tell(values, steps, (self.steps - before) / max(self.elapsed - spent, 1e-9), last=True)
         if state is not None:

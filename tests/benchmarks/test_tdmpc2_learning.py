@@ -140,6 +140,16 @@ def test_a_run_goes_on_from_its_state_to_the_same_bits(tmp_path: Path) -> None:
         other.load(tmp_path / "x.training")
 
 
+def test_what_is_there_is_kept_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tdmpc2 import run as module
+
+    monkeypatch.setattr(module, "KEEP_EVERY", -1.0)
+    run, kept = small_run(first=8), []
+    run.train(20, kept=lambda: kept.append(run.learner.updates))
+    # Two updates for each control step of four simulations, from the third on, which completes the first sequences.
+    assert kept == [0, 0, 6, 8, 10]
+
+
 def test_an_agent_s_file_acts_as_it_did(tmp_path: Path) -> None:
     from tdmpc2.agent import Agent, load_agent
 
