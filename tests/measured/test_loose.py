@@ -70,7 +70,7 @@ def record(file: Path, rng: np.random.Generator, seconds: float = 3.0) -> None:
     q[:, 3:] /= np.linalg.norm(q[:, 3:], axis=1, keepdims=True)
     names = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz", "u0", "u1", "u2")
     columns = dict(zip(names, np.concatenate([q, v, u], 1).T, strict=True))
-    np.savez(file, t=np.arange(len(q)) * SAMPLE, **columns)
+    np.savez(file, allow_pickle=False, t=np.arange(len(q)) * SAMPLE, **columns)
 
 
 def rotated(quat: np.ndarray, v: np.ndarray) -> np.ndarray:

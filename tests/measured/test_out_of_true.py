@@ -74,8 +74,9 @@ def record(file: Path, rng: np.random.Generator, wheel: str, seconds: float = 2.
     q, v, u = (np.array(part) for part in zip(*rows, strict=True))
     q += rng.normal(size=q.shape) * [0.0005, 0.0005, 0.0005, 0.002, 0.002]
     v += 0.005 * rng.normal(size=v.shape)
-    np.savez(file, t=np.arange(len(q)) * SAMPLE, **{f"q{i}": q[:, i] for i in range(5)}, v1=v[:, 1], v2=v[:, 2],
-             u0=u[:, 0], u1=u[:, 1])  # fmt: skip
+    columns = dict(zip(("q0", "q1", "q2", "q3", "q4"), q.T, strict=True))
+    columns |= {"v1": v[:, 1], "v2": v[:, 2], "u0": u[:, 0], "u1": u[:, 1]}
+    np.savez(file, allow_pickle=False, t=np.arange(len(q)) * SAMPLE, **columns)
 
 
 @pytest.mark.parametrize("wheel", ["front", "rear"])

@@ -284,6 +284,7 @@ def test_a_tread_pushes_with_the_wheels_turn_ahead_across_and_up() -> None:
     assert np.count_nonzero(out.xfrc.any(1)) == 1
     with pytest.raises(InputError, match=r"'knee' is no wheel's joint; there are: w0, w1, w2, w3"):
         make("generic_tread", "knee", dict.fromkeys(names, 0.0))[0].bind(model)
-    proposed = {e.id: e for e in propose(model, Scales(*np.ones((2, model.nv)), np.ones(0), np.ones(0), 0.01))}
+    one, none = np.ones(model.nv), np.ones(0)
+    proposed = {e.id: e for e in propose(model, Scales(one, one, none, none, 0.01))}
     assert [i for i in proposed if "tread" in i] == [f"generic_tread:w{i}" for i in range(4)]
     assert proposed["generic_tread:w0"].params[0].probes[0] == pytest.approx(0.1 * 22 * G / 4)

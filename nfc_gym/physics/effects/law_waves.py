@@ -91,8 +91,14 @@ class LawHarmonic(OfVariable, _Wave):
                 out.append(cls((place,), sizes))
             for other, (its, angle) in degrees(model).items():
                 joint = int(model.dof_jntid[its])
-                endless = angle is not None and kind_of(model, its) == _HINGE and not model.jnt_limited[joint]
-                if endless and _turned(scales, angle) and its != dof and model.dof_treeid[its] == model.dof_treeid[dof]:
+                endless = kind_of(model, its) == _HINGE and not model.jnt_limited[joint]
+                if (
+                    angle is not None
+                    and endless
+                    and _turned(scales, angle)
+                    and its != dof
+                    and model.dof_treeid[its] == model.dof_treeid[dof]
+                ):
                     out.append(cls((place, other), sizes))
         return out
 
