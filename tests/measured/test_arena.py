@@ -13,6 +13,7 @@ from nfc_gym.measured.fit import Fit, stand
 from nfc_gym.measured.metric import metric
 from nfc_gym.measured.owned import Data
 from nfc_gym.measured.problem import Columns, Problem
+from nfc_gym.measured.search import Options, Search
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.friction import Coulomb
 from nfc_gym.physics.effects.inertial import Payload
@@ -249,3 +250,26 @@ def test_what_gains_as_much_for_more_numbers_is_an_equivalent_however_little_tha
     laws: Any = [best, rival]
     assert choice.alike(laws, laws[0], laws[0]) == ["shift:a"]
     assert choice.alike(laws, laws[0], laws[0], priced=False) == ["shift:a", *["load:a"] * listed]
+
+
+@pytest.mark.parametrize(
+    ("bluntly", "sharply", "total", "holds"),
+    [(True, False, 500.0, True), (False, True, 500.0, True), (False, False, 500.0, False), (False, True, 15.0, False)],
+)
+def test_a_smooth_law_is_judged_a_second_time_where_much_of_its_gain_is_not_sure(
+    bluntly: bool, sharply: bool, total: float, holds: bool
+) -> None:
+    """As a named effect is; but not for a gain that would not be worth naming if it were sure."""
+    j: Any = SimpleNamespace(total=total, fitted="its fit")
+    sharp = SimpleNamespace(worth=lambda j, share: sharply, enter_again=lambda j: j)
+    arena: Any = SimpleNamespace(
+        worth=lambda j, share: bluntly,
+        sharper=lambda fitted: sharp,
+        misfit=1000.0,
+        label=lambda j: "generic_grip:ground",
+    )
+    said: list[str] = []
+    search: Any = SimpleNamespace(options=Options(), say=said.append)
+    assert Search._holds(search, arena, j) == holds  # pyright: ignore[reportPrivateUsage]
+    asked = not bluntly and total > 100
+    assert said == ["judging again under what generic_grip:ground leaves unexplained"] * asked
