@@ -248,7 +248,7 @@ def _fold(
     return outcome
 
 
-_TOLD = ("generic", "nearest", "dropped", "doubted", "misshapen")  # of `Found`, kept as it is
+_TOLD = ("generic", "nearest", "hinted", "dropped", "doubted", "misshapen")  # of `Found`, kept as it is
 
 
 def _search(run: Run, fitting: Any, work: Problem, select: Problem) -> Found:

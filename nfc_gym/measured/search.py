@@ -87,6 +87,7 @@ class Found:
       slack: (m,) that of the metric of the last round, under which `extended` was fitted.
       rounds: in order, the last one being the round that accepted nothing.
       generic: id of a generic alternative that beat every named effect, or None.
+      hinted: id of the one that gains most beyond chance by straight lines, believed or not; None where none does.
       nearest: id of the candidate that led the last round's screening, whatever it gained; None where there was none.
       dropped: named effects that a generic alternative alone outdid.
       doubted: accepted effects that lead rivals by less than they leave over, with these (see `doubt`).
@@ -100,6 +101,7 @@ class Found:
     rounds: list[Round]
     generic: str | None
     nearest: str | None
+    hinted: str | None = None
     dropped: list[str] = field(default_factory=list)
     doubted: dict[str, list[str]] = field(default_factory=dict)
     misshapen: dict[str, str] = field(default_factory=dict)
@@ -110,6 +112,7 @@ class Search:
     """One greedy search on fit and selection problems."""
 
     _thinned = False  # whether laws have left the model that the round at hand starts from
+    _hinted: str | None = None  # see `Found`
 
     def __init__(
         self,
@@ -203,7 +206,8 @@ class Search:
         nearest = screened[0].effect.id if screened else None
         doubts = doubted(arena, rounds, self.named) if arena.leftover > SILENT else {}
         shapes = {i: arena.label(j) for i, j in odd.items() if i not in dropped}
-        return Found(calibrated, arena.current, arena.extra, rounds, label, nearest, dropped, doubts, shapes)
+        hinted = self._hinted
+        return Found(calibrated, arena.current, arena.extra, rounds, label, nearest, hinted, dropped, doubts, shapes)
 
     def _contest(self, arena: Arena, screen: Screen, begins: bool) -> tuple[list[Screened], Round, Judged | None]:
         """The contest of one round: its screening, what is reported of it, and what it accepted.
@@ -376,6 +380,9 @@ class Search:
         else:
             screened = [screen.try_one(g) for g in self.generics if g.patchy]
         worth = self.options.worth
+        chance = screen.chance(screened, arena.blocks[0], self.rng)
+        beyond = {s.effect.id: s.gain / chance[s.effect.id] for s in screened if s.gain > 0 and s.effect.id in chance}
+        self._hinted = max((i for i, times in beyond.items() if times > 1), key=lambda i: beyond[i], default=None)
         # What no push on a joint says shows least in straight lines: the best of each such family is asked in any case.
         wordless = {s.effect.family: s for s in reversed(screened) if s.effect.wordless}.values()
         leading = [s for i, s in enumerate(screened) if i < _LEADING or any(s is w for w in wordless)]
@@ -384,7 +391,6 @@ class Search:
         outcome.ranking += [arena.row(j) for j in judged]
         if not judged or not self._holds(arena, judged[0]):
             return None
-        chance = screen.chance(screened, arena.blocks[0], self.rng)
         return judged[0] if float(judged[0].fit_gains.sum()) > chance.get(arena.label(judged[0]), 0.0) else None
 
     def _holds(self, arena: Arena, j: Judged) -> bool:

@@ -10,9 +10,10 @@ from nfc_gym.measured.forced import surest
 from nfc_gym.measured.laws import Proposal
 from nfc_gym.measured.search import Found
 from nfc_gym.measured.verdict import Verified, column_means
+from nfc_gym.physics.effects import FAMILIES
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.generic import GenericMemory, GenericVelocity
-from nfc_gym.physics.effects.generic_ground import GenericGrip, GenericTread
+from nfc_gym.physics.effects.generic_ground import GenericTread
 from nfc_gym.physics.effects.generic_inner import GenericInner
 from nfc_gym.physics.effects.ground import base_on_ground
 from nfc_gym.physics.effects.law import Law, degrees
@@ -59,8 +60,12 @@ def unexplained(
         text = f"looks like {', and '.join(parts)}{near}"
         return _place(plant.model, laws[0]) | out | {"description": f"{text}; {reason}" if "alike" in reason else text}
     if found.generic is not None:
-        at, what = _smooth(plant.model, found)
+        at, what = _smooth(plant.model, found, found.generic)
         return at | out | {"description": f"looks like {what}, of no law of the library{near}"}
+    if found.hinted is not None:
+        at, what = _smooth(plant.model, found, found.hinted)
+        text = f"most like {what}, but not surely on unseen logs"
+        return at | out | {"description": f"{text}{_elsewhere(v, at)}; {reason}{near}"}
     if scanned is not None:
         joint, guess = surest(scanned.evidence), scanned.nearest
         if joint is not None and (guess is None or _joint_of(guess.law) != joint):
@@ -85,22 +90,22 @@ def _guess(near: Proposal) -> str:
     return f"depends most on {near.law.what}, which takes away {near.share:.0%} of it, but not surely on unseen logs"
 
 
-def _smooth(model: mujoco.MjModel, found: Found) -> tuple[dict[str, str], str]:
-    """`coordinate` and `where` of the generic alternative that is believed, and what it is, in words."""
-    assert found.generic is not None
-    family, _, name = found.generic.partition(":")
+def _smooth(model: mujoco.MjModel, found: Found, generic: str) -> tuple[dict[str, str], str]:
+    """`coordinate` and `where` of a generic alternative, and what it is, in words."""
+    family, _, name = generic.partition(":")
     if family == GenericMemory.family:
         return _degree(model, name, False), f"a force with memory in {name}"
-    if family not in (GenericGrip.family, GenericTread.family, GenericInner.family):
-        return _degree(model, name, family == GenericVelocity.family), wording.smooth(found.generic)
-    told = next(r["sentence"] for round_ in found.rounds for r in round_.ranking if r["id"] == found.generic)
+    if not (kind := FAMILIES[family]).wordless:
+        return _degree(model, name, family == GenericVelocity.family), wording.smooth(generic)
+    sentences = (r["sentence"] for round_ in found.rounds for r in round_.ranking if r["id"] == generic)
+    what = _inner(next(sentences, f"{kind.summary}, {name}"))  # one that was not refitted has no sizes
     if family == GenericTread.family:
-        return _degree(model, name, False), _inner(told)
+        return _degree(model, name, False), what
     if family == GenericInner.family:
-        return _joint(model, name), _inner(told)
+        return _joint(model, name), what
     root = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, base_on_ground(model))
     # a base without a name has no channel
-    return {"coordinate": f"body:{root}:pos" if root else "ground", "where": "ground"}, _inner(told)
+    return {"coordinate": f"body:{root}:pos" if root else "ground", "where": "ground"}, what
 
 
 def _place(model: mujoco.MjModel, law: Effect, sure: bool = True) -> dict[str, str]:

@@ -146,7 +146,7 @@ def test_even_without_a_law_the_worst_place_is_named() -> None:
     # The first misses by more, the second by more of what noise alone would make it miss.
     v = SimpleNamespace(problem=problem, white={"extended": np.tile([4.0, 3.0], (5, 1))}, floor=np.array([8.0, 0.9]))
     last = SimpleNamespace(ranking=[{"id": "lag:m", "generic": False, "share": 0.12}], reason="too small")
-    found = SimpleNamespace(rounds=[last], rest=SimpleNamespace(dropped=[], scanned=None), generic=None)
+    found = SimpleNamespace(rounds=[last], rest=SimpleNamespace(dropped=[], scanned=None), generic=None, hinted=None)
     left = unexplained(v, found, SimpleNamespace(effects=(), model=None), [], [], 0.0)  # pyright: ignore[reportArgumentType]
     assert left["where"] == "joint:b"
     assert left["coordinate"] == "joint:b (joint speed)"

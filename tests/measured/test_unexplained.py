@@ -32,6 +32,7 @@ def said(
     text: str = MODEL,
     bare: Proposal | None = None,
     sure: bool = False,
+    hinted: str | None = None,
     **more: str,
 ) -> dict[str, Any]:
     model = mujoco.MjModel.from_xml_string(text)
@@ -40,7 +41,7 @@ def said(
     believable = [nearest] if sure and nearest else []
     rest = Remainder(fitted=None, scanned=Scanned(believable, nearest, {}, evidence or {}))  # type: ignore[arg-type]
     rest.bare = None if bare is None else Scanned([], bare, {}, {})
-    found: Any = SimpleNamespace(generic=generic, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
+    found: Any = SimpleNamespace(generic=generic, hinted=hinted, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
     columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
     v: Any = SimpleNamespace(problem=problem, white={"extended": np.array([[1.0, 3.0]])}, floor=np.ones(2))
@@ -90,6 +91,32 @@ def test_a_smooth_force_that_is_believed_goes_before_a_law_that_is_not(
     found = said(generic, nearest=near, evidence={"root": 300.0, "knee": 0.0})
     assert (found["coordinate"], found["where"]) == (coordinate, where)
     assert found["description"].startswith("looks like a smooth force by ")
+
+
+@pytest.mark.parametrize(
+    ("hinted", "coordinate", "where", "text"),
+    [
+        (
+            "generic_tread:knee",
+            "joint:knee:pos",
+            "joint:knee",
+            "a force under a wheel that repeats with its turn, knee",
+        ),
+        ("generic_grip:ground", "body:car:pos", "ground", "friction of the ground that depends on the place, ground"),
+        ("generic_inner:root", "body:car:pos", "joint:root", "something that moves in a body, root"),
+        ("generic_memory:knee", "joint:knee:pos", "joint:knee", "a force with memory in knee"),
+    ],
+)
+def test_what_gains_beyond_chance_says_where_though_it_is_not_believed(
+    hinted: str, coordinate: str, where: str, text: str
+) -> None:
+    near = Proposal(LawHeight(("root[2]",)), np.ones(2), 0.02)
+    found = said(None, hinted=hinted, nearest=near)
+    assert (found["coordinate"], found["where"]) == (coordinate, where)
+    assert found["description"].startswith(f"most like {text}, but not surely on unseen logs")
+    assert said("generic_velocity:knee", hinted=hinted)["coordinate"] == "joint:knee:vel", (
+        "what is believed goes before"
+    )
 
 
 def test_what_repeats_with_another_parts_turn_comes_from_that_part() -> None:
