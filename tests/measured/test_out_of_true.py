@@ -6,11 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
+from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.bench import candidates, make_bench
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.fit import stand
 from nfc_gym.measured.metric import metric
+from nfc_gym.measured.owned import Data
+from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.screen import Screen, screen_all
+from nfc_gym.measured.search import Options, Search
 from nfc_gym.measured.settle import slack
 from nfc_gym.physics.effects.law import Law
 
@@ -88,13 +92,22 @@ def test_what_repeats_with_a_wheels_turn_is_told_from_forces_on_the_vehicle(tmp_
     for name in ("fit_0", "fit_1", "select", "verify"):
         record(tmp_path / f"{name}.npz", rng, wheel)
     bench = make_bench(load(tmp_path / "mapping.yaml"), 1)
-    logs = bench.dataset.of("fit")
-    problem, x = bench.problem(logs), bench.plant.null
+    logs, x = bench.dataset.of("fit"), bench.plant.null
+    problem, other = bench.problem(logs), bench.problem(bench.dataset.of("select"))
     sigma = problem.covariance(bench.plant, x)
-    under = metric(problem, sigma, slack(problem, sigma, bench.plant, x))
-    screen = Screen(problem, under, stand(problem, under, bench.plant, x))
+    extra = slack(problem, sigma, bench.plant, x)
+    under = metric(problem, sigma, extra)
+    current = stand(problem, under, bench.plant, x)
+    screen = Screen(problem, under, current)
     generics = [e for e in candidates(bench, logs) if e.generic and not isinstance(e, Law)]
     gains = {s.effect.id: s.gain for s in screen_all(screen, generics)}
     (best, most), (_, second) = list(gains.items())[:2]
     assert best == f"generic_tread:{wheel}"
     assert most > 1.5 * second
+    data, select = Data(problem, sigma), Data(other, other.covariance(bench.plant, x))
+    arena = Arena(data, select, current, under, extra, rng, lambda text: None)
+    # One look at which of them gains more than chance names it, were it not believed.
+    search = Search(data, select, generics, Options(), lambda text: None)
+    found = search._generic(arena, screen, Round([], 0.0))  # pyright: ignore[reportPrivateUsage]
+    assert search._hinted == best  # pyright: ignore[reportPrivateUsage]
+    assert found is None or arena.label(found) == best
