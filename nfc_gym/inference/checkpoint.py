@@ -59,7 +59,7 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
     try:
         about = json.loads(metadata["about"])
         own, frame = PriorBox.from_dict(about["prior"]), about.get("frame")
-        config, sizes, notes = NetworkConfig(**about["network"]), Sizes(**about["sizes"]), dict(about["notes"])
+        config, sizes, notes = NetworkConfig(**_known(about["network"])), Sizes(**about["sizes"]), dict(about["notes"])
         network = Network(config, sizes, own)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, IndexError) as e:
         raise InputError(f"{path}: its metadata describe no network that this version knows ({e})") from None
@@ -78,3 +78,11 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
     except (RuntimeError, TypeError) as e:
         raise InputError(f"{path}: its weights are not those of the network that it describes ({e})") from None
     return network.eval(), given, notes
+
+
+def _known(network: dict[str, Any]) -> dict[str, Any]:
+    """A network's description without what earlier versions said of every one and this one has no more.
+
+    `aligned`: it was made for windows of the same commands. One that was is not known here.
+    """
+    return {key: value for key, value in network.items() if key != "aligned" or value is not False}

@@ -19,7 +19,6 @@ class NetworkConfig:
       encoder: of the motion: tcn, nn, qmc-rff, qmc-fks, or none.
       density: of (psi, delta_s): score, mixture or flow.
       width: of the layers of the encoder `nn`.
-      aligned: all windows have the same commands (`simulate.Repeated`), so that inputs are standardised time by time.
       summaries: physics summaries beside the encoder.
       elevation: the elevation map beside the encoder.
       linear: densities start from what a ridge regression tells (`LinearBase`): on the physics summaries where they are
@@ -38,7 +37,6 @@ class NetworkConfig:
     encoder: str = "tcn"
     density: str = "score"
     width: int = 1024
-    aligned: bool = False
     summaries: bool = False
     elevation: bool = False
     linear: bool = False

@@ -3,9 +3,7 @@
 from functools import partial
 from typing import Any, NamedTuple, cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from nfc_gym.core.errors import InputError
@@ -26,7 +24,6 @@ from nfc_gym.inference.random import seeded
 from nfc_gym.inference.space import EDGE, PriorBox
 
 _CHUNK = 1024  # windows whose fixed features are computed at once
-_SAME = 1e-3  # commands that are as near as this are the same
 
 
 class Encoded(NamedTuple):
@@ -68,7 +65,7 @@ class Network(Learner):
             self.place = Place(sizes.place) if sizes.place else nn.Identity()
             plan = Regressions.of(sizes.layout, sizes.states, sizes.actions) if config.summaries else None
             self.encoder = Joined(
-                config.encoder, sizes.horizon, sizes.states, sizes.actions, width=config.width, aligned=config.aligned,
+                config.encoder, sizes.horizon, sizes.states, sizes.actions, width=config.width,
                 summaries=config.summaries, regressions=plan, elevation=config.elevation,
             )  # fmt: skip
             width = config.features or self.encoder.features
@@ -153,13 +150,6 @@ class Network(Learner):
             if name in batch and batch[name].shape[1:] != (CELLS, CELLS):
                 raise InputError(f"windows: {name} has shape {tuple(batch[name].shape)}, want (n, {CELLS}, {CELLS})")
 
-    def repeats(self, actions: NDArray[np.float64]) -> bool:
-        """Whether actions (H, a) are the commands that it was trained on, where those were the same in all windows."""
-        signals = self.encoder.signals
-        if not self.config.aligned or signals is None:
-            return True
-        return bool(np.allclose(signals.commands.cpu().numpy(), actions, atol=_SAME))
-
     @torch.no_grad()
     def unlike(self, states: Tensor) -> Tensor:
         """(s,) spreads that the median of each state of one window (H+1, s), as logged, lies from the training set's.
@@ -230,16 +220,6 @@ class Network(Learner):
             scaled = self.delta_scale(self.faced(batch["delta_s"], self.facing(batch["states"])))
             parts.append(torch.where(self.varies, scaled, torch.randn_like(scaled)))
         return torch.cat(parts, 1)
-
-    @torch.no_grad()
-    def middles(self, batch: Batch) -> Tensor:
-        """(B, size of psi) z amid what is said of windows, see `Density.middle`."""
-        parts = zip(batch["states"].split(_CHUNK), batch["actions"].split(_CHUNK), strict=True)
-        out = []
-        for given in (self.encode(*part) for part in parts):
-            y = self.density.middle(given.features)
-            out.append(y if self.base is None else self.base.colour(y[:, None], given.mean[:, None])[:, 0])
-        return torch.cat(out)
 
     @torch.no_grad()
     def calibrate(self, batch: Batch) -> None:

@@ -105,11 +105,6 @@ class NeuralPosterior:
         if len(actions) < size.horizon:
             raise InputError(f"window: {len(actions)} steps; this network was trained on windows of {size.horizon}")
         states, actions = states[-size.horizon - 1 :], actions[len(actions) - size.horizon :]
-        if not self.network.repeats(actions):
-            raise InputError(
-                "window: this network was learned from windows of one motion's commands, and these are others: "
-                "give them to the posterior that it was refined from"
-            )
         elevation = None
         if self.network.config.elevation:
             if window.elevation is None:

@@ -24,10 +24,8 @@ Array = NDArray[np.float64]
 TRUNCATED, POSTERIOR = PROPOSALS = ("truncated", "posterior")
 QUANTILE = 5e-4  # of the posterior's density, that says how far its draws reach
 WIDER = 1.0  # how many times as far truncated proposals do
-SLACK = 1.0  # nats
 _FILLS = 1.5  # times the variance of what lies evenly in a region: that of candidates for it
 _OWN = 0.25  # of such candidates: draws of the posterior itself
-_TRIED, _ENOUGH = 100_000, 100  # draws of the prior by which its share inside is told, and how many must be inside
 _LEAST = 1e-4  # probit, of a normal's standard deviations: draws may all be equal
 _NARROWS = 0.05  # nats of posterior entropy that a round must win, or the rounds end
 
@@ -46,8 +44,6 @@ class SequentialConfig:
       oversampling: candidates for each draw that importance resampling chooses from.
       narrows: nats of entropy that a round must take from the posterior for another to follow.
       held_out: share of each round that is held out.
-      fresh: windows simulated after the last round at the posterior's own draws, which its width is taken from
-        (`widths`); 0 leaves a flow as wide as held-out windows have it.
       anew: whether every later round trains a network of new weights; one that goes on from the last round's may learn
         what is new less well (Ash and Adams, On warm-starting neural network training, NeurIPS 2020).
       proposal: of later rounds: "truncated", the prior where the posterior has mass, or "posterior", draws of it.
@@ -62,13 +58,12 @@ class SequentialConfig:
     oversampling: int = 16
     narrows: float = _NARROWS
     held_out: float = 0.1
-    fresh: int = 0
     anew: bool = False
     proposal: str = TRUNCATED
     seed: int = 0
 
     def __post_init__(self) -> None:
-        least_of = {"rounds": 1, "simulations": 20, "samples": 100, "oversampling": 1, "fresh": 0, "seed": 0}
+        least_of = {"rounds": 1, "simulations": 20, "samples": 100, "oversampling": 1, "seed": 0}
         for name, least in least_of.items():
             require_whole(f"sequential: {name}", getattr(self, name), least)
         if np.isnan(self.narrows):  # by which nothing would ever stop
@@ -188,57 +183,6 @@ class _Normal:
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """(n, size) draws."""
         return self.middle + rng.standard_normal((n, len(self.middle))) @ self.root.T
-
-
-class Around:
-    """The uniform prior where a normal through a posterior's draws, in probit coordinates, has not ended; see `reach`.
-
-    As `TruncatedPrior`, but of draws alone: densities of a score model take a processor a tenth of a second each, and
-    tens of thousands of them would be asked for. Any region that holds the posterior's mass will do to propose from.
-    The threshold is lowered by `SLACK`: where a posterior is a little too sure, or a little beside the truth, what it
-    leaves out no later round would find.
-
-    Args:
-      posterior: given a window.
-      config: `samples` draws make the normal and, with `quantile` and `wider`, its edge; `oversampling` candidates are
-        drawn for each proposal that cannot be had by rejection from the prior.
-      rng: of these draws.
-
-    Attributes:
-      threshold: log density over the prior's that a proposal exceeds.
-      kept: share of the prior's volume above it.
-    """
-
-    def __init__(self, posterior: "Believed", config: SequentialConfig, rng: np.random.Generator) -> None:
-        self.prior, self.oversampling = posterior.prior, config.oversampling
-        z = self.prior.to_z(drawn(posterior, config.samples, rng))
-        self.normal, self.size = _Normal.through(z), z.shape[1]
-        highest, depth = reach(self.gain(z), config)
-        self.threshold = highest - depth - SLACK
-        self.wide = self.normal.filling(depth + SLACK)
-        inside = float((self.gain(rng.standard_normal((_TRIED, self.size))) > self.threshold).mean())
-        self.rejects = inside * _TRIED >= _ENOUGH
-        self.kept = inside if self.rejects else float(np.exp(self._candidates(_TRIED, rng)[1]).mean())
-
-    def gain(self, z: Array) -> Array:
-        """(n,) log density of the normal over the prior's at z (n, size)."""
-        return self.normal.gain(z)
-
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """(n, d) psi, physical units."""
-        if not self.rejects:
-            z, log_weight = self._candidates(n * self.oversampling, rng)
-            return self.prior.from_z(z[chosen(log_weight, n, rng)])
-        found: list[Array] = []
-        while (missing := n - sum(map(len, found))) > 0:
-            z = rng.standard_normal((min(_TRIED, 1 + int(1.2 * missing / self.kept)), self.size))
-            found.append(z[self.gain(z) > self.threshold])
-        return self.prior.from_z(np.concatenate(found)[:n])
-
-    def _candidates(self, n: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """(n, size) from a wider normal, and (n,) the log weights that make them the prior above the threshold."""
-        z = self.wide.sample(n, rng)
-        return z, np.where(self.gain(z) > self.threshold, -self.wide.gain(z), -np.inf)
 
 
 class Corrected:

@@ -5,9 +5,6 @@ quantile (truncated sequential posterior estimation: Deistler et al. 2022; for s
 appends to all earlier rounds and trains on. Inside the truncated region the proposal is proportional to the prior, so
 the loss needs no correction. With draws of the posterior itself the answer is corrected instead (`proposals`). Either
 way the posterior of the *given* window stays right, that of others does not.
-
-What is learned for one window alone may be learned from windows of its own commands (`simulate.Repeated`), by a network
-of its own: it begins `within` the region in which another posterior of that window has mass.
 """
 
 from collections.abc import Callable
@@ -20,14 +17,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfc_gym.core.errors import InputError
 from nfc_gym.inference.data import Batch, TensorWindows
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.proposals import (
     TRUNCATED,
-    Around,
     Believed,
     Corrected,
     Proposed,
@@ -39,12 +34,9 @@ from nfc_gym.inference.proposals import (
 from nfc_gym.inference.random import mixed, seeded
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
-from nfc_gym.inference.widths import LEAST, factor
 
 Array = NDArray[np.float64]
 Simulator = Callable[[Array, np.random.Generator], Batch]
-Made = Callable[[Array, np.random.Generator], TensorWindows]
-_PASSES = 4  # over held out windows, each with noise of its own
 
 
 @dataclass
@@ -70,8 +62,8 @@ class Rounds:
 
 def sequential(
     network: Network, simulate: Simulator, window: Window, config: SequentialConfig | None = None,
-    training: TrainConfig | None = None, *, begun: TensorWindows | None = None, within: Around | None = None,
-    device: str | torch.device = "cpu", report: Report = quiet, scales: bool = True, noise: Array | None = None,
+    training: TrainConfig | None = None, *, begun: TensorWindows | None = None, device: str | torch.device = "cpu",
+    report: Report = quiet, scales: bool = True,
 ) -> Rounds:  # fmt: skip
     """Infer psi from one window in rounds of simulations that close in on it.
 
@@ -83,22 +75,15 @@ def sequential(
       training: of each round, on all windows so far.
       begun: windows whose psi is drawn from the prior and which the network has been trained on: they are the first
         round, whatever their number, for any window that was observed.
-      within: what the first round is drawn from in place of the prior, where another posterior of this window is there
-        already.
       device: to train on.
       report: is told of the progress.
       scales: see `train`; a network that was trained before on other windows is to keep its own.
-      noise: (H+1, s) standard deviation of the sensors' noise, which windows are simulated without: each pass over
-        them draws it anew, and little of it is learned by heart. None takes them as they are.
 
     Raises:
-      InputError: the simulator returns windows that are not the network's, or another number of them; or a start that
-        cannot be had.
+      InputError: the simulator returns windows that are not the network's, or another number of them.
     """
     config, training = config or SequentialConfig(), training or TrainConfig(epochs=50)
-    if within is not None and (begun is not None or config.proposal != TRUNCATED):
-        raise InputError("sequential: `within` goes with truncated proposals, and with no windows that were `begun`")
-    made = partial(_simulated, network.prior, simulate, noise)
+    made = partial(_simulated, network.prior, simulate)
     rng = np.random.default_rng(config.seed)
     out = Rounds(NeuralPosterior(network))
     believed, seen = _Beliefs(window, config), _Seen(config.held_out)
@@ -110,9 +95,8 @@ def sequential(
             if config.anew:
                 _renew(network, mixed(config.seed, r))
         else:
-            out.kept.append(1.0 if within is None else within.kept)
-            draw = within.sample if within else partial(_prior, network.prior)
-            new = begun or made(draw(config.simulations, rng), rng)
+            out.kept.append(1.0)
+            new = begun or made(_prior(network.prior, config.simulations, rng), rng)
             believed.first = len(new)
         learned, held_out = seen.with_more(new)
         if r or begun is None:
@@ -127,30 +111,7 @@ def sequential(
         if r and out.entropy[-2] - out.entropy[-1] < config.narrows:
             out.stopped = "no longer narrows"
             break
-    if config.fresh:
-        _widen(out, made, window, config, rng)
     return out
-
-
-def _widen(out: Rounds, made: Made, window: Window, config: SequentialConfig, rng: np.random.Generator) -> None:
-    """Take the last posterior's width from windows simulated at its own draws (`widths`), where it has one to set."""
-    network, prior = out.posterior.network, out.posterior.prior
-    if not isinstance(out.posterior, NeuralPosterior) or not network.density.widens:
-        return
-    if config.fresh < LEAST * (prior.size + 1):
-        raise InputError(
-            f"sequential: fresh is {config.fresh}, want 0 or {LEAST * (prior.size + 1)} and more for {prior.size} "
-            "parameters"
-        )
-    psi = drawn(out.posterior, config.fresh, rng)
-    windows = made(psi, rng)
-    batch = next(windows.batches(len(windows), None))
-    found = network.middles({name: t.to(next(network.parameters()).device) for name, t in batch.items()})
-    own = prior.to_z(drawn(out.posterior, config.samples, rng))
-    by = factor(prior.to_z(psi), found.double().cpu().numpy(), own)
-    network.density.widen(by)
-    out.posterior = NeuralPosterior(network).given(window)
-    out.entropy[-1] = -float(told(out.posterior, drawn(out.posterior, config.samples, rng)).mean())
 
 
 class _Seen:
@@ -198,12 +159,11 @@ class _Beliefs:
 
 
 def _calibrate(network: Network, held_out: TensorWindows, seed: int) -> None:
-    """Take the density's width from what was held out, with the sensors' noise of several passes."""
+    """Take the density's width from what was held out."""
     device = next(network.parameters()).device
-    turns = 1 if held_out.noise is None else _PASSES
-    passes = [batch for k in range(turns) for batch in held_out.batches(len(held_out), mixed(seed, k))]
+    (batch,) = held_out.batches(len(held_out), None)
     with seeded(seed, device):
-        network.calibrate({name: torch.cat([p[name] for p in passes]).to(device) for name in passes[0]})
+        network.calibrate({name: t.to(device) for name, t in batch.items()})
 
 
 def _renew(network: Network, seed: int) -> None:
@@ -222,9 +182,7 @@ def _prior(prior: PriorBox, n: int, rng: np.random.Generator) -> Array:
     return prior.psi_of(rng.uniform(size=(n, len(prior))))
 
 
-def _simulated(
-    prior: PriorBox, simulate: Simulator, noise: Array | None, psi: Array, rng: np.random.Generator
-) -> TensorWindows:
+def _simulated(prior: PriorBox, simulate: Simulator, psi: Array, rng: np.random.Generator) -> TensorWindows:
     batch: dict[str, Any] = dict(simulate(psi, rng))
     batch["psi"] = torch.as_tensor(prior.u_of(psi), dtype=torch.float32).clamp(0, 1)
-    return TensorWindows(batch, noise=None if noise is None else torch.as_tensor(noise, dtype=torch.float32))
+    return TensorWindows(batch)

@@ -222,21 +222,3 @@ def test_states_without_a_place_have_none() -> None:
 
     assert place_of(("body:base:quat.w", "body:base:linvel.x")) is None
     assert place_of(("joint:hip:pos",)) is None
-
-
-@pytest.mark.parametrize("name", ["tcn", "nn", "qmc-rff", "qmc-fks"])
-def test_windows_of_the_same_commands_are_told_apart_by_little(name: str) -> None:
-    """What all have in common is taken out time by time, so that the little in which they differ is what is seen."""
-    g = torch.Generator().manual_seed(0)
-    common, own = torch.randn(1, 9, 2, generator=g), 1e-3 * torch.randn(50, 9, 2, generator=g)
-    states, actions = common + own, torch.randn(1, 8, 1, generator=g).expand(50, 8, 1)
-    apart = {}
-    for aligned in (False, True):
-        encoder = Joined(name, 8, 2, 1, width=32, aligned=aligned)
-        encoder.fit(states, actions, None)
-        fixed = encoder.fixed(states, actions)
-        assert fixed.shape == (50, 9 * 5)
-        assert encoder(states, actions).shape[0] == 50
-        apart[aligned] = fixed[:, : 9 * 5].std(0).median()
-    assert apart[False] < 0.05
-    assert 0.5 < apart[True] < 2

@@ -241,7 +241,6 @@ def test_a_window_of_another_robot_is_refused_by_its_files_name(posterior: Path,
     [
         ("--log", "run_0", "--log run_0 is of a mapping's logs"),
         ("--until", "1.5", "--until 1.5 is of a mapping's logs"),
-        ("--device", "cpu", "--device cpu is for --refine"),
         ("--jobs", "0", "--jobs 0 is for --refine"),
     ],
 )

@@ -359,6 +359,27 @@ def test_metadata_that_describe_no_network_are_told_as_that(tmp_path: Path, part
         load(file)
 
 
+def test_networks_of_earlier_versions_are_opened_but_those_of_the_same_commands(tmp_path: Path) -> None:
+    """Those said of every network whether all of its windows had the same commands."""
+    posterior, window = cart()
+    file = tmp_path / "p.safetensors"
+    posterior.save(file)
+    tensors, metadata = read(file)
+    about = json.loads(metadata["about"])
+    assert "aligned" not in about["network"]
+
+    def written(aligned: bool) -> None:
+        earlier = about | {"network": about["network"] | {"aligned": aligned}}
+        save_file(tensors, file, {**metadata, "about": json.dumps(earlier)})
+
+    written(False)
+    expected = posterior.given(window).sample(9, rng()).psi
+    np.testing.assert_array_equal(load(file).given(window).sample(9, rng()).psi, expected)
+    written(True)
+    with pytest.raises(InputError, match=r"p\.safetensors: its metadata describe no network that this version knows"):
+        load(file)
+
+
 def test_a_folder_is_no_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"{tmp_path} is a folder; want a file"):
         load(tmp_path)

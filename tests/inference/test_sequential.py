@@ -5,19 +5,16 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from problems import NOISE, SMALL, box, gaussian, linear_windows, mix, network
+from problems import NOISE, box, gaussian, linear_windows, mix, network
 from scipy.special import gamma
 from scipy.stats import chi2, kstest, norm
 
 from nfc_gym.core import Fidelity, InputError
-from nfc_gym.inference.config import NetworkConfig, Sizes
-from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Quiet
-from nfc_gym.inference.proposals import SLACK, Around, Corrected, Proposed, SequentialConfig, TruncatedPrior, told
+from nfc_gym.inference.proposals import Corrected, Proposed, SequentialConfig, TruncatedPrior, told
 from nfc_gym.inference.sequential import _renew, sequential
 from nfc_gym.inference.train import TrainConfig, train
-from nfc_gym.inference.widths import factor, log_volume
 
 X = torch.tensor([[0.8, -0.5, 0.3]])
 OBSERVED = Window(X, np.zeros((0, 0)))
@@ -85,13 +82,12 @@ def test_proposals_fill_the_region_of_a_narrow_posterior(size: int, rho: float) 
     assert proposal.kept == pytest.approx(share, rel=0.15)
 
 
-@pytest.mark.parametrize("way", [TruncatedPrior, Around])
 @pytest.mark.parametrize("wider", [1.0, 2.0])
-def test_a_region_is_some_times_as_wide_as_a_posterior_reaches(way: type, wider: float) -> None:
+def test_a_region_is_some_times_as_wide_as_a_posterior_reaches(wider: float) -> None:
     posterior = Together(6, 0.9)
     # what the farthest of a few draws are differs from time to time, the tenth of many does not
     config = SequentialConfig(samples=4000, quantile=0.1, wider=wider)
-    threshold = way(posterior, config, np.random.default_rng(0)).threshold + (SLACK if way is Around else 0)
+    threshold = TruncatedPrior(posterior, config, np.random.default_rng(0)).threshold
     edge = np.sqrt(2 * (told(posterior, posterior.prior.from_z(np.zeros((1, 6))))[0] - threshold))
     assert edge == pytest.approx(wider * np.sqrt(chi2(6).ppf(0.9)), rel=0.03)
 
@@ -114,73 +110,15 @@ class Partly(Together):
         return Fidelity(self.prior.from_z(z))
 
 
-@pytest.mark.parametrize("way", [TruncatedPrior, Around])
-def test_what_was_not_told_of_is_proposed_as_the_prior_has_it(way: type) -> None:
+def test_what_was_not_told_of_is_proposed_as_the_prior_has_it() -> None:
     """Of candidates wider than the prior in fourteen parameters hardly any would be left to choose from."""
     posterior, config = Partly(3, 17), SequentialConfig(oversampling=8)
-    proposal = way(posterior, config, np.random.default_rng(0))
+    proposal = TruncatedPrior(posterior, config, np.random.default_rng(0))
     z = posterior.prior.to_z(proposal.sample(3000, np.random.default_rng(1)))
     np.testing.assert_allclose(z[:, 3:].std(0), 1, atol=0.06)
     away = np.linalg.norm(np.linalg.solve(posterior.root, z[:, :3].T), axis=0)
     # evenly in a ball of radius R, whose mean square is 3/5 R^2 and of which half lies within 0.5^(1/3) R
     assert (away**2).mean() / np.median(away) ** 2 == pytest.approx(0.6 / 0.5 ** (2 / 3), rel=0.05)
-
-
-def together(psi: np.ndarray, rng: np.random.Generator) -> dict[str, torch.Tensor]:
-    """Six parameters of which the sum is seen, and neighbours' differences four times worse."""
-    z = box(6).to_z(psi)
-    x = z @ SUM.T + 0.02 * rng.normal(size=z.shape)
-    return {"states": torch.as_tensor(x[:, None], dtype=torch.float32), "actions": torch.zeros(len(x), 0, 0)}
-
-
-SUM = np.vstack([np.ones(6), 0.25 * (np.eye(6)[:5] - np.eye(6)[1:])])
-
-
-def test_what_rounds_learn_of_many_parameters_is_as_wide_as_the_posterior() -> None:
-    """Held-out windows leave a regression at 0.89 of the spread, fresh ones at the posterior's own draws do not."""
-    covariance = np.linalg.inv(np.eye(6) + SUM.T @ SUM / 0.02**2)
-    root, seen = np.linalg.cholesky(covariance), together(box(6).from_z(np.full((1, 6), 0.3)), np.random.default_rng(5))
-    middle = covariance @ SUM.T @ seen["states"][0, 0].double().numpy() / 0.02**2
-
-    class Coarse:
-        prior = box(6)
-
-        def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
-            return Fidelity(self.prior.from_z(middle + 1.5 * rng.normal(size=(n, 6)) @ root.T))
-
-    config = SequentialConfig(2, 1500, oversampling=8, narrows=-np.inf, fresh=600)
-    windows = linear_windows(10, 6)
-    net = Network(NetworkConfig(**SMALL | {"density": "flow"}, linear=True), Sizes.of(windows.tensors), box(6))
-    within = Around(Coarse(), config, np.random.default_rng(0))  # type: ignore[arg-type]
-    out = sequential(
-        net, together, Window(seen["states"][0].numpy(), np.zeros((0, 0))), config,
-        TrainConfig(epochs=1, batch=128, rate=1e-9, average=0.5), within=within,
-    )  # fmt: skip
-    z = box(6).to_z(out.posterior.sample(4000, np.random.default_rng(0)).psi)
-    spread = np.linalg.solve(root, (z - middle).T).std(1)
-    assert np.exp(np.log(spread).mean()) == pytest.approx(1, abs=0.05)
-    assert out.entropy[-1] == pytest.approx(-told(out.posterior, box(6).from_z(z)).mean(), abs=0.1)
-    assert len(out.windows) == 3000
-    few = SequentialConfig(1, 100, fresh=27)
-    with pytest.raises(InputError, match="fresh is 27, want 0 or 28 and more for 6 parameters"):
-        sequential(net, together, Window(seen["states"][0].numpy(), np.zeros((0, 0))), few, TrainConfig(epochs=1))
-
-
-@pytest.mark.parametrize("reach", [0.5, 1.0, 3.0])
-@pytest.mark.parametrize("shrunk", [0.3, 1.0])
-def test_a_width_told_by_a_statistic_is_the_posteriors_however_that_shrinks(reach: float, shrunk: float) -> None:
-    """x = A z + noise, and t = K x: half of its log determinant in closed form, from windows drawn narrow or wide."""
-    a, rng = mix(5).double().numpy() / np.geomspace(0.05, 5, 5)[:, None], np.random.default_rng(0)
-    exact = -0.5 * np.linalg.slogdet(np.eye(5) + a.T @ a)[1]
-    found = []
-    for _ in range(30):
-        z = 0.4 + reach * rng.normal(size=(300, 5)) @ np.linalg.cholesky(np.linalg.inv(np.eye(5) + a.T @ a)).T
-        x = z @ a.T + rng.normal(size=(300, 5))
-        found.append(log_volume(z, shrunk * x @ mix(5).double().numpy()))
-    assert np.mean(found) == pytest.approx(exact, abs=0.1)  # 2 % of the spread in each of five
-    own = np.random.default_rng(1).multivariate_normal(np.zeros(5), np.linalg.inv(np.eye(5) + a.T @ a), 20_000)
-    assert factor(z, x, 0.8 * own) == pytest.approx(1.25, rel=0.05)
-    assert factor(z, x, 1.5 * own) == 1
 
 
 def test_the_truth_is_hardly_ever_cut_off() -> None:
@@ -272,6 +210,21 @@ def test_new_weights_begin_at_the_width_of_a_new_network() -> None:
     _renew(net, 3)
     for name, tensor in net.state_dict().items():
         assert torch.equal(tensor, fresh.state_dict()[name]), name
+
+
+def test_flows_learned_in_rounds_are_as_wide_as_held_out_windows_have_them() -> None:
+    net = network(linear_windows(200), density="flow", linear=True)
+    config, training = SequentialConfig(1, 300, samples=150), TrainConfig(30, batch=32, rate=3e-3, average=0.5)
+    out = sequential(net, simulate, OBSERVED, config, training)
+    _, held_out = out.windows.split(config.held_out)
+    (flow,) = net.density.links
+    with torch.no_grad():
+        given = net.encode(held_out.tensors["states"], held_out.tensors["actions"])
+        x = net.base.whiten(net.targets(held_out.tensors), given.mean)
+        latent = flow.flow(flow.context(given.features)).transform(x)
+    spread = float(latent.square().mean().sqrt())
+    assert abs(spread - 1) > 0.01  # where the flow begins
+    np.testing.assert_allclose(flow.flow.base.scale, spread, rtol=1e-4)
 
 
 class Normal:
@@ -421,44 +374,3 @@ def test_bad_settings_are_refused() -> None:
             SequentialConfig(wider=wider)
     with pytest.raises(InputError, match="narrows is nan"):
         SequentialConfig(narrows=np.nan)
-
-
-def test_around_draws_the_prior_holds_the_posterior_and_is_the_prior_there() -> None:
-    posterior, rng = given(), np.random.default_rng(0)
-    around = Around(posterior, SequentialConfig(samples=1000, wider=1), rng)
-    psi = around.sample(3000, np.random.default_rng(1))
-    brute = box(3).psi_of(np.random.default_rng(2).uniform(size=(200_000, 3)))
-    inside = brute[around.gain(box(3).to_z(brute)) > around.threshold]
-    assert around.rejects
-    assert around.kept == pytest.approx(len(inside) / 200_000, rel=0.05)
-    assert around.kept < 0.7
-    u, v = box(3).u_of(psi), box(3).u_of(inside)
-    np.testing.assert_allclose(u.mean(0), v.mean(0), atol=0.02)
-    np.testing.assert_allclose(u.std(0), v.std(0), atol=0.02)
-    truths = gaussian(X[0]).sample((4000,)).double().numpy()
-    assert (around.gain(truths) > around.threshold).mean() > 0.999
-    # the posterior is normal: where densities put the edge, `SLACK` aside
-    often = SequentialConfig(samples=2000, quantile=0.05)  # the farthest draw of all differs from time to time
-    exact, normal = (way(posterior, often, np.random.default_rng(0)) for way in (TruncatedPrior, Around))
-    assert normal.threshold == pytest.approx(exact.threshold - SLACK, abs=0.2)
-
-
-def test_a_region_too_small_to_be_met_by_chance_is_filled_all_the_same() -> None:
-    middle, sd = np.array([1.0, -0.5, 0.2]), 1e-3
-
-    class Narrow:
-        prior = box(3)
-
-        def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
-            return Fidelity(box(3).from_z(middle + sd * rng.standard_normal((n, 3))))
-
-    around = Around(Narrow(), SequentialConfig(samples=4000), np.random.default_rng(0))
-    assert not around.rejects
-    # the density over the prior's at a distance of r standard deviations is that of a ball's edge
-    highest = around.gain(middle[None])[0]
-    radius = sd * np.sqrt(2 * (highest - around.threshold))
-    assert around.kept == pytest.approx(4 / 3 * np.pi * radius**3 * np.prod(norm.pdf(middle)), rel=0.15)
-    z = box(3).to_z(around.sample(3000, np.random.default_rng(1)))
-    away = np.linalg.norm(z - middle, axis=1) / radius
-    assert away.max() < 1.1
-    assert kstest(away**3, "uniform").statistic < 0.06  # in the ball, where the prior is flat

@@ -108,41 +108,30 @@ class Signals(nn.Module):
     Args:
       states: s.
       actions: a.
-      aligned: H, where all windows have the same commands and each time is standardised by itself: what is left is in
-        what they differ. 0 standardises over all times together.
     """
 
-    def __init__(self, states: int, actions: int, aligned: int = 0) -> None:
+    def __init__(self, states: int, actions: int) -> None:
         super().__init__()
-        self.channels, self.aligned, self.length = 2 * states + actions, aligned > 0, aligned
-        times = {"s": aligned + 1, "ds": aligned, "a": aligned} if aligned else {"s": 1, "ds": 1, "a": 1}
+        self.channels = 2 * states + actions
         sizes = {"s": states, "ds": states, "a": actions}
-        self.scales = nn.ModuleDict({name: Standard(times[name] * size) for name, size in sizes.items()})
+        self.scales = nn.ModuleDict({name: Standard(size) for name, size in sizes.items()})
 
     def fit(self, states: Tensor, actions: Tensor) -> None:
         """Take scales from windows of the training set."""
         parts = {"s": states, "ds": states.diff(dim=1), "a": actions}
         for name, x in parts.items():
             if x.numel():
-                cast(Standard, self.scales[name]).fit(x.flatten(1) if self.aligned else x)
+                cast(Standard, self.scales[name]).fit(x)
 
     def forward(self, states: Tensor, actions: Tensor) -> Tensor:
         """(B, H+1, channels)."""
-        steps = nn.functional.pad(self._scaled("ds", states.diff(dim=1)), (0, 0, 1, 0))
-        actions = nn.functional.pad(self._scaled("a", actions), (0, 0, 0, 1))
-        return torch.cat([self._scaled("s", states), steps, actions], -1).clamp(-SEEN, SEEN)
+        steps = nn.functional.pad(self.scales["ds"](states.diff(dim=1)), (0, 0, 1, 0))
+        actions = nn.functional.pad(self.scales["a"](actions), (0, 0, 0, 1))
+        return torch.cat([self.scales["s"](states), steps, actions], -1).clamp(-SEEN, SEEN)
 
     def far(self, states: Tensor) -> Tensor:
         """(s,) spreads that the median of each state of one window (H+1, s) lies from the training set's mean."""
-        return self._scaled("s", states[None])[0].median(0).values.abs()
-
-    @property
-    def commands(self) -> Tensor:
-        """(H, a) that all windows had, where they are aligned."""
-        return cast(Standard, self.scales["a"]).mean.view(self.length, -1)
-
-    def _scaled(self, name: str, x: Tensor) -> Tensor:
-        return self.scales[name](x.flatten(1)).view(x.shape) if self.aligned else self.scales[name](x)
+        return self.scales["s"](states).median(0).values.abs()
 
 
 class SignalEncoder(Encoder):
@@ -152,12 +141,11 @@ class SignalEncoder(Encoder):
       horizon: H.
       states: s.
       actions: a.
-      aligned: whether all windows have the same commands, see `Signals`.
     """
 
-    def __init__(self, horizon: int, states: int, actions: int, aligned: bool = False) -> None:
+    def __init__(self, horizon: int, states: int, actions: int) -> None:
         super().__init__()
-        self.signals = Signals(states, actions, horizon if aligned else 0)
+        self.signals = Signals(states, actions)
         self.channels = self.signals.channels
         self.length = horizon + 1
 

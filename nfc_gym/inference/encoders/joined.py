@@ -24,7 +24,6 @@ class Joined(Encoder):
       states: s.
       actions: a.
       width: of the layers of `nn`.
-      aligned: whether all windows have the same commands, see `Signals`.
       summaries: with physics summaries.
       regressions: theirs.
       elevation: with a map.
@@ -34,8 +33,8 @@ class Joined(Encoder):
     """
 
     def __init__(
-        self, name: str, horizon: int, states: int, actions: int, *, width: int = 1024, aligned: bool = False,
-        summaries: bool = False, regressions: Regressions | None = None, elevation: bool = False,
+        self, name: str, horizon: int, states: int, actions: int, *, width: int = 1024, summaries: bool = False,
+        regressions: Regressions | None = None, elevation: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if name not in (*ENCODERS, "none"):
@@ -44,9 +43,9 @@ class Joined(Encoder):
             raise InputError(f"the encoder {name!r} sees no map; those that do: tcn, nn")
         parts: list[Encoder] = []
         if name == "nn":
-            parts.append(MLP(horizon, states, actions, aligned, width))
+            parts.append(MLP(horizon, states, actions, width))
         elif name != "none":
-            parts.append(ENCODERS[name](horizon, states, actions, aligned))
+            parts.append(ENCODERS[name](horizon, states, actions))
         parts += [Summaries(horizon, states, actions, regressions)] if summaries else []
         parts += [ResNet18()] if elevation else []
         if name == "none" and not summaries:

@@ -36,15 +36,14 @@ class KernelFeatures(SignalEncoder):
       horizon: H.
       states: s.
       actions: a.
-      aligned: whether all windows have the same commands.
     """
 
     features = FEATURES
     directions: Tensor
     width: Tensor
 
-    def __init__(self, horizon: int, states: int, actions: int, aligned: bool = False) -> None:
-        super().__init__(horizon, states, actions, aligned)
+    def __init__(self, horizon: int, states: int, actions: int) -> None:
+        super().__init__(horizon, states, actions)
         self.size = self.length * self.channels
         self.register_buffer("directions", self.spread_directions().float())
         self.register_buffer("width", torch.tensor(math.sqrt(self.size)))
@@ -93,8 +92,8 @@ class FKS(KernelFeatures):
 
     radii: Tensor
 
-    def __init__(self, horizon: int, states: int, actions: int, aligned: bool = False) -> None:
-        super().__init__(horizon, states, actions, aligned)
+    def __init__(self, horizon: int, states: int, actions: int) -> None:
+        super().__init__(horizon, states, actions)
         self.register_buffer("radii", torch.as_tensor(chi_quantiles(self.size, _NODES), dtype=torch.float32))
 
     def spread_directions(self) -> Tensor:

@@ -12,12 +12,11 @@ class MLP(SignalEncoder):
       horizon: H.
       states: s.
       actions: a.
-      aligned: whether all windows have the same commands.
       width: of the layers, and the number of features.
     """
 
-    def __init__(self, horizon: int, states: int, actions: int, aligned: bool = False, width: int = 1024) -> None:
-        super().__init__(horizon, states, actions, aligned)
+    def __init__(self, horizon: int, states: int, actions: int, width: int = 1024) -> None:
+        super().__init__(horizon, states, actions)
         self.features = width
         self.layers = nn.Sequential(
             nn.Linear(self.length * self.channels, width), nn.GELU(), nn.Linear(width, width), nn.GELU()

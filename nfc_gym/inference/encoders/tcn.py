@@ -78,12 +78,11 @@ class TCN(SignalEncoder):
       horizon: H.
       states: s.
       actions: a.
-      aligned: whether all windows have the same commands.
       width: of the kernels.
     """
 
-    def __init__(self, horizon: int, states: int, actions: int, aligned: bool = False, width: int = 3) -> None:
-        super().__init__(horizon, states, actions, aligned)
+    def __init__(self, horizon: int, states: int, actions: int, width: int = 3) -> None:
+        super().__init__(horizon, states, actions)
         sizes = (CHANNELS[0], *CHANNELS)
         self.first = nn.Conv1d(self.channels, CHANNELS[0], 1)
         self.blocks = nn.Sequential(

@@ -54,14 +54,6 @@ class Density(nn.Module):
         What is learned from few windows is too sure of itself; how much so, windows that were held out tell.
         """
 
-    def middle(self, features: Tensor) -> Tensor:
-        """(B, width) a point of the first block amid its density, where that `widens`."""
-        raise NotImplementedError
-
-    def widen(self, by: float) -> None:
-        """Make the first block's density wider about its `middle`, where that `widens`."""
-        raise NotImplementedError
-
 
 class Explicit(Density):
     """A density that is evaluated in one pass, and so trained on its log-likelihood."""
@@ -107,14 +99,6 @@ class Chain(Explicit):
         for link, size in zip(self.links, self.sizes, strict=True):
             cast(Density, link).calibrate(x[:, at : at + size], torch.cat([features, x[:, :at]], 1))
             at += size
-
-    def middle(self, features: Tensor) -> Tensor:
-        """See `Density`."""
-        return cast(Density, self.links[0]).middle(features)
-
-    def widen(self, by: float) -> None:
-        """See `Density`."""
-        cast(Density, self.links[0]).widen(by)
 
     def sample(self, n: int, features: Tensor, blocks: int | None = None) -> Tensor:
         """See `Density`."""

@@ -40,17 +40,6 @@ class Flow(Explicit):
         latent = self.flow(self.context(features)).transform(x)
         cast(Tensor, self.flow.base.scale).copy_(latent.square().mean().sqrt())
 
-    @torch.no_grad()
-    def middle(self, features: Tensor) -> Tensor:
-        """See `Density`: where the flow takes the middle of the normal that it begins at."""
-        zero = features.new_zeros(len(features), self.sizes[0])
-        return self.flow(self.context(features)).transform.inv(zero)
-
-    @torch.no_grad()
-    def widen(self, by: float) -> None:
-        """See `Density`."""
-        cast(Tensor, self.flow.base.scale).mul_(by)
-
     def sample(self, n: int, features: Tensor, blocks: int | None = None) -> Tensor:
         """See `Density`."""
         return self.flow(self.context(features)).sample((n,)).transpose(0, 1)
