@@ -264,8 +264,9 @@ def _arguments() -> argparse.Namespace:
         "--round", type=count(1), default=10_000, help="simulations a sequential round (default %(default)s)"
     )
     parser.add_argument(
-        "--ways", nargs="+", choices=list(WAYS), default=["on"], help="in which second rounds train (default on)"
-    )
+        "--ways", nargs="+", choices=list(WAYS), default=["on"],
+        help="in which second rounds train, or refined, simulations of the window's own commands instead (default on)",
+    )  # fmt: skip
     parser.add_argument(
         "--few",
         type=count(1),

@@ -17,17 +17,17 @@ from nfc_gym.inference.config import Sizes
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.network import Network
+from nfc_gym.inference.normal import NormalPosterior
 from nfc_gym.inference.posterior import NeuralPosterior, Window
-from nfc_gym.inference.proposals import Around, Believed, SequentialConfig
+from nfc_gym.inference.proposals import Believed, SequentialConfig
 from nfc_gym.inference.random import mixed
-from nfc_gym.inference.refine import refine
-from nfc_gym.inference.sequential import Rounds, sequential
+from nfc_gym.inference.sequential import sequential
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
 from nfc_gym.simulate import Simulator, starts
 from nfc_gym.simulate.ceiling import ceiling
 from nfc_gym.simulate.machine import Machine
-from nfc_gym.simulate.repeated import Repeated
+from nfc_gym.simulate.refined import refined
 from posteriors import metrics
 from posteriors.fitted import Ours
 from posteriors.methods import METHODS, OURS, network_config
@@ -36,11 +36,11 @@ FIRST, ONE = "first", "one"  # networks of the first round, and of one round of 
 HELD_OUT = 0.1  # of each round's windows
 SAMPLES = 2000  # of a posterior, for its intervals
 GROUND = ("terrain_kind", "terrain_seed", "terrain_difficulty")
-# How a second round trains: see `SequentialConfig`; with its own commands, see `refine`.
-OWN, TWICE = "own", "own twice"  # in one round, or in two of half the size, the second where the first has mass
+REFINED = "refined"  # in place of a second round that trains, `simulate.refined`
+# How a second round trains: see `SequentialConfig`.
 WAYS = {
     "on": {}, "anew": {"anew": True}, "posterior": {"proposal": "posterior"},
-    "anew posterior": {"anew": True, "proposal": "posterior"}, OWN: {}, TWICE: {"anew": True},
+    "anew posterior": {"anew": True, "proposal": "posterior"}, REFINED: {},
 }  # fmt: skip
 AXLE = "front_left_wheel_damping"  # the gain kv of its servo: 0 is a lost axle
 
@@ -96,12 +96,14 @@ def rounds(
 ) -> dict[str, Any]:  # fmt: skip
     """One truth: two rounds of `size` simulations against one of twice as many; gain of the true psi, nats a parameter.
 
+    `REFINED` begins with the first round too, and then simulates the window's own commands `size` times at most.
+
     Args:
       env: id.
       truth: its seed.
       size: simulations a round.
       training: of the second round.
-      ways: of WAYS, in which it trains, each from the same simulations.
+      ways: of WAYS, in which it trains, each after the same first round.
       jobs: processes of the simulation.
       device: to train on.
       folder: what `before` wrote.
@@ -115,35 +117,32 @@ def rounds(
     seen = replace(simulate, names=("states", "actions", "start", *GROUND))(psi, rng)
     window = Window(seen["states"][0].numpy(), seen["actions"][0].numpy())
 
-    def gain(given: Believed) -> float:
+    def gain(given: Believed | NormalPosterior) -> float:
         return float(given.log_prob(Fidelity(psi))[0] + prior.log_volume) / prior.size
 
     alone, once = gain(NeuralPosterior(one).given(window)), gain(NeuralPosterior(first).given(window))
     out: dict[str, Any] = {"one": alone, "first": once}
     for way in ways:
+        if way == REFINED:
+            own = refined(
+                NeuralPosterior(first), window, environment=env, simulations=size, seed=mixed(truth, 2), jobs=jobs
+            )
+            out |= {way: gain(own)} | {f"{k} ({way})": v for k, v in _held(own, psi, rng).items()}
+            continue
         how = SequentialConfig(2, size, narrows=-np.inf, held_out=HELD_OUT, seed=mixed(truth, 2), **WAYS[way])
-        if way in (OWN, TWICE):
-            again = Repeated.of(simulate, window.states, window.actions, {k: t.numpy() for k, t in known.items()})
-            how = replace(how, rounds=1) if way == OWN else replace(how, simulations=size // 2)
-            begin = NeuralPosterior(deepcopy(first))
-            two = refine(begin, window, again, how, training, device=device)
-            region = Around(begin.given(window), how, np.random.default_rng([how.seed, 1]))  # as `refine` makes it
-            out["inside"] = float(region.gain(prior.to_z(psi))[0] > region.threshold)
-            out |= {f"{k} ({way})": v for k, v in _held(two, prior, psi, rng).items()}
-        else:
-            two = sequential(deepcopy(first), simulate, window, how, training, begun=begun, device=device, scales=False)
+        two = sequential(deepcopy(first), simulate, window, how, training, begun=begun, device=device, scales=False)
         out |= {way: gain(two.posterior), f"kept ({way})": two.kept[-1]}
-    if OWN in ways or TWICE in ways:
+    if REFINED in ways:
         asked = {k: t.numpy() for k, t in seen.items()} | {"psi": prior.u_of(psi)}
         most = ceiling(env, asked, before=starts.spread(Machine(env), {"start": known["start"].numpy()}))
         out["ceiling"] = float(most.joint[0]) / prior.size
     return out
 
 
-def _held(two: Rounds, prior: PriorBox, psi: NDArray[np.float64], rng: np.random.Generator) -> dict[str, float]:
-    """Share of the true parameters that the 90 % intervals hold, and their mean width."""
-    low, high = metrics.intervals(prior.u_of(two.posterior.sample(SAMPLES, rng).psi)[None], 0.9)
-    u = prior.u_of(psi)
+def _held(own: NormalPosterior, psi: NDArray[np.float64], rng: np.random.Generator) -> dict[str, float]:
+    """Share of the true parameters psi (1, d) that a posterior's 90 % intervals hold, and their mean width."""
+    low, high = metrics.intervals(own.prior.u_of(np.asarray(own.sample(SAMPLES, rng).psi))[None], 0.9)
+    u = own.prior.u_of(psi)
     return {"held": float(((low <= u) & (u <= high)).mean()), "width": float((high - low).mean())}
 
 
@@ -157,11 +156,11 @@ def summed(found: list[dict[str, Any]]) -> dict[str, Any]:
     }
     for way in (w for w in WAYS if w in found[0]):
         two = np.array([f[way] for f in found])
-        out |= {f"two rounds, trained {way}": metrics.mean(two), f"... less one ({way})": metrics.mean(two - one)}
+        title = "the first round, refined" if way == REFINED else f"two rounds, trained {way}"
+        out |= {title: metrics.mean(two), f"... less one ({way})": metrics.mean(two - one)}
         for name, said in {"held": "90 % interval holds the truth", "width": "its width over the prior's"}.items():
             if (key := f"{name} ({way})") in found[0]:
                 out[f"... {said} ({way})"] = metrics.mean(np.array([f[key] for f in found]))
     if "ceiling" in found[0]:
         out["what these windows tell at most, gain a parameter"] = metrics.mean(np.array([f["ceiling"] for f in found]))
-        out["the second round's region holds the truth"] = metrics.mean(np.array([f["inside"] for f in found]))
     return out

@@ -3,10 +3,12 @@
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 torch = pytest.importorskip("torch", reason="the posteriors that are judged are nfc_gym.inference's")
 
@@ -190,6 +192,53 @@ def test_noise_is_drawn_anew_with_each_pass_and_the_same_for_a_seed() -> None:
     assert float(first[..., 0].std()) == pytest.approx(0.5, rel=0.2)
     train, judge = held.split(0.25)
     assert (len(train), len(judge)) == (30, 10)
+
+
+def test_refined_windows_are_judged_beside_the_first_round(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a posterior that is known: N(0, 0.5^2) in each parameter's probit coordinate."""
+    from posteriors import cases
+    from posteriors.sets import environment, prior_of
+
+    from nfc_gym.inference.config import NetworkConfig
+    from nfc_gym.inference.normal import NormalPosterior
+    from nfc_gym.inference.posterior import NeuralPosterior, Window
+    from nfc_gym.inference.random import mixed
+    from nfc_gym.inference.train import TrainConfig
+
+    env, training, device = environment("Jackal", "Flat"), TrainConfig(epochs=1, batch=32), torch.device("cpu")
+    prior, asked, truth = prior_of(env), dict[str, Any](), list[np.ndarray]()
+
+    def refined(posterior: NeuralPosterior, window: Window, **how: object) -> NormalPosterior:
+        posterior.given(window)  # or it is refused
+        asked.update(how)
+        return NormalPosterior(prior, np.zeros(17), 0.25 * np.eye(17))
+
+    def ceiling(env: str, window: dict[str, np.ndarray], **how: object) -> SimpleNamespace:
+        truth.append(ndtri(window["psi"][0]))
+        return SimpleNamespace(joint=np.array([34.0]))
+
+    quick = NetworkConfig("nn", "mixture", width=16, features=16, hidden=16, components=1)
+    monkeypatch.setattr(cases, "network_config", lambda *_: quick)
+    monkeypatch.setattr(cases, "refined", refined)
+    monkeypatch.setattr(cases, "ceiling", ceiling)
+    cases.before(env, prior, 40, training, True, 1, device, tmp_path)
+    found = [cases.rounds(env, k, 40, training, ["refined"], 1, device, tmp_path) for k in (3, 4)]
+    assert {k: asked[k] for k in ("environment", "simulations", "seed", "jobs")} == {
+        "environment": env, "simulations": 40, "seed": mixed(4, 2), "jobs": 1,
+    }  # fmt: skip
+    for one, z in zip(found, truth, strict=True):
+        assert one["refined"] == pytest.approx(-math.log(0.5) - ((z / 0.5) ** 2 - z**2).mean() / 2, abs=1e-6)
+        assert one["ceiling"] == 2
+        edge = 1.645 * 0.5
+        sure = np.abs(np.abs(z) - edge) > 0.1  # ends of intervals are those of draws
+        low, high = ((np.abs(z) < edge) & sure).mean(), ((np.abs(z) < edge) | ~sure).mean()
+        assert low <= one["held (refined)"] <= high
+        assert one["width (refined)"] == pytest.approx(2 * ndtr(edge) - 1, abs=0.02)
+        assert set(one) == {"one", "first", "refined", "held (refined)", "width (refined)", "ceiling"}
+    told = cases.summed(found)
+    assert told["the first round, refined"].value == pytest.approx(np.mean([f["refined"] for f in found]))
+    assert told["... less one (refined)"].value == pytest.approx(np.mean([f["refined"] - f["one"] for f in found]))
+    assert told["what these windows tell at most, gain a parameter"].value == 2
 
 
 @pytest.mark.parametrize("method", ["sde-nn", "mdn-rff"])
