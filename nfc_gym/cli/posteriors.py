@@ -100,17 +100,18 @@ def belief_of(file: Path, environment: str, option: str) -> Sampler:
     source = load_source(file)
     if file.suffix.lower() != ".safetensors":
         return source
+    from nfc_gym.inference.normal import NormalPosterior
     from nfc_gym.inference.posterior import NeuralPosterior
     from nfc_gym.simulate.machine import Machine
 
-    if isinstance(source, NeuralPosterior):
+    if isinstance(source, NeuralPosterior | NormalPosterior):
         machine, robot = Machine(environment), source.prior.robot
         if robot != machine.kind.name:
             raise InputError(
                 f"{option} {file}: a posterior of the robot {robot!r}, and {machine.environment} is of "
                 f"{machine.kind.name!r}: choose one of that robot"
             )
-        if source.kept is None:
+        if isinstance(source, NeuralPosterior) and source.kept is None:
             raise InputError(
                 f"{option} {file}: this posterior was given no window: give what "
                 f"`nfc-gym infer {file} window.npz --out given.safetensors` writes"
@@ -236,7 +237,12 @@ def _told(posterior: Path) -> str:
 
 def infer(
     ctx: typer.Context,
-    posterior: Annotated[Path, typer.Argument(metavar="FILE.safetensors", help="What `nfc-gym train` wrote.")],
+    posterior: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE.safetensors|ID", help="What `nfc-gym train` wrote; with --refine an environment will do."
+        ),
+    ],
     window: Annotated[
         Path,
         typer.Argument(
@@ -253,10 +259,9 @@ def infer(
     until: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where the window ends in that log.")] = None,
     refine: Annotated[
         int | None,
-        typer.Option(min=500, metavar="N", help="Learn anew from N simulations of these commands: sharper, minutes."),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option(help="For --refine: auto, cpu or cuda; default auto, a GPU where there is one.")
+        typer.Option(
+            min=1, metavar="N", help="Ask the simulator: N simulations of these commands at most, 10000 are plenty."
+        ),
     ] = None,
     jobs: Annotated[
         int | None, typer.Option(min=0, help="For --refine: processes that simulate; default 0, all cores.")
@@ -272,33 +277,35 @@ def infer(
     A mapping file (or the folder that RecordLog wrote) names logs instead; what the robot would have observed is then
     made of their channels, for robots that feel no forces: Jackal, Quadcopter, Quadruped.
 
-    A posterior of any window reads each a little coarsely. --refine N simulates N windows of this window's own commands
-    and learns from these alone, on a plane, of psi alone.
+    A posterior of any window reads each a little coarsely. --refine N simulates this window's own commands again and
+    again, in rounds that close in on the psi which do what was observed: far sharper, in half a minute, on a plane, of
+    psi alone. It needs no trained posterior: give the environment's id, and it begins with the prior.
 
     Either kind of --out goes into RandomizePsi, into `nfc-gym simulate --proposal` and into `nfc-gym close-loop
     --posterior`.
 
-    Example: nfc-gym infer jackal.safetensors window.npz --out psi.npz
+    Examples: nfc-gym infer jackal.safetensors window.npz --out psi.npz, nfc-gym infer JackalFlat window.npz --refine
+    10000 --out today.safetensors
     """
     with outcome(ctx):
         mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
         _require_used(mapped, f"of a mapping's logs, and {window} is no mapping file", log=log, until=until)
-        _require_used(refine is not None, "for --refine: give --refine N too", device=device, jobs=jobs)
+        _require_used(refine is not None, "for --refine: give --refine N too", jobs=jobs)
         inference = learning()
         from nfc_gym.inference.progress import Spoken
 
-        seen = _window(posterior, window, log, until) if mapped else window
-
+        trained = refine is None or posterior.suffix.lower() == ".safetensors"
+        environment = _environment(posterior) if trained and mapped else "" if trained else str(posterior)
+        seen = _window(environment, window, log, until) if mapped else window
         anew, report = None, Spoken()
         if refine is not None:
             from nfc_gym.simulate.refined import refined
 
             anew = partial(
-                refined, simulations=refine, seed=seed, jobs=jobs or 0, device=inference.device_of(device or "auto"),
-                report=report,
-            )  # fmt: skip
+                refined, environment=environment, simulations=refine, seed=seed, jobs=jobs or 0, report=report
+            )
         drawn, found = inference.infer(
-            posterior, seen, samples=samples, seed=seed, out=out, refined=anew, report=report
+            posterior if trained else None, seen, samples=samples, seed=seed, out=out, refined=anew, report=report
         )
         _print_table(found, inference.AS_WIDE)
         if out is not None and out.suffix == ".npz":
@@ -333,18 +340,24 @@ def _require_used(used: bool, what: str, **options: object) -> None:
             raise InputError(f"{option}{'' if isinstance(value, bool) else f' {value}'} is {what}, or leave it out")
 
 
-def _window(posterior: Path, mapping: Path, log: str | None, until: float | None) -> "Window":
-    """The window of motion that a posterior wants, from a log of a mapping."""
+def _environment(posterior: Path) -> str:
+    """Of which a posterior is."""
     from nfc_gym.inference.checkpoint import load as read
+
+    found = read(posterior)[2].get("environment")
+    if found is None:
+        raise InputError(f"{posterior}: does not say of which environment it is: give the window as an .npz")
+    return str(found)
+
+
+def _window(environment: str, mapping: Path, log: str | None, until: float | None) -> "Window":
+    """The window of motion of a robot, from a log of a mapping."""
     from nfc_gym.inference.posterior import Window
     from nfc_gym.measured.dataset import load
     from nfc_gym.measured.states import estimate_states
     from nfc_gym.simulate.machine import Machine
     from nfc_gym.simulate.observed import commands, observed
 
-    environment = read(posterior)[2].get("environment")
-    if environment is None:
-        raise InputError(f"{posterior}: does not say of which environment it is: give the window as an .npz")
     logs = {each.name: each for each in load(mapping / "mapping.yaml" if mapping.is_dir() else mapping).logs}
     if log is not None and log not in logs:
         raise InputError(f"{mapping}: no log {log!r}; there are: {', '.join(logs)}")

@@ -22,6 +22,7 @@ _FOLDERS = (WINDOWS, ADAPTED, LEARNED, REPORT, DEMO, _RUN)
 # The `format` in a safetensors file's metadata, without its version.
 _FORMATS = {
     "nfc_gym-posterior": POSTERIOR,
+    "nfc_gym-normal": POSTERIOR,
     "nfc_gym-detector": DETECTOR,
     "nfc_gym-policy": POLICY,
     "nfc_gym-training": TRAINING,

@@ -17,6 +17,8 @@ from nfc_gym.inference.config import Sizes
 from nfc_gym.inference.contrast import Contrast, ContrastConfig
 from nfc_gym.inference.detector import WindowDetector
 from nfc_gym.inference.faults import FaultClassifier, FaultConfig
+from nfc_gym.inference.normal import FORMAT as NORMAL
+from nfc_gym.inference.normal import NormalPosterior
 from nfc_gym.inference.rates import Threshold
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.state import read, require_format
@@ -86,4 +88,7 @@ def load(path: str | os.PathLike[str], prior: PriorBox | None = None) -> WindowD
 
 def opened(path: Path) -> Any:
     """What a `.safetensors` file holds: a detector, or a posterior."""
-    return load(path) if read(path)[1].get("format") == FORMAT else posterior.load(path)
+    tensors, metadata = read(path)
+    if metadata.get("format") == NORMAL:
+        return NormalPosterior.of_file(path, tensors, metadata)
+    return load(path) if metadata.get("format") == FORMAT else posterior.load(path)

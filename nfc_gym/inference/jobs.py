@@ -21,6 +21,7 @@ from nfc_gym.inference.encoders.base import SEEN
 from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.gains import gains
 from nfc_gym.inference.network import Network
+from nfc_gym.inference.normal import NormalPosterior
 from nfc_gym.inference.posterior import NeuralPosterior, Window, load
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.reflection import Reflection
@@ -194,20 +195,23 @@ class Told(NamedTuple):
     width: float
 
 
+Refined = Callable[[NeuralPosterior | None, Window], NormalPosterior]
+
+
 def infer(
-    posterior: Path, window: Path | Window, *, samples: int = 1000, seed: int = 0, out: Path | None = None,
-    refined: Callable[[NeuralPosterior, Window], NeuralPosterior] | None = None, report: Report = quiet,
+    posterior: Path | None, window: Path | Window, *, samples: int = 1000, seed: int = 0, out: Path | None = None,
+    refined: Refined | None = None, report: Report = quiet,
 ) -> tuple[Fidelity, list[Told]]:  # fmt: skip
     """Draw from a posterior given a window.
 
     Args:
-      posterior: what `train_posterior` wrote.
+      posterior: what `train_posterior` wrote; None where `refined` needs none.
       window: see `read_window`; or the window itself.
       samples: how many.
       seed: of the draws.
       out: `.npz` for the draws (`psi`, and `delta_s` where it is inferred), or `.safetensors` for the posterior given
         this window; wrappers and `nfc-gym simulate --proposal` take either.
-      refined: makes of the posterior one given the window, `simulate.refined`; None gives it the window.
+      refined: makes a posterior given the window, `simulate.refined`; None gives the window to the one there is.
       report: is told where the window is unlike all that the posterior was trained on.
 
     Raises:
@@ -219,16 +223,18 @@ def infer(
     if out is not None:
         kinds.require_kind(out, kinds.DRAWS if out.suffix == ".npz" else kinds.POSTERIOR)
         require_writable(out.absolute().parent)
-    if posterior.is_file() and kinds.kind_of(posterior) == kinds.STRUCTURE:
+    if posterior is not None and posterior.is_file() and kinds.kind_of(posterior) == kinds.STRUCTURE:
         raise InputError(
             f"{posterior} is a structure head, which knows families of effects and no psi: give it to `nfc-gym "
             "close-loop --posterior`, and a posterior here"
         )
-    found, seen = load(posterior), window if isinstance(window, Window) else read_window(window)
-    seen = _as_trained(found, seen, "window" if isinstance(window, Window) else str(window))
-    _say_unlike(found, seen, report)
-    given = found.given(seen) if refined is None else refined(found, seen)
-    parts = [p for p in given.network.parts if p != "delta_e"]
+    found = None if posterior is None else load(posterior)
+    seen, name = (window, "window") if isinstance(window, Window) else (read_window(window), str(window))
+    if found is not None:
+        seen = _as_trained(found, seen, name)
+        _say_unlike(found, seen, report)
+    given = _given(found, seen, refined)
+    parts = [p for p in given.parts if p != "delta_e"]
     drawn = given.of(*parts).sample(samples, np.random.default_rng(seed))
     if out is not None and out.suffix == ".safetensors":
         given.save(out)
@@ -237,6 +243,14 @@ def infer(
         with replacing(out) as part, part.open("wb") as file:
             np.savez(file, **{p: getattr(drawn, p) for p in parts})
     return drawn, told(given.prior, np.asarray(drawn.psi))
+
+
+def _given(found: NeuralPosterior | None, seen: Window, refined: Refined | None) -> NeuralPosterior | NormalPosterior:
+    if refined is not None:
+        return refined(found, seen)
+    if found is None:
+        raise InputError("infer: want a posterior, or to refine from none")
+    return found.given(seen)
 
 
 def _as_trained(posterior: NeuralPosterior, window: Window, name: str) -> Window:
@@ -253,7 +267,17 @@ def _as_trained(posterior: NeuralPosterior, window: Window, name: str) -> Window
     except InputError as e:
         raise InputError(f"{name}: {str(e).removeprefix('window: ')}") from None
     actions = np.asarray(window.actions, float)
-    first = len(actions) - posterior.network.sizes.horizon
+    require_commands(actions, posterior.network.sizes.horizon, name)
+    return replace(window, actions=np.clip(actions, -1, 1))
+
+
+def require_commands(actions: Array, horizon: int, name: str) -> None:
+    """Refuse actions (n, a) of which one of the last `horizon` is far outside [-1, 1].
+
+    Raises:
+      InputError: naming the first of them.
+    """
+    first = max(0, len(actions) - horizon)
     far = np.argwhere(np.abs(actions[first:]) > _FARTHEST)
     if len(far):
         k, i = far[0]
@@ -261,7 +285,6 @@ def _as_trained(posterior: NeuralPosterior, window: Window, name: str) -> Window
             f"{name}: actions are what env.step takes, in [-1, 1]; actions[{first + k}, {i}] is "
             f"{actions[first + k, i]:g}: raw commands, or other units?"
         )
-    return replace(window, actions=np.clip(actions, -1, 1))
 
 
 def _say_unlike(posterior: NeuralPosterior, window: Window, report: Report) -> None:

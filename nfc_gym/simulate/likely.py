@@ -91,10 +91,10 @@ def _known(machine: Machine, start: Array) -> tuple[Array, Array]:
     model = machine.model
     data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION
     out, above = np.empty((len(start), model.nv - 2 + model.nv + model.na)), np.empty(len(start))
-    touching, floor = _touching(model)
+    geoms, floor = touching(model)
     for i, state in enumerate(np.ascontiguousarray(start)):
         mujoco.mj_setState(model, data, state, kind)
-        above[i] = _lowest(model, data, touching, floor)
+        above[i] = lowest(model, data, geoms, floor)
         quat = data.qpos[3:7]
         tilt = quat_multiply(_turn(-yaw_of(quat)), quat)
         speed = rotate_back(quat, data.qvel[:3])
@@ -110,16 +110,16 @@ def _placed(machine: Machine, own: Array, yaw: Array, place: Array, above: Array
     moving = own[:, joints + hinges :].copy()
     moving[:, :3] = rotate(quat, moving[:, :3])
     out = np.concatenate([place, own[:, :1], quat, own[:, joints : joints + hinges], moving], 1)
-    data, (touching, floor) = mujoco.MjData(model), _touching(model)
+    data, (geoms, floor) = mujoco.MjData(model), touching(model)
     for row, wanted in zip(out, above, strict=True):
         data.qpos[:] = row[: model.nq]
-        is_at = _lowest(model, data, touching, floor)
+        is_at = lowest(model, data, geoms, floor)
         if wanted < _TOUCHES or is_at < 0:
             row[2] += wanted - is_at
     return out
 
 
-def _touching(model: mujoco.MjModel) -> tuple[list[int], int]:
+def touching(model: mujoco.MjModel) -> tuple[list[int], int]:
     """Geoms that the plane stops, and the plane."""
     floor = int(np.flatnonzero(model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))[0])
     with_floor = (model.geom_contype & model.geom_conaffinity[floor]) | (
@@ -128,10 +128,10 @@ def _touching(model: mujoco.MjModel) -> tuple[list[int], int]:
     return [int(g) for g in np.flatnonzero(with_floor) if g != floor], floor
 
 
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, touching: list[int], floor: int) -> float:
+def lowest(model: mujoco.MjModel, data: mujoco.MjData, geoms: list[int], floor: int) -> float:
     """m between the plane and the lowest of some geoms."""
     mujoco.mj_kinematics(model, data)
-    return min(mujoco.mj_geomDistance(model, data, floor, g, 10.0, None) for g in touching)
+    return min(mujoco.mj_geomDistance(model, data, floor, g, 10.0, None) for g in geoms)
 
 
 def _turn(yaw: Array) -> Array:

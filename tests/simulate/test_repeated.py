@@ -5,11 +5,14 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from nfc_gym.core import InputError
+from nfc_gym.inference.space import PriorBox
 from nfc_gym.simulate import Repeated, Simulator
-from nfc_gym.simulate.likely import LEAST, Likely, _lowest, _touching
+from nfc_gym.simulate.likely import LEAST, Likely, lowest, touching
 from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.opening import Opening
 
 pytest.importorskip("torch")
 
@@ -61,62 +64,89 @@ def test_starts_surround_the_true_one(case: tuple[Machine, Simulator, dict[str, 
     assert (drawn[:, moving].std(0) < 0.9 * before.std(0)).mean() > 0.5
 
 
+def above(machine: Machine, rows: np.ndarray) -> np.ndarray:
+    """(n,) m between starts' lowest geoms and the plane."""
+    data, (geoms, floor) = mujoco.MjData(machine.model), touching(machine.model)
+    out = []
+    for row in rows:
+        data.qpos[:] = row[: machine.model.nq]
+        out.append(lowest(machine.model, data, geoms, floor))
+    return np.array(out)
+
+
 def test_starts_stand_on_the_ground_as_those_did_that_are_known(
     case: tuple[Machine, Simulator, dict[str, np.ndarray]],
 ) -> None:
     machine, _, windows = case
     known, asked = split(windows)
-    data, (touching, floor) = mujoco.MjData(machine.model), _touching(machine.model)
-
-    def above(rows: np.ndarray) -> np.ndarray:
-        out = []
-        for row in rows:
-            data.qpos[:] = row[: machine.model.nq]
-            out.append(_lowest(machine.model, data, touching, floor))
-        return np.array(out)
-
-    found = above(
-        Likely(machine, known, asked["states"][0]).draw(known["psi"][:100].astype(float), np.random.default_rng(1))
-    )
-    allowed = above(np.array([begun(machine, s) for s in known["start"]]))
+    likely = Likely(machine, known, asked["states"][0])
+    found = above(machine, likely.draw(known["psi"][:100].astype(float), np.random.default_rng(1)))
+    allowed = above(machine, np.array([begun(machine, s) for s in known["start"]]))
     assert found.min() > allowed.min() - 1e-6
     assert found.min() < 0.01 or machine.kind.name == "quadcopter"
 
 
-def test_windows_repeat_the_commands_from_the_first_observation(
+def test_an_opening_has_the_mean_and_the_spread_of_starts(
+    case: tuple[Machine, Simulator, dict[str, np.ndarray]],
+) -> None:
+    machine, _, windows = case
+    known, asked = split(windows)
+    likely, rng, model = Likely(machine, known, asked["states"][0]), np.random.default_rng(1), machine.model
+    opening = Opening(likely, rng)
+    z = rng.standard_normal((600, len(machine.space)))
+    starts = opening.starts(z, rng.standard_normal((600, opening.size)))
+    drawn = likely.draw(ndtr(z), rng)
+    assert starts.shape == (600, model.nq + model.nv + model.na)
+    np.testing.assert_allclose(np.linalg.norm(starts[:, 3:7], axis=1), 1, atol=1e-9)
+    for part in (slice(7, model.nq), slice(model.nq, None)):  # joints; all that moves
+        spread = drawn[:, part].std(0)
+        varies = spread > 1e-6
+        away = (starts[:, part].mean(0) - drawn[:, part].mean(0))[varies] / spread[varies]
+        assert np.abs(away).max() < 0.4
+        share = starts[:, part].std(0)[varies] / spread[varies]
+        assert (share > 0.7).all()
+        assert (share < 1.4).all()
+    found, wanted = above(machine, starts), above(machine, drawn)
+    np.testing.assert_allclose(found.mean(), wanted.mean(), atol=0.3 * wanted.std() + 1e-6)
+    np.testing.assert_allclose(found.std(), wanted.std(), rtol=0.25, atol=1e-6)
+
+
+def test_windows_repeat_the_commands_from_where_this_one_began(
     case: tuple[Machine, Simulator, dict[str, np.ndarray]],
 ) -> None:
     machine, simulator, windows = case
     known, asked = split(windows)
-    again = Repeated.of(replace(simulator, names=("states", "actions")), asked["states"], asked["actions"], known)
-    rng, space = np.random.default_rng(2), machine.space
-    u = np.concatenate([np.tile(asked["psi"], (40, 1)), rng.uniform(size=(40, len(space)))])
-    found = again(space.low + u * (space.high - space.low), np.random.default_rng(3))
-    assert set(found) == {"states", "actions"}
-    np.testing.assert_array_equal(found["states"][:, 0].numpy(), np.tile(asked["states"][0], (80, 1)))
-    np.testing.assert_allclose(found["actions"].numpy(), np.tile(asked["actions"], (80, 1, 1)), atol=1e-6)
-    assert again.noise.shape == asked["states"].shape
-    assert (again.noise[0] == 0).all()
-    np.testing.assert_array_equal(again.noise[1], machine.noise)
+    rng, d = np.random.default_rng(2), len(machine.space)
+    simulator = replace(simulator, names=("states",))
+    again = Repeated.of(simulator, asked["states"], asked["actions"], known, rng)
+    prior = PriorBox.of(machine.space, machine.kind.name)
+    assert again.size == d + again.opening.size
+    own = prior.to_z(machine.space.low + asked["psi"] * (machine.space.high - machine.space.low))
+    theta = rng.standard_normal((80, again.size))
+    theta[:40, :d] = own
+    off = again(theta, 3)
+    assert off.shape == (80, machine.habit.horizon * int(machine.told.sum()))
     # under the psi that it was made with it is met more closely than under any
-    seen = np.flatnonzero(machine.told)
-    away = ((found["states"][:, 1:, seen].numpy() - asked["states"][1:, seen]) / machine.noise[seen]) ** 2
-    assert np.median(away[:40].mean((1, 2))) < 0.8 * np.median(away[40:].mean((1, 2)))
-    same = again(space.low + u * (space.high - space.low), np.random.default_rng(3))
-    assert (same["states"] == found["states"]).all()
+    assert np.median((off[:40] ** 2).mean(1)) < 0.8 * np.median((off[40:] ** 2).mean(1))
+    assert (again(theta, 3) == off).all()
+    other = again(theta, 4)  # the motors' noise is another
+    assert (other != off).any()
+    louder = replace(again, simulator=replace(simulator, noise=2.0))
+    np.testing.assert_allclose(2 * louder(theta, 3), off)
 
 
 def test_what_cannot_be_repeated_is_refused() -> None:
     _, simulator, windows = simulated("nfc_gym/JackalFlat-v0")
-    known, asked = split(windows)
+    (known, asked), rng = split(windows), np.random.default_rng(0)
     few = {k: v[: LEAST - 1] for k, v in known.items()}
     with pytest.raises(InputError, match=f"want {LEAST} windows or more"):
-        Repeated.of(simulator, asked["states"], asked["actions"], few)
+        Repeated.of(simulator, asked["states"], asked["actions"], few, rng)
     with pytest.raises(InputError, match=r"states \(41, 15\) and actions \(40, 2\)"):
-        Repeated.of(simulator, asked["states"][:41], asked["actions"][:40], known)
+        Repeated.of(simulator, asked["states"][:41], asked["actions"][:40], known, rng)
     broken = asked["states"].copy()
     broken[3, 4] = np.nan
     with pytest.raises(InputError, match="not finite"):
-        Repeated.of(simulator, broken, asked["actions"], known)
+        Repeated.of(simulator, broken, asked["actions"], known, rng)
+    rough = replace(simulator, environment="nfc_gym/JackalRough-v0")
     with pytest.raises(InputError, match="on a plane only"):
-        Repeated.of(replace(simulator, environment="nfc_gym/JackalRough-v0"), asked["states"], asked["actions"], known)
+        Repeated.of(rough, asked["states"], asked["actions"], known, rng)

@@ -1,0 +1,118 @@
+"""`NormalPosterior`: psi's posterior given one window, normal where the prior is."""
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from numpy.typing import NDArray
+
+from nfc_gym import __version__
+from nfc_gym.core.errors import InputError
+from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.core.files import replacing
+from nfc_gym.core.whole import require_whole
+from nfc_gym.inference.space import PriorBox
+
+Array = NDArray[np.float64]
+FORMAT = "nfc_gym-normal-1"
+
+
+@dataclass(frozen=True)
+class NormalPosterior:
+    """A normal in the probit coordinates z of the prior's box; a `core.Posterior`.
+
+    What the window does not show stays as wide as the prior, which is N(0, I) there, and no draw leaves the box.
+
+    Attributes:
+      prior: psi's box.
+      mean, covariance: (k,) and (k, k) of z.
+      notes: kept in its file.
+    """
+
+    prior: PriorBox
+    mean: Array
+    covariance: Array
+    notes: dict[str, Any] = field(default_factory=dict)
+    parts: tuple[str, ...] = ("psi",)
+
+    def __post_init__(self) -> None:
+        k = self.prior.size
+        if np.shape(self.mean) != (k,) or np.shape(self.covariance) != (k, k):
+            raise InputError(
+                f"a normal posterior of {k} free parameters wants a mean of {(k,)} and a covariance of {(k, k)}, got "
+                f"{np.shape(self.mean)} and {np.shape(self.covariance)}"
+            )
+        try:
+            np.linalg.cholesky(self.covariance)
+        except np.linalg.LinAlgError:
+            raise InputError("a normal posterior's covariance must be positive definite") from None
+
+    def of(self, *parts: str) -> "NormalPosterior":
+        """Itself: it speaks of psi alone.
+
+        Raises:
+          InputError: other parts.
+        """
+        if parts != ("psi",):
+            raise InputError(f"posterior: its only part is psi, got {parts}")
+        return self
+
+    def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
+        """`n` draws of psi in physical units.
+
+        Raises:
+          InputError: n is no whole number of 1 or more.
+        """
+        require_whole("sample: n", n, 1)
+        z = self.mean + rng.standard_normal((n, len(self.mean))) @ np.linalg.cholesky(self.covariance).T
+        return Fidelity(self.prior.from_z(z))
+
+    def log_prob(self, x: Fidelity) -> Array:
+        """(n,) log density of psi in physical units, in nats; minus infinity outside the prior's box.
+
+        Raises:
+          InputError: x has no psi, or holds more.
+        """
+        if x.psi is None or len(x.given) > 1:
+            raise InputError("log_prob: this density is of psi and of nothing else")
+        psi = np.atleast_2d(x.psi)
+        z, free = self.prior.to_z(psi), np.array(self.prior.free)
+        u = self.prior.u_of(psi)[:, free]
+        off = z - self.mean
+        squares = (off * np.linalg.solve(self.covariance, off.T).T).sum(1)
+        told = 0.5 * (np.square(z).sum(1) - squares - np.linalg.slogdet(self.covariance)[1])
+        return np.where(((u < 0) | (u > 1)).any(1), -np.inf, told - self.prior.log_volume)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file that `load_source` opens.
+
+        Raises:
+          InputError: another suffix.
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".safetensors":
+            raise InputError(f"{path}: a posterior is kept in a file that ends in .safetensors")
+        about = {"nfc_gym": __version__, "prior": self.prior.to_dict(), "notes": self.notes}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays = {"mean": np.ascontiguousarray(self.mean), "covariance": np.ascontiguousarray(self.covariance)}
+        with replacing(path) as part:
+            safetensors.numpy.save_file(arrays, part, {"format": FORMAT, "about": json.dumps(about)})
+
+    @classmethod
+    def of_file(cls, path: Path, arrays: dict[str, Any], metadata: dict[str, str]) -> "NormalPosterior":
+        """From what a file holds, arrays or tensors.
+
+        Raises:
+          InputError: it is damaged.
+        """
+        try:
+            about = json.loads(metadata["about"])
+            prior, notes = PriorBox.from_dict(about["prior"]), dict(about["notes"])
+            mean, covariance = (np.asarray(arrays[k], float) for k in ("mean", "covariance"))
+        except (KeyError, TypeError, ValueError) as e:
+            raise InputError(f"{path}: holds no normal posterior that this version knows ({e})") from None
+        return cls(prior, mean, covariance, notes)

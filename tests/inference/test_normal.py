@@ -1,0 +1,72 @@
+"""A posterior that is normal in probit coordinates."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nfc_gym.core import Fidelity, InputError, Posterior, kinds, load_source
+from nfc_gym.inference.normal import NormalPosterior
+from nfc_gym.inference.space import PriorBox
+
+PRIOR = PriorBox(
+    "cart", ("mass", "drag", "known"), ("kg", "N s/m", "m"), (1, 0, 0), (3, 0.5, 1), (2, 0.2, 0.4), (True, True, False)
+)
+MEAN, COVARIANCE = np.array([0.4, -0.2]), np.array([[0.04, 0.01], [0.01, 0.5]])
+
+
+def posterior() -> NormalPosterior:
+    return NormalPosterior(PRIOR, MEAN, COVARIANCE, {"environment": "cart"})
+
+
+def test_draws_and_density_agree() -> None:
+    given, rng = posterior(), np.random.default_rng(0)
+    assert isinstance(given, Posterior)
+    psi = given.sample(40_000, rng).psi
+    assert psi is not None
+    assert (psi[:, 2] == 0.4).all()  # known: it stays nominal
+    z = PRIOR.to_z(psi)
+    np.testing.assert_allclose(z.mean(0), MEAN, atol=0.015)
+    np.testing.assert_allclose(np.cov(z.T), COVARIANCE, atol=0.01)
+    # The density of the free parameters integrates to 1 over the box.
+    mass, drag = (np.linspace(low, high, 402)[1:-1] for low, high in ((1, 3), (0, 0.5)))
+    grid = np.stack([*(g.ravel() for g in np.meshgrid(mass, drag)), np.full(160_000, 0.4)], 1)
+    density = np.exp(given.log_prob(Fidelity(grid)))
+    assert density.sum() * (mass[1] - mass[0]) * (drag[1] - drag[0]) == pytest.approx(1, abs=0.01)
+    assert given.log_prob(Fidelity(np.array([[5.0, 0.1, 0.4]])))[0] == -np.inf
+
+
+def test_what_was_not_told_is_the_prior() -> None:
+    blank = NormalPosterior(PRIOR, np.zeros(2), np.eye(2))
+    psi = blank.sample(5, np.random.default_rng(0)).psi
+    assert psi is not None
+    np.testing.assert_allclose(blank.log_prob(Fidelity(psi)), -PRIOR.log_volume, atol=1e-9)
+
+
+def test_its_file_is_a_source(tmp_path: Path) -> None:
+    file = tmp_path / "today.safetensors"
+    posterior().save(file)
+    assert kinds.kind_of(file) == kinds.POSTERIOR
+    again = load_source(file)
+    assert isinstance(again, NormalPosterior)
+    assert (again.prior, again.notes) == (PRIOR, {"environment": "cart"})
+    np.testing.assert_array_equal(again.covariance, COVARIANCE)
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(InputError, match="truncated"):
+        load_source(file)
+
+
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"wants a mean of \(2,\)"):
+        NormalPosterior(PRIOR, np.zeros(3), np.eye(3))
+    with pytest.raises(InputError, match="positive definite"):
+        NormalPosterior(PRIOR, MEAN, np.diag([1, -1]))
+    given = posterior()
+    with pytest.raises(InputError, match="its only part is psi"):
+        given.of("psi", "delta_s")
+    with pytest.raises(InputError, match="of psi and of nothing else"):
+        given.log_prob(Fidelity(delta_s=np.zeros((1, 3))))
+    with pytest.raises(InputError, match=r"ends in \.safetensors"):
+        given.save(tmp_path / "today.npz")
+    with pytest.raises(InputError, match="n is"):
+        given.sample(0, np.random.default_rng(0))
