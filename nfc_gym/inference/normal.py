@@ -14,7 +14,7 @@ from nfc_gym import __version__
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.files import replacing
-from nfc_gym.core.whole import require_whole
+from nfc_gym.core.whole import require_share, require_whole
 from nfc_gym.inference.space import PriorBox
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ FORMAT = "nfc_gym-normal-1"
 
 @dataclass(frozen=True)
 class NormalPosterior:
-    """A normal in the probit coordinates z of the prior's box; a `core.Posterior`.
+    """A normal in the probit coordinates z of the prior's box, and a little of the prior; a `core.Posterior`.
 
     What the window does not show stays as wide as the prior, which is N(0, I) there, and no draw leaves the box.
 
@@ -31,12 +31,14 @@ class NormalPosterior:
       prior: psi's box.
       mean, covariance: (k,) and (k, k) of z.
       notes: kept in its file.
+      doubt: share of the prior: how often the normal may be altogether wrong.
     """
 
     prior: PriorBox
     mean: Array
     covariance: Array
     notes: dict[str, Any] = field(default_factory=dict)
+    doubt: float = 0.0
     parts: tuple[str, ...] = ("psi",)
 
     def __post_init__(self) -> None:
@@ -46,6 +48,7 @@ class NormalPosterior:
                 f"a normal posterior of {k} free parameters wants a mean of {(k,)} and a covariance of {(k, k)}, got "
                 f"{np.shape(self.mean)} and {np.shape(self.covariance)}"
             )
+        require_share("a normal posterior's doubt", self.doubt)
         try:
             np.linalg.cholesky(self.covariance)
         except np.linalg.LinAlgError:
@@ -68,7 +71,9 @@ class NormalPosterior:
           InputError: n is no whole number of 1 or more.
         """
         require_whole("sample: n", n, 1)
-        z = self.mean + rng.standard_normal((n, len(self.mean))) @ np.linalg.cholesky(self.covariance).T
+        noise = rng.standard_normal((n, len(self.mean)))
+        z = self.mean + noise @ np.linalg.cholesky(self.covariance).T
+        z = np.where(rng.random((n, 1)) < self.doubt, noise, z)
         return Fidelity(self.prior.from_z(z))
 
     def log_prob(self, x: Fidelity) -> Array:
@@ -85,6 +90,8 @@ class NormalPosterior:
         off = z - self.mean
         squares = (off * np.linalg.solve(self.covariance, off.T).T).sum(1)
         told = 0.5 * (np.square(z).sum(1) - squares - np.linalg.slogdet(self.covariance)[1])
+        if self.doubt:
+            told = np.logaddexp(np.log1p(-self.doubt) + told, np.log(self.doubt))
         return np.where(((u < 0) | (u > 1)).any(1), -np.inf, told - self.prior.log_volume)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -96,7 +103,7 @@ class NormalPosterior:
         path = Path(path)
         if path.suffix.lower() != ".safetensors":
             raise InputError(f"{path}: a posterior is kept in a file that ends in .safetensors")
-        about = {"nfc_gym": __version__, "prior": self.prior.to_dict(), "notes": self.notes}
+        about = {"nfc_gym": __version__, "prior": self.prior.to_dict(), "notes": self.notes, "doubt": self.doubt}
         path.parent.mkdir(parents=True, exist_ok=True)
         arrays = {"mean": np.ascontiguousarray(self.mean), "covariance": np.ascontiguousarray(self.covariance)}
         with replacing(path) as part:
@@ -111,8 +118,8 @@ class NormalPosterior:
         """
         try:
             about = json.loads(metadata["about"])
-            prior, notes = PriorBox.from_dict(about["prior"]), dict(about["notes"])
+            prior, notes, doubt = PriorBox.from_dict(about["prior"]), dict(about["notes"]), float(about["doubt"])
             mean, covariance = (np.asarray(arrays[k], float) for k in ("mean", "covariance"))
         except (KeyError, TypeError, ValueError) as e:
             raise InputError(f"{path}: holds no normal posterior that this version knows ({e})") from None
-        return cls(prior, mean, covariance, notes)
+        return cls(prior, mean, covariance, notes, doubt)

@@ -39,8 +39,7 @@ _ALIKE = 0.1  # where this one is told so much more than them at most, nats an e
 _FAR = 1.5  # standard deviations, root mean square over theta, that the middle goes in a round
 _STILL = 0.03  # nats an entry of psi that `LAST` rounds must have won, or they are the last
 _RIDGE = 1e-9
-_WIDE = 1.0
-_FAIR = 10.0  # standard deviations of the sensors, beyond which what is missed counts by its logarithm
+_FAIR = 30.0  # standard deviations of the sensors, beyond which what is missed counts by its logarithm
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ def close_in(
 
 
 def _simulated(errors: Errors, around: Normal, r: Array, seed: int) -> _Round:
-    root = np.sqrt(_WIDE) * np.linalg.cholesky(around.covariance)
+    root = np.linalg.cholesky(around.covariance)
     away = r @ root.T
     ends = errors(around.mean + away, seed), errors(around.mean - away, seed)
     fine = np.isfinite(ends[0]).all(1) & np.isfinite(ends[1]).all(1)

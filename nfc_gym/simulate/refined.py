@@ -20,6 +20,9 @@ from nfc_gym.simulate.rounds import Simulator
 Array = NDArray[np.float64]
 BEGINNINGS = 2048  # windows of any motion, from which it is learned where this one may have begun
 _DRAWS = 1000  # of the posterior that it begins with
+# Where what the machine does is far from linear, the normal may be altogether wrong and not know it: two of 32 Jackals
+# were (docs/posteriors.md).
+DOUBT = 0.02
 
 
 def refined(
@@ -77,4 +80,5 @@ def refined(
     found = close_in(again, begin, prior.size, simulations, seed, report)
     told = {key: notes[key] for key in ("states",) if key in notes}
     kept = {"environment": machine.environment, "refined": simulations} | told
-    return NormalPosterior(prior, found.mean[: prior.size], found.covariance[: prior.size, : prior.size], kept)
+    own = slice(0, prior.size)
+    return NormalPosterior(prior, found.mean[own], found.covariance[own, own], kept, DOUBT)

@@ -15,19 +15,21 @@ PRIOR = PriorBox(
 MEAN, COVARIANCE = np.array([0.4, -0.2]), np.array([[0.04, 0.01], [0.01, 0.5]])
 
 
-def posterior() -> NormalPosterior:
-    return NormalPosterior(PRIOR, MEAN, COVARIANCE, {"environment": "cart"})
+def posterior(doubt: float = 0.0) -> NormalPosterior:
+    return NormalPosterior(PRIOR, MEAN, COVARIANCE, {"environment": "cart"}, doubt)
 
 
-def test_draws_and_density_agree() -> None:
-    given, rng = posterior(), np.random.default_rng(0)
+@pytest.mark.parametrize("doubt", [0.0, 0.3])
+def test_draws_and_density_agree(doubt: float) -> None:
+    given, rng = posterior(doubt), np.random.default_rng(0)
     assert isinstance(given, Posterior)
     psi = given.sample(40_000, rng).psi
     assert psi is not None
     assert (psi[:, 2] == 0.4).all()  # known: it stays nominal
     z = PRIOR.to_z(psi)
-    np.testing.assert_allclose(z.mean(0), MEAN, atol=0.015)
-    np.testing.assert_allclose(np.cov(z.T), COVARIANCE, atol=0.01)
+    np.testing.assert_allclose(z.mean(0), (1 - doubt) * MEAN, atol=0.015)
+    apart = doubt * (1 - doubt) * np.outer(MEAN, MEAN)  # of a mixture's two means
+    np.testing.assert_allclose(np.cov(z.T), (1 - doubt) * COVARIANCE + doubt * np.eye(2) + apart, atol=0.015)
     # The density of the free parameters integrates to 1 over the box.
     mass, drag = (np.linspace(low, high, 402)[1:-1] for low, high in ((1, 3), (0, 0.5)))
     grid = np.stack([*(g.ravel() for g in np.meshgrid(mass, drag)), np.full(160_000, 0.4)], 1)
@@ -43,13 +45,22 @@ def test_what_was_not_told_is_the_prior() -> None:
     np.testing.assert_allclose(blank.log_prob(Fidelity(psi)), -PRIOR.log_volume, atol=1e-9)
 
 
+def test_doubt_bounds_what_a_wrong_normal_costs() -> None:
+    far = PRIOR.from_z(np.array([[-3.0, 3.0]]))
+    sure, doubting = (posterior(doubt).log_prob(Fidelity(far))[0] + PRIOR.log_volume for doubt in (0.0, 0.02))
+    assert sure < -50
+    assert doubting == pytest.approx(np.log(0.02))
+    with pytest.raises(InputError, match="doubt"):
+        posterior(1.5)
+
+
 def test_its_file_is_a_source(tmp_path: Path) -> None:
     file = tmp_path / "today.safetensors"
-    posterior().save(file)
+    posterior(0.1).save(file)
     assert kinds.kind_of(file) == kinds.POSTERIOR
     again = load_source(file)
     assert isinstance(again, NormalPosterior)
-    assert (again.prior, again.notes) == (PRIOR, {"environment": "cart"})
+    assert (again.prior, again.notes, again.doubt) == (PRIOR, {"environment": "cart"}, 0.1)
     np.testing.assert_array_equal(again.covariance, COVARIANCE)
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(InputError, match="truncated"):
