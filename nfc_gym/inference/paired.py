@@ -168,7 +168,7 @@ def close_in(
 
 
 def _simulated(errors: Errors, around: Normal, r: Array, seed: int) -> _Round:
-    root = np.linalg.cholesky(around.covariance)
+    root = np.asarray(np.linalg.cholesky(around.covariance), float)
     away = r @ root.T
     ends = errors(around.mean + away, seed), errors(around.mean - away, seed)
     fine = np.isfinite(ends[0]).all(1) & np.isfinite(ends[1]).all(1)
