@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from nfc_gym.inference.faults import FaultClassifier, FaultConfig
     from nfc_gym.inference.jobs import infer, train_posterior
     from nfc_gym.inference.network import Network
+    from nfc_gym.inference.normal import NormalPosterior
     from nfc_gym.inference.posterior import NeuralPosterior, Window, load
     from nfc_gym.inference.progress import Spoken
     from nfc_gym.inference.sequential import sequential
@@ -31,6 +32,7 @@ _HOME = {
     "Network": "network",
     "NetworkConfig": "config",
     "NeuralPosterior": "posterior",
+    "NormalPosterior": "normal",
     "PriorBox": "space",
     "Sizes": "config",
     "Spoken": "progress",
@@ -48,8 +50,8 @@ _HOME = {
 }
 __all__ = [
     "Contrast", "ContrastConfig", "Either", "FaultClassifier", "FaultConfig", "Network", "NetworkConfig",
-    "NeuralPosterior", "PriorBox", "Sizes", "Spoken", "StoredWindows", "TensorWindows", "TrainConfig", "Window",
-    "WindowDetector", "Windows", "infer", "load", "sequential", "train", "train_posterior",
+    "NeuralPosterior", "NormalPosterior", "PriorBox", "Sizes", "Spoken", "StoredWindows", "TensorWindows",
+    "TrainConfig", "Window", "WindowDetector", "Windows", "infer", "load", "sequential", "train", "train_posterior",
 ]  # fmt: skip
 
 lazy.export(__name__, _HOME, "inference")
