@@ -57,6 +57,13 @@ class Normal:
     mean: Array
     covariance: Array
 
+    def beside(self, more: int) -> "Normal":
+        """The same beside further entries of which nothing is known."""
+        p = len(self.mean)
+        covariance = np.eye(p + more)
+        covariance[:p, :p] = self.covariance
+        return Normal(np.concatenate([self.mean, np.zeros(more)]), covariance)
+
     def told(self, size: int) -> float:
         """Nats over the prior that are told of the first `size` entries, an entry, at the mean's own place."""
         own = self.covariance[:size, :size]

@@ -58,11 +58,10 @@ def refined(
     if machine.rough:
         raise InputError(f"{machine.environment}: one window's commands are repeated on a plane only")
     rng = np.random.default_rng([seed, 2])
-    first = np.zeros(prior.size), np.eye(prior.size)
+    first = Normal(np.zeros(prior.size), np.eye(prior.size))
     if posterior is not None:
-        drawn = posterior.of("psi").given(window).sample(_DRAWS, rng).psi
-        z = prior.to_z(np.asarray(drawn))
-        first = z.mean(0), np.cov(z.T)
+        z = prior.to_z(np.asarray(posterior.of("psi").given(window).sample(_DRAWS, rng).psi))
+        first = Normal(z.mean(0), np.cov(z.T))
     states, actions = np.asarray(window.states, float), np.asarray(window.actions, float)
     require_commands(np.atleast_2d(actions), machine.habit.horizon, "window")
     actions = np.clip(actions, -1, 1)
@@ -72,12 +71,7 @@ def refined(
     known = {name: t.numpy() for name, t in simulator.draw(BEGINNINGS, rng).items()}
     again = Repeated.of(replace(simulator, names=("states",)), states, actions, known, rng)
     report.message(f"simulates these commands {simulations} times at most")
-    more = again.size - prior.size
-    begin = Normal(
-        np.concatenate([first[0], np.zeros(more)]),
-        np.block([[first[1], np.zeros((prior.size, more))], [np.zeros((more, prior.size)), np.eye(more)]]),
-    )
-    found = close_in(again, begin, prior.size, simulations, seed, report)
+    found = close_in(again, first.beside(again.opening.size), prior.size, simulations, seed, report)
     told = {key: notes[key] for key in ("states",) if key in notes}
     kept = {"environment": machine.environment, "refined": simulations} | told
     own = slice(0, prior.size)
