@@ -15,10 +15,8 @@ and their covariance by a round that W does not come from, so that a poor W tell
 prior they give the next N(m, L L'), around which the next round lies.
 
 No round takes an earlier answer for its prior, and where a round lies does not bias it: a regression on theta has no
-such bias. It only says where the robot is taken as linear, and its noise as it is there. Where that noise is less than
-the observed robot's, its noise looks like signal; so a round in which what was observed is less likely than in an
-earlier one is refused, and the next lies halfway back. What rounds disagree on at the end, beyond what each allows for,
-is added to the width.
+such bias. It only says where the robot is taken as linear, and its noise as it is there: noise that grows with a
+parameter is not seen as that. What rounds disagree on at the end, beyond what each allows for, is added to the width.
 """
 
 from collections.abc import Callable
@@ -41,8 +39,6 @@ _ALIKE = 0.1  # where this one is told so much more than them at most, nats an e
 _FAR = 1.5  # standard deviations, root mean square over theta, that the middle goes in a round
 _STILL = 0.03  # nats an entry of psi that `LAST` rounds must have won, or they are the last
 _RIDGE = 1e-9
-_WORSE = 3.0  # twice the nats by which what was observed may be less likely than in the best round
-_TRIES = 3  # rounds refused one after the other that are the last
 _FAIR = 30.0  # standard deviations of the sensors, beyond which what is missed counts by its logarithm
 
 
@@ -99,17 +95,6 @@ class _Round:
     def part(self, rows: slice) -> "_Round":
         """Some of its pairs."""
         return _Round(self.half[rows], self.middle[rows], self.r[rows], self.root)
-
-    def unlikely(self) -> float:
-        """Minus twice the log density of what was observed, normal about the middle, but for a constant.
-
-        Slopes are taken where noise is as it is here. Where it is less than it was for the robot that was observed, its
-        noise looks like signal, and rounds that follow it go astray: this rises then, since noise of that size is rare.
-        """
-        rows, off = self.spread, self.middle.mean(0)
-        among = np.eye(len(rows)) + rows @ rows.T
-        shared = rows @ off
-        return float(off @ off - shared @ np.linalg.solve(among, shared) + np.linalg.slogdet(among)[1])
 
     def told(self, weights: Array) -> _Told:
         """By statistics `weights` (p, K) of the outputs."""
@@ -172,18 +157,9 @@ def close_in(
             f"refine: {simulations} simulations are too few for {p} unknowns; want {4 * LAST * (p + 2)} or more"
         )
     believed, done, answers = begin, list[tuple[float, _Round]](), list[Normal]()
-    best, accepted, refused = np.inf, begin, 0
     for k in range(rounds):
         rng = np.random.default_rng([seed, k])
         here = _simulated(errors, believed, rng.standard_normal((pairs, p)), int(rng.integers(2**32)))
-        unlikely = here.unlikely() + float(believed.mean @ believed.mean)
-        if unlikely > best + _WORSE:
-            refused += 1
-            if refused == _TRIES:
-                break
-            believed = Normal((accepted.mean + believed.mean) / 2, accepted.covariance)
-            continue
-        best, accepted, refused = min(best, unlikely), believed, 0
         now = believed.told(size)
         told = _told(here, [each for then, each in done if now - then < _ALIKE])
         done = [*done, (now, here)][-_POOLED:]

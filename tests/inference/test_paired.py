@@ -98,38 +98,6 @@ def test_some_that_come_apart_are_left_out_and_most_are_refused() -> None:
         close_in(lambda theta, seed: np.full((len(theta), OUTPUTS), np.nan), NOTHING, KNOWN, 4000)
 
 
-def test_how_unlikely_a_round_is_by_the_normal_that_is_known() -> None:
-    problem, pairs = Linear(4), 2000
-    noise = np.eye(OUTPUTS) + problem.motors @ problem.motors.T
-
-    def exact(theta: Array) -> float:
-        off = problem.seen - problem.slope @ theta
-        return off @ np.linalg.solve(noise, off) + np.linalg.slogdet(noise)[1]
-
-    found = []
-    for theta in (problem.truth, problem.truth + 0.5):
-        narrow = Normal(theta, 1e-6 * np.eye(KNOWN))
-        here = paired._simulated(problem, narrow, np.random.default_rng(0).standard_normal((pairs, KNOWN)), 1)
-        found.append(here.unlikely())
-        assert found[-1] == pytest.approx(exact(theta), rel=0.05)
-    assert found[1] > found[0] + 10
-
-
-def test_rounds_that_are_less_likely_are_refused_and_end_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, centres, rises = Linear(0), [], iter(range(0, 100, 10))
-
-    def seen(theta: Array, seed: int) -> Array:
-        centres.append(theta.mean(0))
-        return problem(theta, seed)
-
-    monkeypatch.setattr(paired._Round, "unlikely", lambda _: 1000.0 * next(rises))
-    found = close_in(seen, NOTHING, KNOWN, 8000)
-    first, second, third, fourth = (np.mean(centres[k : k + 2], 0) for k in range(0, 8, 2))  # of pairs
-    assert len(centres) == 8  # one round that counts, three that do not
-    np.testing.assert_allclose([first, third, fourth], [0 * second, second / 2, second / 4], atol=1e-9)
-    np.testing.assert_allclose(found.mean, second, atol=1e-9)  # what the only one led to
-
-
 def test_too_few_simulations_are_refused_and_enough_are_named() -> None:
     with pytest.raises(InputError, match="100 simulations are too few for 6 unknowns; want 128 or more"):
         close_in(Linear(0), NOTHING, KNOWN, 100)
