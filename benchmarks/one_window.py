@@ -11,7 +11,6 @@ is done, so that the command goes on where it was stopped; `--stop` begins nothi
 """
 
 import argparse
-import multiprocessing
 import os
 import sys
 import time
@@ -35,6 +34,7 @@ from nfc_gym.inference.progress import Quiet
 from nfc_gym.simulate import Simulator, starts
 from nfc_gym.simulate.ceiling import ceiling
 from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.pool import unordered
 from nfc_gym.simulate.refined import refined
 
 Array = NDArray[np.float64]
@@ -146,22 +146,16 @@ def main(argv: list[str] | None = None) -> int:
     tasks = [(f"{name}_{task[1]}", task) for name, task in wanted if not kept.has(f"{name}_{task[1]}")]
     print(f"seed {seed}; {len(wanted) - len(tasks)} of {len(wanted)} windows are there already", flush=True)
     until = time.monotonic() + args.stop
-    with multiprocessing.get_context("spawn").Pool(min(args.jobs, max(1, len(tasks)))) as pool:
-        found = [(name, pool.apply_async(_in_time, (task, until))) for name, task in tasks]
-        for k, (name, each) in enumerate(found):
-            cell = each.get()
-            if cell is not None:
-                kept.keep(name, cell)
-                print(f"{k + 1} of {len(found)}: {name} {_short(cell)}", flush=True)
+    asked = (task for _, task in tasks if time.monotonic() < until)
+    made = enumerate(map(judged, asked)) if args.jobs == 1 else unordered(judged, zip(asked), args.jobs)
+    for done, (k, cell) in enumerate(made, 1):
+        kept.keep(tasks[k][0], cell)
+        print(f"{done} of {len(tasks)}: {tasks[k][0]} {_short(cell)}", flush=True)
     table = rows(kept, args.robots)
     print("\n".join(map(said, table)))
     if args.json is not None:
         write_json(args.json, {"seed": seed, "simulations": args.simulations, "rows": table})
     return 0
-
-
-def _in_time(task: tuple[str, int, int, bool, int], until: float) -> dict[str, Any] | None:
-    return judged(task) if time.monotonic() < until else None
 
 
 def _short(cell: dict[str, Any]) -> str:
