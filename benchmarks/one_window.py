@@ -89,10 +89,10 @@ def judged(task: tuple[str, int, int, bool, int]) -> dict[str, Any]:
 
 def one(found: NormalPosterior, psi: Array, u: Array, low: Array, high: Array) -> dict[str, float]:
     """Gain of the truth [nats a parameter]; its squared distance a parameter, 1 on average; intervals."""
-    off = found.prior.to_z(psi)[0] - found.mean
+    off = found.prior.to_z(psi)[0] - found.normal.mean
     return {
         "gain": float(found.log_prob(Fidelity(psi))[0] + found.prior.log_volume) / found.prior.size,
-        "squares": float(off @ np.linalg.solve(found.covariance, off)) / len(off),
+        "squares": float(off @ np.linalg.solve(found.normal.covariance, off)) / len(off),
         "held": float(((low <= u[0]) & (u[0] <= high)).mean()),
         "width": float((high - low).mean()),
     }

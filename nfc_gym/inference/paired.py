@@ -20,13 +20,13 @@ parameter is not seen as that. What rounds disagree on at the end, beyond what e
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.inference.normal import Normal
 from nfc_gym.inference.progress import Report, quiet
 
 Array = NDArray[np.float64]
@@ -40,30 +40,6 @@ _FAR = 1.5  # standard deviations, root mean square over theta, that the middle 
 _STILL = 0.03  # nats an entry of psi that `LAST` rounds must have won, or they are the last
 _RIDGE = 1e-9
 _FAIR = 30.0  # standard deviations of the sensors, beyond which what is missed counts by its logarithm
-
-
-@dataclass(frozen=True)
-class Normal:
-    """What is believed of theta.
-
-    Attributes:
-      mean, covariance: (p,) and (p, p).
-    """
-
-    mean: Array
-    covariance: Array
-
-    def beside(self, more: int) -> "Normal":
-        """The same beside further entries of which nothing is known."""
-        p = len(self.mean)
-        covariance = np.eye(p + more)
-        covariance[:p, :p] = self.covariance
-        return Normal(np.concatenate([self.mean, np.zeros(more)]), covariance)
-
-    def told(self, size: int) -> float:
-        """Nats over the prior that are told of the first `size` entries, an entry, at the mean's own place."""
-        own = self.covariance[:size, :size]
-        return -0.5 * float(np.linalg.slogdet(own)[1]) / size
 
 
 class _Told(NamedTuple):

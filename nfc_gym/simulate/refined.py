@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.inference.jobs import require_commands
-from nfc_gym.inference.normal import NormalPosterior
-from nfc_gym.inference.paired import SIMULATIONS, Normal, close_in
+from nfc_gym.inference.normal import Normal, NormalPosterior
+from nfc_gym.inference.paired import SIMULATIONS, close_in
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.space import PriorBox
@@ -20,8 +20,8 @@ from nfc_gym.simulate.rounds import Simulator
 Array = NDArray[np.float64]
 BEGINNINGS = 2048  # windows of any motion, from which it is learned where this one may have begun
 _DRAWS = 1000  # of the posterior that it begins with
-# Where what the machine does is far from linear, the normal may be altogether wrong and not know it: two of 32 Jackals
-# were (docs/posteriors.md).
+# Where what the machine does is far from linear, the normal may be altogether wrong and not know it, as of two of 32
+# Jackals (docs/posteriors.md): so much is left to what was believed before.
 DOUBT = 0.02
 
 
@@ -32,7 +32,8 @@ def refined(
     """Psi's posterior given one window on a plane, from simulations of the same commands (`inference.paired`).
 
     Args:
-      posterior: trained on windows of any motion of that robot: where the first round lies. None begins with the prior.
+      posterior: trained on windows of any motion of that robot: where the first round lies, and what is believed where
+        the answer is wrong. None begins with the prior.
       window: what was observed; the last H steps count.
       environment: id; by default the one whose windows the posterior was trained on.
       simulations: windows of the same commands, at most; `BEGINNINGS` aside.
@@ -58,7 +59,7 @@ def refined(
     if machine.rough:
         raise InputError(f"{machine.environment}: one window's commands are repeated on a plane only")
     rng = np.random.default_rng([seed, 2])
-    first = Normal(np.zeros(prior.size), np.eye(prior.size))
+    first = Normal.prior(prior.size)
     if posterior is not None:
         z = prior.to_z(np.asarray(posterior.of("psi").given(window).sample(_DRAWS, rng).psi))
         first = Normal(z.mean(0), np.cov(z.T))
@@ -74,5 +75,4 @@ def refined(
     found = close_in(again, first.beside(again.opening.size), prior.size, simulations, seed, report)
     told = {key: notes[key] for key in ("states",) if key in notes}
     kept = {"environment": machine.environment, "refined": simulations} | told
-    own = slice(0, prior.size)
-    return NormalPosterior(prior, found.mean[own], found.covariance[own, own], kept, DOUBT)
+    return NormalPosterior(prior, found.first(prior.size), kept, DOUBT, first)

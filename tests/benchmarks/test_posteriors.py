@@ -200,7 +200,7 @@ def test_refined_windows_are_judged_beside_the_first_round(tmp_path: Path, monke
     from posteriors.sets import environment, prior_of
 
     from nfc_gym.inference.config import NetworkConfig
-    from nfc_gym.inference.normal import NormalPosterior
+    from nfc_gym.inference.normal import Normal, NormalPosterior
     from nfc_gym.inference.posterior import NeuralPosterior, Window
     from nfc_gym.inference.random import mixed
     from nfc_gym.inference.train import TrainConfig
@@ -211,7 +211,7 @@ def test_refined_windows_are_judged_beside_the_first_round(tmp_path: Path, monke
     def refined(posterior: NeuralPosterior, window: Window, **how: object) -> NormalPosterior:
         posterior.given(window)  # or it is refused
         asked.update(how)
-        return NormalPosterior(prior, np.zeros(17), 0.25 * np.eye(17))
+        return NormalPosterior(prior, Normal(np.zeros(17), 0.25 * np.eye(17)))
 
     def ceiling(env: str, window: dict[str, np.ndarray], **how: object) -> SimpleNamespace:
         truth.append(ndtri(window["psi"][0]))

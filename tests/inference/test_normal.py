@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Fidelity, InputError, Posterior, kinds, load_source
-from nfc_gym.inference.normal import NormalPosterior
+from nfc_gym.inference.normal import Normal, NormalPosterior
 from nfc_gym.inference.space import PriorBox
 
 PRIOR = PriorBox(
@@ -15,8 +15,8 @@ PRIOR = PriorBox(
 MEAN, COVARIANCE = np.array([0.4, -0.2]), np.array([[0.04, 0.01], [0.01, 0.5]])
 
 
-def posterior(doubt: float = 0.0) -> NormalPosterior:
-    return NormalPosterior(PRIOR, MEAN, COVARIANCE, {"environment": "cart"}, doubt)
+def posterior(doubt: float = 0.0, before: Normal | None = None) -> NormalPosterior:
+    return NormalPosterior(PRIOR, Normal(MEAN, COVARIANCE), {"environment": "cart"}, doubt, before)
 
 
 @pytest.mark.parametrize("doubt", [0.0, 0.3])
@@ -39,7 +39,7 @@ def test_draws_and_density_agree(doubt: float) -> None:
 
 
 def test_what_was_not_told_is_the_prior() -> None:
-    blank = NormalPosterior(PRIOR, np.zeros(2), np.eye(2))
+    blank = NormalPosterior(PRIOR, Normal.prior(2))
     psi = blank.sample(5, np.random.default_rng(0)).psi
     assert psi is not None
     np.testing.assert_allclose(blank.log_prob(Fidelity(psi)), -PRIOR.log_volume, atol=1e-9)
@@ -50,18 +50,26 @@ def test_doubt_bounds_what_a_wrong_normal_costs() -> None:
     sure, doubting = (posterior(doubt).log_prob(Fidelity(far))[0] + PRIOR.log_volume for doubt in (0.0, 0.02))
     assert sure < -50
     assert doubting == pytest.approx(np.log(0.02))
+    told = posterior(0.02, Normal(np.array([-3.0, 3.0]), 0.01 * np.eye(2)))  # who believed it before loses little
+    after = told.log_prob(Fidelity(far))[0] + PRIOR.log_volume
+    assert after == pytest.approx(np.log(0.02) + told.otherwise.gain(np.array([[-3.0, 3.0]]))[0], abs=1e-3)
+    z = PRIOR.to_z(told.sample(4000, np.random.default_rng(0)).psi)
+    assert 0.01 < (np.abs(z - [-3, 3]).max(1) < 1).mean() < 0.03
     with pytest.raises(InputError, match="doubt"):
         posterior(1.5)
 
 
 def test_its_file_is_a_source(tmp_path: Path) -> None:
     file = tmp_path / "today.safetensors"
-    posterior(0.1).save(file)
+    before = Normal(MEAN + 1, 2 * COVARIANCE)
+    posterior(0.1, before).save(file)
     assert kinds.kind_of(file) == kinds.POSTERIOR
     again = load_source(file)
     assert isinstance(again, NormalPosterior)
     assert (again.prior, again.notes, again.doubt) == (PRIOR, {"environment": "cart"}, 0.1)
-    np.testing.assert_array_equal(again.covariance, COVARIANCE)
+    np.testing.assert_array_equal(again.normal.covariance, COVARIANCE)
+    np.testing.assert_array_equal(again.otherwise.mean, before.mean)
+    np.testing.assert_array_equal(again.otherwise.covariance, before.covariance)
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(InputError, match="truncated"):
         load_source(file)
@@ -69,9 +77,9 @@ def test_its_file_is_a_source(tmp_path: Path) -> None:
 
 def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"wants a mean of \(2,\)"):
-        NormalPosterior(PRIOR, np.zeros(3), np.eye(3))
+        NormalPosterior(PRIOR, Normal.prior(3))
     with pytest.raises(InputError, match="positive definite"):
-        NormalPosterior(PRIOR, MEAN, np.diag([1, -1]))
+        NormalPosterior(PRIOR, Normal(MEAN, np.diag([1.0, -1.0])))
     given = posterior()
     with pytest.raises(InputError, match="its only part is psi"):
         given.of("psi", "delta_s")

@@ -13,7 +13,7 @@ pytest.importorskip("torch")
 from nfc_gym.cli import app
 from nfc_gym.inference import Network, NetworkConfig, NeuralPosterior, PriorBox, Sizes, Window
 from nfc_gym.inference.encoders.place import place_of
-from nfc_gym.inference.normal import NormalPosterior
+from nfc_gym.inference.normal import Normal, NormalPosterior
 from nfc_gym.inference.progress import Quiet
 from nfc_gym.inference.windows import Windows
 from nfc_gym.measured.belief import read_belief
@@ -70,7 +70,7 @@ def test_a_window_is_told_of_without_a_network(flown: tuple[Window, np.ndarray])
     assert own.notes == {"environment": ENVIRONMENT, "refined": SIMULATIONS}
     gain = (own.log_prob(Fidelity(psi))[0] + own.prior.log_volume) / own.prior.size
     assert gain > 1.2  # nats a parameter; a minute of training on a hundred thousand windows tells 2.5
-    z = (own.prior.to_z(psi)[0] - own.mean) / np.sqrt(np.diag(own.covariance))
+    z = (own.prior.to_z(psi)[0] - own.normal.mean) / np.sqrt(np.diag(own.normal.covariance))
     assert np.abs(z).max() < 4
     assert sum(text.startswith("round ") for text in heard.said) == 4
 
@@ -112,7 +112,7 @@ def test_the_command_line_refines(
     def instead(posterior: NeuralPosterior | None, window: Window, **how: object) -> NormalPosterior:
         asked.append((posterior, how))
         prior = PriorBox.of(Machine(ENVIRONMENT).space, "quadcopter")
-        return NormalPosterior(prior, np.zeros(prior.size), np.eye(prior.size))
+        return NormalPosterior(prior, Normal.prior(prior.size))
 
     monkeypatch.setattr(refined, "refined", instead)
     command = ["infer", str(file), str(motion), "--refine", "700", "--out", str(out)]
@@ -134,7 +134,7 @@ def test_the_command_line_refines(
 def test_its_file_is_a_proposal_and_a_belief(tmp_path: Path) -> None:
     machine, file = Machine(ENVIRONMENT), tmp_path / "today.safetensors"
     prior = PriorBox.of(machine.space, "quadcopter")
-    NormalPosterior(prior, np.full(prior.size, 0.5), 0.01 * np.eye(prior.size)).save(file)
+    NormalPosterior(prior, Normal(np.full(prior.size, 0.5), 0.01 * np.eye(prior.size))).save(file)
     command = ["simulate", "QuadcopterFlat", "--windows", "6", "--jobs", "1", "--proposal", str(file), "--out"]
     done = CliRunner().invoke(app, [*command, str(tmp_path / "windows")])
     assert done.exit_code == 0, done.output
