@@ -20,6 +20,7 @@ from nfc_gym.inference.space import PriorBox
 Array = NDArray[np.float64]
 FORMAT = "nfc_gym-normal-1"
 _PARTS = ("mean", "covariance")
+_LEAST = 1e-4  # probit, of standard deviations
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,11 @@ class Normal:
         """N(0, I)."""
         return cls(np.zeros(size), np.eye(size))
 
+    @classmethod
+    def through(cls, z: Array) -> "Normal":
+        """With the mean and the covariance of points z (n, p), which may all be equal."""
+        return cls(z.mean(0), np.atleast_2d(np.cov(z.T)) + _LEAST**2 * np.eye(z.shape[1]))
+
     def beside(self, more: int) -> "Normal":
         """The same beside further entries of which nothing is known."""
         p = len(self.mean)
@@ -52,6 +58,10 @@ class Normal:
     def told(self, size: int) -> float:
         """Nats over the prior that are told of the first `size` entries, an entry, at the mean's own place."""
         return -0.5 * float(np.linalg.slogdet(self.first(size).covariance)[1]) / size
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """(n, p) draws."""
+        return self.mean + rng.standard_normal((n, len(self.mean))) @ np.linalg.cholesky(self.covariance).T
 
     def gain(self, z: Array) -> Array:
         """(n,) log density over the prior's at z (n, p)."""
@@ -118,11 +128,8 @@ class NormalPosterior:
           InputError: n is no whole number of 1 or more.
         """
         require_whole("sample: n", n, 1)
-        noise = rng.standard_normal((n, self.prior.size))
-        surely, else_ = (
-            each.mean + noise @ np.linalg.cholesky(each.covariance).T for each in (self.normal, self.otherwise)
-        )
-        return Fidelity(self.prior.from_z(np.where(rng.random((n, 1)) < self.doubt, else_, surely)))
+        z, before = (each.sample(n, rng) for each in (self.normal, self.otherwise))
+        return Fidelity(self.prior.from_z(np.where(rng.random((n, 1)) < self.doubt, before, z)))
 
     def log_prob(self, x: Fidelity) -> Array:
         """(n,) log density of psi in physical units, in nats; minus infinity outside the prior's box.

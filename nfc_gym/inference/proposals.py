@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.network import Network
+from nfc_gym.inference.normal import Normal
 from nfc_gym.inference.posterior import NeuralPosterior
 from nfc_gym.inference.space import PriorBox
 
@@ -26,7 +26,6 @@ QUANTILE = 5e-4  # of the posterior's density, that says how far its draws reach
 WIDER = 1.0  # how many times as far truncated proposals do
 _FILLS = 1.5  # times the variance of what lies evenly in a region: that of candidates for it
 _OWN = 0.25  # of such candidates: draws of the posterior itself
-_LEAST = 1e-4  # probit, of a normal's standard deviations: draws may all be equal
 _NARROWS = 0.05  # nats of posterior entropy that a round must win, or the rounds end
 
 
@@ -110,7 +109,7 @@ class TruncatedPrior:
         gain = told(posterior, psi)
         highest, depth = reach(gain, config)
         self.threshold = highest - depth
-        self.wide = _Normal.through(posterior.prior.to_z(psi)).filling(depth)
+        self.wide = _filling(Normal.through(posterior.prior.to_z(psi)), depth)
         tried, log_weight = self._candidates(config.samples, rng)
         self.kept = float(min(1.0, np.exp(log_weight).mean()))
         u = posterior.prior.u_of(np.concatenate([psi, tried[np.isfinite(log_weight)]]))
@@ -152,37 +151,16 @@ class TruncatedPrior:
         return psi, np.where(gain > self.threshold, -mixed, -np.inf)
 
 
-class _Normal:
-    """A normal in the coordinates z in which the prior is N(0, I): its mean (size,) and covariance (size, size)."""
+def _filling(normal: Normal, depth: float) -> Normal:
+    """One as wide as the region in which its log density over the prior's is within `depth` nats of its highest.
 
-    def __init__(self, middle: Array, covariance: Array) -> None:
-        self.middle, self.covariance = middle, covariance
-        self.root = np.linalg.cholesky(covariance)
-
-    @classmethod
-    def through(cls, z: Array) -> "_Normal":
-        """With the mean and covariance of points z (n, size)."""
-        return cls(z.mean(0), np.atleast_2d(np.cov(z.T)) + _LEAST**2 * np.eye(z.shape[1]))
-
-    def filling(self, depth: float) -> "_Normal":
-        """One as wide as the region in which the log density over the prior's is within `depth` nats of its highest.
-
-        It is the prior times a wider likelihood: where nothing was told the prior is all that there is to fill.
-        """
-        spread, axes = np.linalg.eigh(self.covariance)
-        precision = np.maximum(1 / spread - 1, 0)
-        told_of = (precision / (1 + precision)).sum()  # dimensions
-        wider = max(1.0, _FILLS * 2 * depth / (told_of + 2))  # an even ball of radius R has variance R^2 / (d + 2)
-        return _Normal(self.middle, axes / (1 / spread - precision + precision / wider) @ axes.T)
-
-    def gain(self, z: Array) -> Array:
-        """(n,) its log density over the prior's at z (n, size)."""
-        white = solve_triangular(self.root, (z - self.middle).T, lower=True)
-        return 0.5 * (z * z).sum(1) - 0.5 * (white * white).sum(0) - np.log(self.root.diagonal()).sum()
-
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """(n, size) draws."""
-        return self.middle + rng.standard_normal((n, len(self.middle))) @ self.root.T
+    It is the prior times a wider likelihood: where nothing was told the prior is all that there is to fill.
+    """
+    spread, axes = np.linalg.eigh(normal.covariance)
+    precision = np.maximum(1 / spread - 1, 0)
+    told_of = (precision / (1 + precision)).sum()  # dimensions
+    wider = max(1.0, _FILLS * 2 * depth / (told_of + 2))  # an even ball of radius R has variance R^2 / (d + 2)
+    return Normal(normal.mean, axes / (1 / spread - precision + precision / wider) @ axes.T)
 
 
 class Corrected:

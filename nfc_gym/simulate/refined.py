@@ -61,8 +61,8 @@ def refined(
     rng = np.random.default_rng([seed, 2])
     first = Normal.prior(prior.size)
     if posterior is not None:
-        z = prior.to_z(np.asarray(posterior.of("psi").given(window).sample(_DRAWS, rng).psi))
-        first = Normal(z.mean(0), np.cov(z.T))
+        drawn = posterior.of("psi").given(window).sample(_DRAWS, rng).psi
+        first = Normal.through(prior.to_z(np.asarray(drawn)))
     states, actions = np.asarray(window.states, float), np.asarray(window.actions, float)
     require_commands(np.atleast_2d(actions), machine.habit.horizon, "window")
     actions = np.clip(actions, -1, 1)
