@@ -89,6 +89,8 @@ def test_what_cannot_be_refined_is_refused(flown: tuple[Window, np.ndarray]) -> 
     window, _ = flown
     with pytest.raises(InputError, match="on a plane only"):
         refined.refined(None, window, environment="QuadcopterRough")
+    with pytest.raises(InputError, match="no environment 'Quadcoptre'"):
+        refined.refined(None, window, environment="Quadcoptre")
     nameless = NeuralPosterior(untrained().network)
     with pytest.raises(InputError, match="name the environment"):
         refined.refined(nameless, window)
@@ -129,6 +131,7 @@ def test_the_command_line_refines(
     assert "not shown" in done.output
     refused = CliRunner().invoke(app, ["infer", "QuadcopterFlat", str(motion)])
     assert refused.exit_code == 2
+    assert "an environment goes with --refine N" in " ".join(refused.output.split())
 
 
 def test_its_file_is_a_proposal_and_a_belief(tmp_path: Path) -> None:
