@@ -295,10 +295,6 @@ def infer(
         from nfc_gym.inference.progress import Spoken
 
         trained = refine is None or posterior.suffix.lower() == ".safetensors"
-        if refine is None and not posterior.suffix and not posterior.exists():
-            raise InputError(
-                f"{posterior}: no such file; an environment goes with --refine N, which needs no posterior"
-            )
         environment = _environment(posterior) if trained and mapped else "" if trained else str(posterior)
         seen = _window(environment, window, log, until) if mapped else window
         anew, report = None, Spoken()

@@ -228,6 +228,8 @@ def infer(
             f"{posterior} is a structure head, which knows families of effects and no psi: give it to `nfc-gym "
             "close-loop --posterior`, and a posterior here"
         )
+    if posterior is not None and not posterior.suffix and not posterior.exists():
+        raise InputError(f"{posterior}: no such file; an environment goes with --refine N, which needs no posterior")
     found = None if posterior is None else load(posterior)
     seen, name = (window, "window") if isinstance(window, Window) else (read_window(window), str(window))
     if found is not None:
