@@ -278,8 +278,9 @@ def infer(
     made of their channels, for robots that feel no forces: Jackal, Quadcopter, Quadruped.
 
     A posterior of any window reads each a little coarsely. --refine N simulates this window's own commands again and
-    again, in rounds that close in on the psi which do what was observed: far sharper, in half a minute, on a plane, of
-    psi alone. It needs no trained posterior: give the environment's id, and it begins with the prior.
+    again, in rounds that close in on the psi which do what was observed: 10 to 90 s of a core, on a plane, of psi
+    alone, and sharper on all robots but the Jackal. It needs no trained posterior: give the environment's id, and it
+    begins with the prior.
 
     Either kind of --out goes into RandomizePsi, into `nfc-gym simulate --proposal` and into `nfc-gym close-loop
     --posterior`.

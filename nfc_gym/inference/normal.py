@@ -182,4 +182,7 @@ class NormalPosterior:
             )
         except (KeyError, TypeError, ValueError) as e:
             raise InputError(f"{path}: holds no normal posterior that this version knows ({e})") from None
-        return cls(prior, normal, notes, doubt, before)
+        try:
+            return cls(prior, normal, notes, doubt, before)
+        except InputError as e:
+            raise InputError(f"{path}: {e}") from None

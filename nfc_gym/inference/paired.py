@@ -38,7 +38,6 @@ _POOLED = 3  # rounds before this one that weights come from too,
 _ALIKE = 0.1  # where this one is told so much more than them at most, nats an entry of psi
 _FAR = 1.5  # standard deviations, root mean square over theta, that the middle goes in a round
 _STILL = 0.03  # nats an entry of psi that `LAST` rounds must have won, or they are the last
-_RIDGE = 1e-9
 _FAIR = 30.0  # standard deviations of the sensors, beyond which what is missed counts by its logarithm
 
 
@@ -168,7 +167,7 @@ def _next(believed: Normal, root: Array, told: _Told) -> Normal:
     covariance = (covariance + covariance.T) / 2
     step = covariance @ (back.T @ told.towards - believed.mean)
     far = float(np.sqrt(np.square(back @ step).mean()))
-    share = min(1.0, _FAR / max(far, _RIDGE))
+    share = _FAR / max(far, _FAR)
     missed = (1 - share) * step
     return Normal(believed.mean + share * step, covariance + np.outer(missed, missed) / len(step))
 

@@ -14,7 +14,7 @@ from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.simulate.machine import Machine
-from nfc_gym.simulate.repeated import Repeated
+from nfc_gym.simulate.repeated import Repeated, last_of
 from nfc_gym.simulate.rounds import Simulator
 
 Array = NDArray[np.float64]
@@ -63,8 +63,9 @@ def refined(
     if posterior is not None:
         drawn = posterior.of("psi").given(window).sample(_DRAWS, rng).psi
         first = Normal.through(prior.to_z(np.asarray(drawn)))
-    states, actions = np.asarray(window.states, float), np.asarray(window.actions, float)
-    require_commands(np.atleast_2d(actions), machine.habit.horizon, "window")
+    # Before anything is simulated.
+    states, actions = last_of(machine, np.asarray(window.states, float), np.asarray(window.actions, float))
+    require_commands(actions, len(actions), "window")
     actions = np.clip(actions, -1, 1)
     noise = float(np.max(notes["noise"]) / np.max(machine.noise)) if notes.get("noise") else 1.0
     simulator = Simulator(environment, effects=0.0, jobs=jobs, noise=noise, names=("states", "start"))

@@ -58,17 +58,7 @@ class Repeated:
           InputError: rough ground, another robot's window or windows, too short, not finite, or too few windows.
         """
         machine = Machine(simulator.environment)
-        h = machine.habit.horizon
-        states, actions = np.asarray(states, float), np.asarray(actions, float)
-        wanted = (machine.kind.proprio_size, machine.kind.action_size)
-        if states.ndim != 2 or actions.ndim != 2 or (states.shape[1], actions.shape[1]) != wanted or len(actions) < h:
-            raise InputError(
-                f"repeated: states {states.shape} and actions {actions.shape}; {machine.environment} wants "
-                f"({h + 1} or more, {wanted[0]}) and ({h} or more, {wanted[1]})"
-            )
-        states, actions = states[-h - 1 :], actions[-h:]
-        if not (np.isfinite(states).all() and np.isfinite(actions).all()):
-            raise InputError("repeated: the window has entries that are not finite")
+        states, actions = last_of(machine, states, actions)
         return cls(simulator, states, actions, Opening(Likely(machine, windows, states[0]), rng))
 
     @property
@@ -99,3 +89,23 @@ class Repeated:
         ends[np.abs(made["pose"][:, 0] - starts[:, :7]).max(1) > _APART] = np.nan
         off = machine.difference(np.broadcast_to(self.states[1:], ends.shape).copy(), ends)
         return (off[..., machine.told] / (self.simulator.noise * machine.noise[machine.told])).reshape(len(theta), -1)
+
+
+def last_of(machine: Machine, states: Array, actions: Array) -> tuple[Array, Array]:
+    """(H + 1, s) states and (H, a) actions, the last of a window.
+
+    Raises:
+      InputError: another robot's, too short, or not finite.
+    """
+    h = machine.habit.horizon
+    states, actions = np.asarray(states, float), np.asarray(actions, float)
+    wanted = (machine.kind.proprio_size, machine.kind.action_size)
+    if states.ndim != 2 or actions.ndim != 2 or (states.shape[1], actions.shape[1]) != wanted or len(actions) < h:
+        raise InputError(
+            f"repeated: states {states.shape} and actions {actions.shape}; {machine.environment} wants "
+            f"({h + 1} or more, {wanted[0]}) and ({h} or more, {wanted[1]})"
+        )
+    states, actions = states[-h - 1 :], actions[-h:]
+    if not (np.isfinite(states).all() and np.isfinite(actions).all()):
+        raise InputError("repeated: the window has entries that are not finite")
+    return states, actions

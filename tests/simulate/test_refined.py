@@ -149,3 +149,10 @@ def test_its_file_is_a_proposal_and_a_belief(tmp_path: Path) -> None:
     belief = read_belief(file, machine.space, 0)
     assert belief.names == machine.space.names
     np.testing.assert_allclose(prior.u_of(belief.draws).mean(0), 0.69, atol=0.02)
+
+
+def test_a_window_of_another_robot_is_refused_before_anything_is_simulated(flown: tuple[Window, np.ndarray]) -> None:
+    heard = Heard()
+    with pytest.raises(InputError, match=r"nfc_gym/JackalFlat-v0 wants \(51 or more, 15\)"):
+        refined.refined(None, flown[0], environment="JackalFlat", report=heard)
+    assert not heard.said
