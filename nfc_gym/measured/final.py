@@ -20,6 +20,7 @@ from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.run import Run
 from nfc_gym.measured.search import Found
 from nfc_gym.measured.settle import settle
+from nfc_gym.measured.verdict import Open
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.rollout import Plant
 
@@ -27,8 +28,8 @@ Array = NDArray[np.float64]
 _NOTHING = 0.5  # of the chance that an effect without size would seem smaller: a median one of these is no effect
 
 
-def final_models(run: Run, found: Found, whole: Problem) -> tuple[Model, Fit, Array]:
-    """Calibrated and extended model refitted on every fit segment; what step and search leave open of the latter."""
+def final_models(run: Run, found: Found, whole: Problem) -> tuple[Model, Fit, Open]:
+    """Calibrated and extended model refitted on every fit segment; what search and step leave open of the latter."""
     assert found.rest is not None
     last = found.rest.fitted
     effects = bool(last.plant.effects)
@@ -44,8 +45,8 @@ def final_models(run: Run, found: Found, whole: Problem) -> tuple[Model, Fit, Ar
             found.rounds.insert(len(found.rounds) - 1, Round([], 0.0, reason=why))  # the last one found nothing more
             rest = _without(extended.fitted, gone)
             extended = _settled(run, "extended, less", rest, whole) if rest.plant.effects else calibrated
-    unsure = np.hypot(step_error(whole, extended.under, extended.fitted), extended.unsure)
-    return Model(calibrated.plant, calibrated.x), extended.fitted, unsure
+    left = Open(extended.unsure, step_error(whole, extended.under, extended.fitted))
+    return Model(calibrated.plant, calibrated.x), extended.fitted, left
 
 
 def _without(fitted: Fit, gone: Sequence[Effect]) -> Fit:

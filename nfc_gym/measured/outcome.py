@@ -37,7 +37,7 @@ def report(
     fold: Fold,
     found: Found,
     final: tuple[Model, Fit],
-    step: Array,
+    left_open: say.Open,
     verifying: Problem,
     fitting: Problem,
     seed: int,
@@ -49,7 +49,7 @@ def report(
       bench: the mapping made ready.
       found: what the search found.
       final: calibrated and extended model.
-      step: (size,) what the physics step adds to the standard deviations of the extended model's parameters.
+      left_open: what search and physics step leave open of the extended model's parameters.
       verifying, fitting: the logs that nobody saw, and those that the final models were fitted to.
       seed: of the draws.
       tell: progress.
@@ -61,15 +61,15 @@ def report(
     tell(f"verifying on {len(verifying)} segments")
     v = say.verify(verifying, models, _REPLICAS, rng)
     shares = say.excess_shares(v, verifying, extended, models.calibrated)
-    sd = say.spread(extended, fitting, step)
-    rows = say.effect_rows(extended, found.rounds, sd, shares)
+    within = say.bounds(extended, fitting, left_open)
+    rows = say.effect_rows(extended, found.rounds, within, shares)
     errors = say.errors(v)
     laws = {e.id for e in extended.plant.effects if e.generic}
     gain = say.gain_interval(v, rng)
     judged = _judge(v, rows, laws, found, errors, gain)
     left = judged.verdict in ("unexplained", "partly explained")
     assert found.rest is not None
-    parameters = say.parameter_rows(extended, nominal[1], sd)
+    parameters = say.parameter_rows(extended, nominal[1], within)
     splits = {s: [log.name for log in dataset.of(s, fold)] for s in ("fit", "select", "verify")}
     return {
         "schema": 1,

@@ -21,6 +21,7 @@ from nfc_gym.physics.rollout import Plant
 Array = NDArray[np.float64]
 CAUSE = 0.5  # of the error beyond the noise: what claims must take away of it to be causes where something remains
 _OWNED, _AGREE = 2, 0.01  # twins that have covariances of their own; share of chi-squared that these may matter
+_TAIL = 1.96  # standard deviations to either side, within which 95 % lie
 _WILD = 1e6  # of a squared whitened number: more counts as this much
 
 
@@ -239,17 +240,31 @@ def null_bound(v: Verified) -> float:
     return float(v.null.mean()) + at * np.sqrt((1 + 1 / count) * whole)
 
 
-def spread(fitted: Fit, problem: Problem, step: Array) -> Array:
-    """(size,) standard deviations of a fit's parameters: what the data leave open, and what the physics step adds."""
-    return np.hypot(uncertainty(fitted, clusters(problem)), step)
+@dataclass(frozen=True)
+class Open:
+    """What is left open of a fit's parameters beside what the data's noise leaves.
+
+    Attributes:
+      search: (size,) standard deviation of what the search for them leaves open.
+      step: (2, size) how far below and above them the physics step may hide their values.
+    """
+
+    search: Array
+    step: Array
 
 
-def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any]]:
-    """Psi with intervals: its place in the model, estimate, 95 % bounds, and how it is known; sd (size,)."""
+def bounds(fitted: Fit, problem: Problem, left: Open) -> Array:
+    """(2, size) 95 % bounds of a fit's parameters: the noise's to either side, the step's to the side where it errs."""
+    noise = _TAIL * np.hypot(uncertainty(fitted, clusters(problem)), left.search)
+    return fitted.x + left.step + np.stack([-noise, noise])
+
+
+def parameter_rows(fitted: Fit, nominal: Array, within: Array) -> list[dict[str, Any]]:
+    """Psi with intervals: its place in the model, estimate, 95 % bounds (2, size), and how it is known."""
     space = fitted.plant.space
     rows = []
     for i, p in enumerate(space.parameters):
-        value, width = float(fitted.x[i]), p.high - p.low
+        value, width, (low, high) = float(fitted.x[i]), p.high - p.low, within[:, i]
         rows.append(
             {
                 "name": p.name,
@@ -258,19 +273,19 @@ def parameter_rows(fitted: Fit, nominal: Array, sd: Array) -> list[dict[str, Any
                 "of": list(p.of),
                 "nominal": float(nominal[i]),
                 "estimate": value,
-                "low": float(max(p.low, value - 1.96 * sd[i])),
-                "high": float(min(p.high, value + 1.96 * sd[i])),
+                "low": float(max(p.low, low)),
+                "high": float(min(p.high, high)),
                 "anchored": p.anchored,
                 "reason": p.reason,
-                "identifiable": bool(p.anchored or sd[i] < 0.25 * width / np.sqrt(12)),
+                "identifiable": bool(p.anchored or (high - low) / (2 * _TAIL) < 0.25 * width / np.sqrt(12)),
                 "left_prior": bool(not p.anchored and min(value - p.low, p.high - value) < 0.005 * width),
             }
         )
     return rows
 
 
-def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[str, float]) -> list[dict[str, Any]]:
-    """Accepted effects with sentences, intervals and equivalents; sd (size,) of all parameters.
+def effect_rows(fitted: Fit, rounds: Sequence[Round], within: Array, shares: dict[str, float]) -> list[dict[str, Any]]:
+    """Accepted effects with sentences, intervals and equivalents; 95 % bounds (2, size) of all parameters.
 
     A parameter that only sets a unit is `given`: its low and high are what it may be, and no interval.
     """
@@ -278,14 +293,14 @@ def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[st
     equivalents = {i: r.rivals(i) for r in rounds for i in r.accepted}
     rows = []
     for effect, theta in zip(fitted.plant.effects, fitted.plant.split(fitted.x)[1], strict=True):
-        own = sd[at : at + len(theta)]
+        own = within[:, at : at + len(theta)]
         at += len(theta)
         rows.append(
             {
                 "id": effect.id,
                 "family": effect.family,
                 "where": effect.where[0] if len(effect.where) == 1 else list(effect.where),
-                "sentence": effect.say(theta, own),
+                "sentence": effect.say(theta, (own[1] - own[0]) / (2 * _TAIL)),
                 "share_of_excess": shares.get(effect.id, 0.0),
                 "equivalents": equivalents.get(effect.id, []),
                 "own_values": isinstance(effect, Each),
@@ -294,12 +309,12 @@ def effect_rows(fitted: Fit, rounds: Sequence[Round], sd: Array, shares: dict[st
                 "parameters": {
                     p.name: {
                         "value": float(t),
-                        "low": float(max(p.low, t - 1.96 * s)),
-                        "high": float(min(p.high, t + 1.96 * s)),
+                        "low": float(max(p.low, low)),
+                        "high": float(min(p.high, high)),
                         "unit": p.unit,
                         **({"given": True} if p.given else {}),
                     }
-                    for p, t, s in zip(effect.params, theta, own, strict=True)
+                    for p, t, low, high in zip(effect.params, theta, *own, strict=True)
                 },
             }
         )

@@ -28,7 +28,7 @@ def test_psi_alone_is_begun_elsewhere_where_there_is_nothing_beside(
         rest=SimpleNamespace(fitted=last), calibrated=SimpleNamespace(plant=plant, x=np.ones(2))
     )
     monkeypatch.setattr(final, "_settled", settled)
-    monkeypatch.setattr(final, "step_error", lambda whole, under, fitted: np.zeros(len(fitted.x)))
+    monkeypatch.setattr(final, "step_error", lambda whole, under, fitted: np.zeros((2, len(fitted.x))))
     monkeypatch.setattr(final, "differs", lambda *_: True)
     monkeypatch.setattr(final, "clusters", lambda _: None)
     final.final_models(SimpleNamespace(), found, SimpleNamespace())  # pyright: ignore[reportArgumentType]

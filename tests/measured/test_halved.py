@@ -15,6 +15,7 @@ from nfc_gym.measured.settle import settle
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
 from nfc_gym.measured.steps import finer
+from nfc_gym.measured.verdict import Open, bounds
 from nfc_gym.physics.effects import build
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
@@ -76,9 +77,11 @@ def test_the_step_widens_the_interval_until_it_holds_the_truth(gain: float) -> N
     contest = arena(gain)
     problem, fitted = contest.fit_data.problem, contest.current
     sd, step = uncertainty(fitted, clusters(problem)), step_error(problem, contest.under, fitted)
-    off = np.abs(fitted.x - gain / 0.5)
-    assert 1.96 * sd < off < 1.96 * np.hypot(sd, step)
-    assert step < off
+    off, (low, high) = np.abs(fitted.x - gain / 0.5), bounds(fitted, problem, Open(np.zeros_like(sd), step))
+    assert off > 1.96 * sd
+    assert low < gain / 0.5 < high
+    assert np.ptp(step) < 1.5 * off
+    assert 0.0 in step, "a first-order step errs to one side"
 
 
 def test_a_halved_problem_is_the_same_experiment_at_half_the_step() -> None:

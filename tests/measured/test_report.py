@@ -171,7 +171,7 @@ def test_a_number_that_only_sets_a_unit_has_no_interval() -> None:
     sag = FAMILIES["supply_sag"](("winch",), sized(SupplySag.PARAMS, reference=narrow))
     x = np.array([0.99, 1.001 * volts])
     plant = SimpleNamespace(space=[], effects=[sag], split=lambda x: (x[:0], [x]))
-    (row,) = effect_rows(SimpleNamespace(plant=plant, x=x), [], np.array([0.005, 1.0]), {})  # type: ignore[arg-type]
+    (row,) = effect_rows(SimpleNamespace(plant=plant, x=x), [], x + np.outer([-1, 1], [0.01, 2.0]), {})  # type: ignore[arg-type]
     numbers = row["parameters"]
     assert numbers["reference"]["given"]
     assert "given" not in numbers["exponent"]
