@@ -13,6 +13,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import replacing
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.network import Encoded, Network
+from nfc_gym.inference.normal import FORMAT as OF_ONE_WINDOW
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.state import read, require_format
 
@@ -55,6 +56,11 @@ def load(path: Path, prior: PriorBox | None = None) -> tuple[Network, Encoded | 
       InputError: the file is damaged, of another format, or of another robot or prior than asked for.
     """
     tensors, metadata = read(path)
+    if metadata.get("format") == OF_ONE_WINDOW:
+        raise InputError(
+            f"{path}: the posterior of one window, as `nfc-gym infer --refine` writes it, and no network that could be "
+            "given another; give a network that `nfc-gym train` made, or refine for that window too"
+        )
     require_format(path, metadata, FORMAT)
     try:
         about = json.loads(metadata["about"])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.core import Fidelity, InputError, Posterior, kinds, load_source
+from nfc_gym.inference import checkpoint
 from nfc_gym.inference.normal import Normal, NormalPosterior
 from nfc_gym.inference.space import PriorBox
 
@@ -73,6 +74,12 @@ def test_its_file_is_a_source(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(InputError, match="truncated"):
         load_source(file)
+
+
+def test_it_is_no_network_for_another_window(tmp_path: Path) -> None:
+    posterior().save(tmp_path / "today.safetensors")
+    with pytest.raises(InputError, match=r"today\.safetensors: the posterior of one window"):
+        checkpoint.load(tmp_path / "today.safetensors")
 
 
 def test_what_is_wrong_is_named(tmp_path: Path) -> None:
