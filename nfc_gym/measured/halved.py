@@ -54,9 +54,8 @@ def step_error(problem: Problem, under: Metric, fitted: Fit) -> Array:
 
     Parameters make up for the step's error too: the best servo gain at 5 ms is not the machine's. A first-order step is
     off by twice what halving it changes, and by 4 / 3 of what quartering it changes; the bounds hold both, and 0. So
-    much is no noise, which would be as likely to either side. Halving alone may show nothing: the errors of a command's
-    lag and of the motion that follows it have opposite signs and another order, so that for a legged robot they cancel
-    at 5 ms and not at 1 ms.
+    much is no noise, which would be as likely to either side. Halving alone may show nothing, or the wrong side: the
+    lag of a legged robot, 6.65 ms, came out 0.22 ms too long at 5 ms, 0.39 at 2.5 ms and 0.14 at 1.25 ms.
 
     Returns:
       The first row at most 0 and the second at least; both 0 where no roll-outs are made.

@@ -1,10 +1,13 @@
 """What makes up for the error of a coarse step is no finding; what the machine does is one at any step."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 
 from nfc_gym.core import Channel, Log
+from nfc_gym.measured import halved
 from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.contest import clusters
 from nfc_gym.measured.cuts import Layout
@@ -82,6 +85,18 @@ def test_the_step_widens_the_interval_until_it_holds_the_truth(gain: float) -> N
     assert low < gain / 0.5 < high
     assert np.ptp(step) < 1.5 * off
     assert 0.0 in step, "a first-order step errs to one side"
+
+
+def test_what_a_quarter_of_the_step_shows_counts_where_half_of_it_shows_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    contest = arena(0.6)
+    ends = {DT: 1.0, DT / 2: 1.1, DT / 4: 0.7}
+    said = lambda problem, under, plant, *_, **__: SimpleNamespace(x=np.array([ends[plant.model.opt.timestep]]))  # noqa: E731
+    monkeypatch.setattr(halved, "fit", said)
+    below, above = step_error(contest.fit_data.problem, contest.under, contest.current)
+    assert below[0] == pytest.approx(-0.3 * 4 / 3)
+    assert above[0] == pytest.approx(0.1 * 2)
 
 
 def test_a_halved_problem_is_the_same_experiment_at_half_the_step() -> None:
