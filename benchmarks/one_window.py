@@ -1,10 +1,11 @@
 """What one window tells of psi when the simulator itself is asked, as `nfc-gym infer ID window.npz --refine` does.
 
     python benchmarks/one_window.py --out DIR [--robots Jackal Ant ...] [--windows N] [--simulations N] [--axle N]
-                                    [--seed S] [--jobs J] [--stop SECONDS] [--json FILE]
+                                    [--posteriors DIR] [--seed S] [--jobs J] [--stop SECONDS] [--json FILE]
     python benchmarks/one_window.py --quick
 
-Windows on flat ground under psi from the prior, drawn at run time, without a trained posterior: gain over the prior of
+Windows on flat ground under psi from the prior, drawn at run time, without a trained posterior or, with --posteriors,
+from `<Robot>Flat.safetensors` there, whose own gain is told beside: gain over the prior of
 the true psi, its share of what the window can tell at most (`simulate.ceiling`), how many truths the 90 % intervals
 hold, and the time on one core. With `--axle` also Jackals whose front-left servo has no gain. Each window is kept as it
 is done, so that the command goes on where it was stopped; `--stop` begins nothing new after so many seconds.
@@ -29,7 +30,7 @@ from posteriors.keep import Kept, begun
 
 from nfc_gym.core import Fidelity
 from nfc_gym.inference.normal import NormalPosterior
-from nfc_gym.inference.posterior import Window
+from nfc_gym.inference.posterior import Window, load
 from nfc_gym.inference.progress import Quiet
 from nfc_gym.simulate import Simulator, starts
 from nfc_gym.simulate.ceiling import ceiling
@@ -63,9 +64,9 @@ def before(environment: str, seed: int) -> Array:
     return starts.spread(Machine(environment), {"start": drawn["start"].numpy()})
 
 
-def judged(task: tuple[str, int, int, bool, int]) -> dict[str, Any]:
-    """One window: see `one`; it is asked for by (robot, number, seed, axle, simulations)."""
-    robot, number, seed, axle, simulations = task
+def judged(task: tuple[str, int, int, bool, int, Path | None]) -> dict[str, Any]:
+    """One window: see `one`; it is asked for by (robot, number, seed, axle, simulations, folder of posteriors)."""
+    robot, number, seed, axle, simulations, folder = task
     environment = f"nfc_gym/{robot}Flat-v0"
     machine = Machine(environment)
     rng = np.random.default_rng([seed, ROBOTS.index(robot), number, int(axle)])
@@ -76,12 +77,18 @@ def judged(task: tuple[str, int, int, bool, int]) -> dict[str, Any]:
     psi = machine.space.low + u * (machine.space.high - machine.space.low)
     seen = Simulator(environment, effects=0.0, jobs=1, names=("states", "actions", "start", *GROUND))(psi, rng)
     window, heard, clock = Window(seen["states"][0].numpy(), seen["actions"][0].numpy()), Rounds(), time.monotonic()
-    found = refined(None, window, environment=environment, simulations=simulations, seed=number, jobs=1, report=heard)
+    trained = None if folder is None else load(folder / f"{robot}Flat.safetensors")
+    found = refined(
+        trained, window, environment=environment, simulations=simulations, seed=number, jobs=1, report=heard
+    )
     out: dict[str, Any] = {"seconds": time.monotonic() - clock, "rounds": heard.count}
     draws = found.prior.u_of(found.sample(SAMPLES, rng).psi)[None]
     low, high = (end[0] for end in metrics.intervals(draws, LEVEL))
     if at is not None:
         return out | {"held": float(low[at] <= u[0, at] <= high[at]), "width": float(high[at] - low[at])}
+    if trained is not None:
+        known = trained.of("psi").given(window).log_prob(Fidelity(psi))
+        out["trained"] = float(known[0] + found.prior.log_volume) / found.prior.size
     asked = {name: t.numpy() for name, t in seen.items()} | {"psi": u}
     most = ceiling(environment, asked, before=before(environment, seed))
     return out | one(found, psi, u, low, high) | {"ceiling": float(most.joint[0]) / found.prior.size}
@@ -107,7 +114,7 @@ def rows(kept: Kept, robots: list[str]) -> list[dict[str, Any]]:
         if not own:
             continue
         row: dict[str, Any] = {"name": name, "windows": len(own)}
-        for key in [k for k in ("gain", "ceiling", "squares", "held", "width") if k in own[0]]:
+        for key in [k for k in ("gain", "trained", "ceiling", "squares", "held", "width") if k in own[0]]:
             fine = [c[key] for c in own if np.isfinite(c[key])]
             row |= dict(zip((key, f"{key}_error"), metrics.mean(np.array(fine)), strict=True))
         told = [(c["gain"], c["ceiling"]) for c in own if np.isfinite(c.get("ceiling", np.nan))]
@@ -130,6 +137,8 @@ def said(row: dict[str, Any]) -> str:
             f"({row.get('share', np.nan):.2f}; least {row['least']:.2f})"
         )
         parts.append(f"squares {row['squares']:.2f}")
+    if "trained" in row:
+        parts.append(f"the trained posterior alone {row['trained']:.3f} +- {row['trained_error']:.3f}")
     parts.append(f"90 % intervals hold {row['held']:.3f} +- {row['held_error']:.3f}")
     if "narrow" in row:
         parts.append(f"under a quarter of the prior {row['narrow']:.2f}")
@@ -140,9 +149,11 @@ def main(argv: list[str] | None = None) -> int:
     """Command line."""
     args = arguments(argv)
     seed = begun(args.out, args.seed)
-    kept = Kept(args.out, {"simulations": args.simulations, "seed": seed})
-    wanted = [(name, (name, i, seed, False, args.simulations)) for i in range(args.windows) for name in args.robots]
-    wanted += [("axle", ("Jackal", i, seed, True, args.simulations)) for i in range(args.axle)]
+    settings = {"simulations": args.simulations, "seed": seed}
+    kept = Kept(args.out, settings | ({"trained": True} if args.posteriors else {}))
+    how = args.simulations, args.posteriors
+    wanted = [(name, (name, i, seed, False, *how)) for i in range(args.windows) for name in args.robots]
+    wanted += [("axle", ("Jackal", i, seed, True, *how)) for i in range(args.axle)]
     tasks = [(f"{name}_{task[1]}", task) for name, task in wanted if not kept.has(f"{name}_{task[1]}")]
     print(f"seed {seed}; {len(wanted) - len(tasks)} of {len(wanted)} windows are there already", flush=True)
     until = time.monotonic() + args.stop
@@ -170,6 +181,7 @@ def arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--windows", type=count(0), default=40, help="a robot (default %(default)s)")
     parser.add_argument("--axle", type=count(0), default=0, help="Jackals with a lost axle (default %(default)s)")
     parser.add_argument("--simulations", type=count(1), default=10_000, help="a window at most (default %(default)s)")
+    parser.add_argument("--posteriors", type=Path, metavar="DIR", help="trained ones to begin with")
     parser.add_argument("--seed", type=count(0), help="default the folder's, or a new one, which is printed")
     parser.add_argument("--jobs", type=count(1), default=os.cpu_count() or 1, help="processes (default all cores)")
     parser.add_argument("--stop", type=number(0), default=float("inf"), help="s, after which nothing new begins")

@@ -1,11 +1,12 @@
 """Where the candidates of one round meet: each is fitted to one model to beat, and judged by one yardstick."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nfc_gym.measured.contest import Judged
+from nfc_gym.measured.contest import Judged, mean
 from nfc_gym.measured.fit import TURNING, Fit, fit, fit_last
 from nfc_gym.measured.metric import Metric, loss, metric
 from nfc_gym.measured.owned import Data, Told, heard
@@ -54,14 +55,21 @@ class Arena(Yardstick):
         current, told = _at_half(data.problem, self.under, self.current), self._told_at_half(self.current)
         return Arena(data, select, current, self.under, self.extra, self.rng, self.say, own=self.own, told=told)
 
-    def enter_halved(self, coarse: Judged, whole: "Arena") -> Judged:
-        """Judge here, at half the step, a candidate that was fitted in the arena of the whole one.
+    def enter_halved(self, duel: Sequence[Judged], whole: "Arena") -> list[Judged]:
+        """Judge here, at half the step, rivals that were fitted in the arena of the whole one.
 
-        The noise that it expects follows from what it told there: its fit at half the step moves it little.
+        Where each has a metric of its own, all are judged by those of all in turn, and by the mean of what they say.
+        Rivals that predict much the same motion have much the same noise to expect, and the chance in what each was
+        told of it may be worth more than all that lies between them. The noise follows from what was told at the whole
+        step: a fit at half of it moves a model little.
         """
-        self.say(f"judging {self.label(coarse)} at half the physics step")
-        at_half = _at_half(self.fit_data.problem, self.under, coarse.fitted)
-        return self.judge(at_half, whole._told_at_half(coarse.fitted))
+        told = [whole._told_at_half(j.fitted) for j in duel] if self.own else [None]
+        found = []
+        for j in duel:
+            self.say(f"judging {self.label(j)} at half the physics step")
+            at_half = _at_half(self.fit_data.problem, self.under, j.fitted)
+            found.append(mean([self.judge(replace(at_half), each) for each in told]))
+        return found
 
     def _told_at_half(self, fitted: Fit) -> Told:
         """Where a model of this arena told the noise that it expects, as a model at half the step."""

@@ -74,6 +74,13 @@ class Judged:
         return float(self.gains.sum()) + float(self.fit_gains.sum())
 
 
+def mean(judged: Sequence[Judged]) -> Judged:
+    """One candidate as several metrics judge it, in the mean."""
+    gains, fit_gains = (np.mean([getattr(j, name) for j in judged], 0) for name in ("gains", "fit_gains"))
+    total, lower = (float(np.mean([getattr(j, name) for j in judged])) for name in ("total", "lower"))
+    return Judged(judged[0].fitted, gains, fit_gains, total, lower)
+
+
 def losses(problem: Problem, metric: Metric, fitted: Fit) -> Array:
     """(S,) loss of each block of a problem under a fitted model."""
     return loss(metric.whiten(fitted_residual(problem, fitted)))[0]

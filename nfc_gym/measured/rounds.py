@@ -298,8 +298,8 @@ class Contest:
 
         A coarse step errs in time by about half of itself, which a delay mends better than the lag that is at work.
         """
-        fine = self.arena.halved()
-        found = [replace(fine.enter_halved(j, self.arena), fitted=j.fitted) for j in duel]
+        found = self.arena.halved().enter_halved(duel, self.arena)
+        found = [replace(f, fitted=j.fitted) for f, j in zip(found, duel, strict=True)]
         return sorted(found, key=lambda j: -j.total)
 
     def _together(self, pairs: Sequence[Judged], believed: Sequence[Judged], judged: Sequence[Judged]) -> list[Judged]:

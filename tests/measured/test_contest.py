@@ -1,12 +1,13 @@
 """Believing a candidate: folds that leave out, clusters that belong together, and gains that are not chance."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from nfc_gym.measured.arena import Arena
 from nfc_gym.measured.choice import Choice
 from nfc_gym.measured.contest import (
     Judged,
@@ -407,6 +408,13 @@ def test_the_leading_law_is_tried_where_like_places_share_it() -> None:
     assert contest._shared([refitted(one)]) == []
 
 
+@dataclass(frozen=True)
+class SimpleFit:
+    """A fit that is known by its law's family."""
+
+    family: str
+
+
 def rated(family: str, total: float, where: tuple[str, ...] = ("all",)) -> Judged:
     own = FAMILIES[family]
     effect = SimpleNamespace(
@@ -422,9 +430,10 @@ def test_who_comes_near_the_best_meets_it_again_at_half_the_step() -> None:
     judged = [best, rated("delay", 95.0, ("one",)), lag, apart, gain, slip, faint]
     said: list[Judged] = []
 
-    def again(j: Judged, whole: Any) -> Judged:
-        said.append(j)
-        return replace(j, total=200.0 if j is lag else 50.0, fitted=SimpleNamespace(step="half"))  # type: ignore[arg-type]
+    def again(duel: list[Judged], whole: Any) -> list[Judged]:
+        said.extend(duel)
+        half: Any = SimpleNamespace(step="half")
+        return [replace(j, total=200.0 if j is lag else 50.0, fitted=half) for j in duel]
 
     arena: Any = SimpleNamespace(
         fit_data=SimpleNamespace(problem=SimpleNamespace(rough=True)),
@@ -442,6 +451,33 @@ def test_who_comes_near_the_best_meets_it_again_at_half_the_step() -> None:
     assert contest._rivals(best, judged) == []
 
 
+@pytest.mark.parametrize("own", [True, False])
+def test_rivals_are_judged_by_the_noise_of_each_in_turn(own: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What chance has told one of them of its noise counts for the other as well."""
+    worth = {("delay", "delay"): 1100.0, ("delay", "lag"): 560.0, ("lag", "delay"): 1080.0, ("lag", "lag"): 600.0}
+    monkeypatch.setattr("nfc_gym.measured.arena._at_half", lambda problem, under, fitted: SimpleFit(fitted.family))
+
+    def judge(fitted: Any, told: str | None) -> Judged:
+        total = worth[fitted.family, told or "delay"]
+        return Judged(fitted, np.array([total]), np.array([total / 2]), total, total / 10)
+
+    fine: Any = SimpleNamespace(
+        own=own,
+        say=lambda text: None,
+        label=lambda j: "",
+        fit_data=SimpleNamespace(problem=None),
+        under=None,
+        judge=judge,
+    )
+    whole: Any = SimpleNamespace(_told_at_half=lambda fitted: fitted.family)
+    duel = [Judged(SimpleFit(f), np.zeros(1), np.zeros(1), 0.0, 0.0) for f in ("delay", "lag")]  # pyright: ignore[reportArgumentType]
+    delay, lag = Arena.enter_halved(fine, duel, whole)
+    assert (delay.total, lag.total) == ((830.0, 840.0) if own else (1100.0, 1080.0))
+    assert delay.lower == delay.total / 10
+    assert delay.gains == delay.total
+    assert delay.fit_gains == delay.total / 2
+
+
 def test_the_same_law_at_a_place_where_it_does_as_well_comes_to_half_the_step_too() -> None:
     """Of two coupled jaws friction at one alone; what is clearly worse there, and values of their own, stay away."""
     best, one, worse = (
@@ -452,9 +488,9 @@ def test_the_same_law_at_a_place_where_it_does_as_well_comes_to_half_the_step_to
     apart, other = rated("coulomb", 99.0, ("l", "r")), rated("hysteresis", 98.0, ("l",))
     met: list[str] = []
 
-    def again(j: Judged, whole: Any) -> Judged:
-        met.append(arena.label(j))
-        return j
+    def again(duel: list[Judged], whole: Any) -> list[Judged]:
+        met.extend(map(arena.label, duel))
+        return duel
 
     arena: Any = SimpleNamespace(
         fit_data=SimpleNamespace(problem=SimpleNamespace(rough=True)),
