@@ -241,6 +241,47 @@ def test_refined_windows_are_judged_beside_the_first_round(tmp_path: Path, monke
     assert told["what these windows tell at most, gain a parameter"].value == 2
 
 
+def test_one_window_begins_with_a_trained_posterior(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An untrained one here, whose own gain is told beside; it is named where its folder lacks it."""
+    import one_window
+    from posteriors.sets import environment, prior_of
+
+    from nfc_gym.core import InputError
+    from nfc_gym.inference.config import NetworkConfig, Sizes
+    from nfc_gym.inference.encoders.place import place_of
+    from nfc_gym.inference.network import Network
+    from nfc_gym.inference.normal import Normal, NormalPosterior
+    from nfc_gym.inference.posterior import NeuralPosterior, Window
+    from nfc_gym.simulate.machine import Machine
+
+    env = environment("Quadcopter", "Flat")
+    prior, machine, begun = prior_of(env), Machine(env), list[object]()
+    sizes = Sizes(
+        machine.habit.horizon, machine.kind.proprio_size, machine.kind.action_size, place=place_of(machine.state_names)
+    )
+    quick = NetworkConfig("nn", "mixture", width=16, features=16, hidden=16, components=1)
+
+    def refined(posterior: object, window: Window, **how: object) -> NormalPosterior:
+        begun.append(posterior)
+        return NormalPosterior(prior, Normal.prior(prior.size))
+
+    monkeypatch.setattr(one_window, "refined", refined)
+    monkeypatch.setattr(one_window, "before", lambda *_: None)
+    monkeypatch.setattr(one_window, "ceiling", lambda *_, **__: SimpleNamespace(joint=np.array([9.0])))
+    command = ["--robots", "Quadcopter", "--windows", "1", "--jobs", "1", "--seed", "3"]
+    table = tmp_path / "rows.json"
+    with pytest.raises(InputError, match=r"QuadcopterFlat\.safetensors"):
+        one_window.main([*command, "--out", str(tmp_path / "a"), "--posteriors", str(tmp_path)])
+    NeuralPosterior(Network(quick, sizes, prior)).save(tmp_path / "QuadcopterFlat.safetensors")
+    for out, more in (("b", ["--posteriors", str(tmp_path)]), ("c", [])):
+        assert one_window.main([*command, "--out", str(tmp_path / out), "--json", str(table), *more]) == 0
+        row = json.loads(table.read_text())["rows"][0]
+        assert isinstance(begun[-1], NeuralPosterior) == ("trained" in row) == bool(more)
+        assert row["gain"] == pytest.approx(0, abs=1e-9)
+        if more:
+            assert math.isfinite(row["trained"])
+
+
 @pytest.mark.parametrize("method", ["sde-nn", "mdn-rff"])
 def test_each_method_has_the_seconds_of_the_budget(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
