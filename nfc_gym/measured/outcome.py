@@ -66,7 +66,7 @@ def report(
     errors = say.errors(v)
     laws = {e.id for e in extended.plant.effects if e.generic}
     gain = say.gain_interval(v, rng)
-    judged = _judge(v, rows, laws, found, errors, gain)
+    judged = _judge(v, rows, laws, found, errors, gain, say.nought(extended, within))
     left = judged.verdict in ("unexplained", "partly explained")
     assert found.rest is not None
     parameters = say.parameter_rows(extended, nominal[1], within)
@@ -138,12 +138,13 @@ def _judge(
     found: Found,
     errors: dict[str, Any],
     gain: tuple[float, float],
+    nought: Container[str] = (),
 ) -> _Judged:
     """Divide what was found into causes and proposals; `laws` are the ids of those without a name.
 
     See `doubt` for what leads its rivals by too little, `form` for what has another's form. `gain` is the interval of
     what is left of the calibrated model's chi-squared: where nothing is missing that the unseen logs show, and what was
-    found may well make no difference there, it is the cause of nothing.
+    found may well make no difference there, it is the cause of nothing. `nought` are effects whose sizes may be none.
     """
     named, proposed = ([r for r in rows if (r["id"] in laws) == law] for law in (False, True))
     generic = found.generic is not None or bool(proposed)
@@ -160,8 +161,8 @@ def _judge(
         return _Judged(verdict, named, [], proposed, taken)
     every = [r | ({"mended_by": by} if (by := found.misshapen.get(r["id"])) else {}) for r in every]
     guesses = every if taken < say.CAUSE else [r for r in every if r["alike"] or "mended_by" in r]
-    # What mends nothing on the unseen logs has mended what the fit left of another law.
-    weak = [r for r in every if r in guesses or r["share_of_excess"] <= 0]
+    # What mends nothing on the unseen logs has mended what the fit left of another law; so has what may have no size.
+    weak = [r for r in every if r in guesses or r["share_of_excess"] <= 0 or r["id"] in nought]
     causes = [r for r in named if r["id"] not in {w["id"] for w in weak}]
     # Beside guesses, what is no guess must itself bring the half: a small law that had no rival is not the cause.
     if guesses and sum(r["share_of_excess"] for r in causes) < say.CAUSE:

@@ -321,6 +321,18 @@ def effect_rows(fitted: Fit, rounds: Sequence[Round], within: Array, shares: dic
     return rows
 
 
+def nought(fitted: Fit, within: Array) -> set[str]:
+    """Ids of accepted effects of which every size may be one that does nothing, by 95 % bounds (2, size)."""
+    at, out = len(fitted.plant.space), set[str]()
+    for effect in fitted.plant.effects:
+        low, high = within[:, at : at + len(effect.params)]
+        at += len(effect.params)
+        sizes = [not (p.shape or p.given) for p in effect.params]
+        if ((low <= effect.null) & (effect.null <= high))[sizes].all():
+            out.add(effect.id)
+    return out
+
+
 def excess_shares(v: Verified, problem: Problem, fitted: Fit, calibrated: tuple[Plant, Array]) -> dict[str, float]:
     """Share of the excess chi-squared that comes back when each effect alone is taken out, on the verification logs."""
     measure = metric(problem, v.sigma)

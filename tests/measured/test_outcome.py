@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nfc_gym.measured.outcome import _judge
+from nfc_gym.measured.verdict import nought
 
 ROWS: list[dict[str, Any]] = [{"id": "wind:base", "share_of_excess": 0.1}, {"id": "law_power:base"}]
 
@@ -18,6 +19,7 @@ def judged(
     misshapen: dict[str, str] | None = None,
     gain: tuple[float, float] = (0.5, 0.9),
     generic: str | None = None,
+    nought: tuple[str, ...] = (),
     **doubted: list[str],
 ) -> Any:
     """Of models that leave `after` beyond a noise of 1, where calibration leaves 5, with this chi-squared."""
@@ -25,7 +27,7 @@ def judged(
     v: Any = SimpleNamespace(null=np.ones(6), shares=np.ones((6, 1)), chi2=lambda stage: chi2)
     doubts = {f"{family}:base": ids for family, ids in doubted.items()}
     found: Any = SimpleNamespace(generic=generic, doubted=doubts, misshapen=misshapen or {})
-    return _judge(v, rows, {"law_power:base"}, found, {"groups": {"angle": row}}, gain)
+    return _judge(v, rows, {"law_power:base"}, found, {"groups": {"angle": row}}, gain, nought)
 
 
 @pytest.mark.parametrize(("after", "claimed"), [(np.sqrt(12.5), True), (np.sqrt(13.5), False)])
@@ -66,6 +68,34 @@ def test_one_guess_among_several_is_no_cause() -> None:
     alone = judged(3.0, 1.5, wind=alike)
     assert (alone.verdict, alone.share) == ("unexplained", alone.taken)
     assert judged(1.0, 1.0, wind=alike).claimed == ROWS[:1]
+
+
+def test_what_may_have_no_size_is_no_cause_where_something_remains() -> None:
+    beside = {"id": "lag:rotor", "share_of_excess": 0.0004}
+    out = judged(3.0, 1.5, [*ROWS[:1], beside], nought=("lag:rotor",))
+    assert (out.verdict, out.claimed) == ("partly explained", ROWS[:1])
+    assert out.weak == [beside | {"nearest": True, "alike": []}]
+    assert judged(3.0, 1.5, nought=("wind:base",)).verdict == "unexplained"
+    assert judged(1.0, 1.0, nought=("wind:base",)).claimed == ROWS[:1]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "none"),
+    [
+        ([0.0, -0.1, -0.2], [0.03, 0.1, 0.2], {"lag:m", "external_force:base"}),
+        ([0.001, -0.1, 0.1], [0.03, 0.1, 0.2], set()),  # along one axis the push is sure
+        ([0.001, -0.1, -0.2], [0.03, 0.1, 0.2], {"external_force:base"}),
+    ],
+)
+def test_an_effect_of_which_every_size_may_be_none(low: list[float], high: list[float], none: set[str]) -> None:
+    def law(name: str, *shapes: bool) -> Any:
+        params = [SimpleNamespace(shape=shape, given=False) for shape in shapes]
+        return SimpleNamespace(id=name, params=params, null=np.zeros(len(shapes)))
+
+    effects = [law("lag:m", False), law("external_force:base", False, False, True)]
+    fitted: Any = SimpleNamespace(plant=SimpleNamespace(space=("mass",), effects=effects))
+    within = np.array([[1.0, *low, 5.0], [2.0, *high, 6.0]])  # psi, the sizes, and a shape that none of this is about
+    assert nought(fitted, within) == none
 
 
 def test_what_is_small_beside_guesses_is_no_cause() -> None:
