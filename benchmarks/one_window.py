@@ -4,11 +4,12 @@
                                     [--posteriors DIR] [--seed S] [--jobs J] [--stop SECONDS] [--json FILE]
     python benchmarks/one_window.py --quick
 
-Windows on flat ground under psi from the prior, drawn at run time, without a trained posterior or, with --posteriors,
-from `<Robot>Flat.safetensors` there, whose own gain is told beside: gain over the prior of
+Windows on flat ground under psi from the prior, drawn at run time, without a trained posterior: gain over the prior of
 the true psi, its share of what the window can tell at most (`simulate.ceiling`), how many truths the 90 % intervals
 hold, and the time on one core. With `--axle` also Jackals whose front-left servo has no gain. Each window is kept as it
 is done, so that the command goes on where it was stopped; `--stop` begins nothing new after so many seconds.
+With `--posteriors` rounds begin where `DIR/<Robot>Flat.safetensors`, a trained posterior, believes psi to be, and its
+own gain is told beside.
 """
 
 import argparse

@@ -160,9 +160,10 @@ def _judge(
     if verdict != "partly explained":
         return _Judged(verdict, named, [], proposed, taken)
     every = [r | ({"mended_by": by} if (by := found.misshapen.get(r["id"])) else {}) for r in every]
+    every = [r | ({"may_be_none": True} if r["id"] in nought else {}) for r in every]
     guesses = every if taken < say.CAUSE else [r for r in every if r["alike"] or "mended_by" in r]
     # What mends nothing on the unseen logs has mended what the fit left of another law; so has what may have no size.
-    weak = [r for r in every if r in guesses or r["share_of_excess"] <= 0 or r["id"] in nought]
+    weak = [r for r in every if r in guesses or r["share_of_excess"] <= 0 or "may_be_none" in r]
     causes = [r for r in named if r["id"] not in {w["id"] for w in weak}]
     # Beside guesses, what is no guess must itself bring the half: a small law that had no rival is not the cause.
     if guesses and sum(r["share_of_excess"] for r in causes) < say.CAUSE:

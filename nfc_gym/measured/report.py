@@ -176,6 +176,7 @@ def _effect(effect: Row, effects: Sequence[Row]) -> Row:
         "nearest": bool(effect.get("nearest")),
         "alike": effect.get("alike") or [],
         "mended_by": wording.smooth(effect["mended_by"]) if "mended_by" in effect else "",
+        "may_be_none": bool(effect.get("may_be_none")),
         "share": share,
         "meter": charts.meter(share, 1.0, "extended"),
         "equivalents": story.rivals_of(effect, effects),

@@ -48,6 +48,8 @@ def unexplained(
             near += f", but {' and '.join(map(wording.smooth, mended))} mends much of what that leaves"
         elif alike:
             near += f", but {', '.join(alike)} would explain nearly as much"
+        elif all("may_be_none" in r for r in weak):
+            near += ", and by its intervals may have no size at all"
         else:
             near += ", too little to be the cause"
     assert found.rest is not None

@@ -74,7 +74,7 @@ def test_what_may_have_no_size_is_no_cause_where_something_remains() -> None:
     beside = {"id": "lag:rotor", "share_of_excess": 0.0004}
     out = judged(3.0, 1.5, [*ROWS[:1], beside], nought=("lag:rotor",))
     assert (out.verdict, out.claimed) == ("partly explained", ROWS[:1])
-    assert out.weak == [beside | {"nearest": True, "alike": []}]
+    assert out.weak == [beside | {"nearest": True, "alike": [], "may_be_none": True}]
     assert judged(3.0, 1.5, nought=("wind:base",)).verdict == "unexplained"
     assert judged(1.0, 1.0, nought=("wind:base",)).claimed == ROWS[:1]
 

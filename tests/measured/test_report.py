@@ -104,6 +104,9 @@ def test_what_comes_nearest_is_no_claim() -> None:
     assert "No effect is claimed." in text
     assert "too little of what is missing to be believed the cause" in text
     assert "a proposed law" not in text
+    text = read(render(report | {"effects": [], "proposals": [near | {"may_be_none": True}]}, pictures())).text
+    assert "by its intervals it may have no size at all" in text
+    assert "too little of what is missing to be believed the cause" not in text
 
 
 def test_what_may_make_no_difference_is_told_as_that() -> None:

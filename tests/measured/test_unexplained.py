@@ -145,6 +145,12 @@ def test_what_takes_away_too_little_is_named_as_the_nearest_and_no_cause() -> No
     assert guesses.endswith("explains 6%, but gain:rotor, payload:base would explain nearly as much")
 
 
+def test_what_may_have_no_size_is_told_as_that() -> None:
+    text = said(None, ("spring_offset:knee",), may_be_none=True)["description"]
+    assert text.count(", and by its intervals may have no size at all") == 1
+    assert "too little to be the cause" not in text
+
+
 def test_what_mends_a_claim_of_another_form_is_said() -> None:
     text = said(None, ("spring_offset:knee",), mended_by="generic_position:knee")["description"]
     assert "but a smooth force by position at knee mends much of what that leaves" in text
