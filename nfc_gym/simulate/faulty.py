@@ -15,24 +15,19 @@ from nfc_gym.core.files import replacing
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.windows import Batch
 from nfc_gym.physics.parameters import ParameterSpace
-from nfc_gym.simulate.draws import geometric
+from nfc_gym.simulate.fault_kinds import KINDS, Acting, Scaled, fault_kinds
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.pool import unordered
-from nfc_gym.simulate.residuals import candidates, sizes
 from nfc_gym.simulate.trials import trials
 
 Array = NDArray[np.float64]
-KINDS = ("none", "mass", "friction", "gain", "effect")
 _ROWS = 500  # windows that a process makes at once: a second or two
-_TOGETHER = 10  # windows with the same effect, whose edits of the model take longer than the windows
-_MASS, _FRICTION, _GAIN = (1.2, 2.5), (0.2, 0.8), (0.0, 0.5)  # a mass is more or less by that factor
 
 
 def faulty(machine: Machine, psi: Array, seed: int, *, noise: float = 1.0, nthread: int = 1) -> Batch:
     """One window on a plane for each row of psi, with sensor noise and one fault.
 
-    Kinds are drawn alike: the main body heavier or lighter (x 1.2 to 2.5, or one by that), less friction (x 0.2 to 0.8)
-    and a servo that is lost or weak (x 0 to 0.5) where psi has them, and an effect of the library, of a realistic size.
+    Kinds are drawn alike; see `fault_kinds`.
 
     Args:
       machine: the robot, on a plane.
@@ -51,24 +46,28 @@ def faulty(machine: Machine, psi: Array, seed: int, *, noise: float = 1.0, nthre
     psi, rng = np.array(psi, float), np.random.default_rng(seed)
     if psi.ndim != 2 or psi.shape[1] != len(machine.space) or not len(psi):
         raise InputError(f"faulty: psi has shape {psi.shape}, want (n, {len(machine.space)}) with n of 1 or more")
-    scales = _scales(machine)
-    names = list(scales)
-    kind = rng.integers(len(scales) + 1, size=len(psi))
+    kinds = fault_kinds(machine)
+    kind = np.array([KINDS.index(k) for k in kinds])[rng.integers(len(kinds), size=len(psi))]
+    off = np.zeros(len(psi), bool)
     for row, k in enumerate(kind):
-        if k < len(scales):
-            psi[row] *= scales[names[k]](rng)
-    scaled, first = np.flatnonzero(kind < len(scales)), int(rng.integers(2**31))
+        if isinstance(drawn := kinds[KINDS[k]], Scaled):
+            psi[row], off[row] = psi[row] * drawn.factors(rng), True
+    scaled, first = np.flatnonzero(off), int(rng.integers(2**31))
     how = {"noise": noise, "nthread": nthread}
     parts = [_of(scaled, trials(machine, psi[scaled], first, **how))] if len(scaled) else []
-    library, rest = candidates(machine), np.flatnonzero(kind == len(scales))
-    for i in range(0, len(rest), _TOGETHER):
-        rows, effect = rest[i : i + _TOGETHER], library[rng.integers(len(library))]
-        theta = np.tile(sizes(effect, rng.random((1, 2 * len(effect.params)))), (len(rows), 1))
-        effect.bind(machine.model)
-        found = trials(machine, psi[rows], int(rng.integers(2**31)), effect=effect, theta=theta, **how)
-        parts.append(_of(rows, found))
+    for name, acting in kinds.items():
+        rest = np.flatnonzero(kind == KINDS.index(name))
+        if not isinstance(acting, Acting) or not len(rest):
+            continue
+        together = acting.together or len(rest)
+        for i in range(0, len(rest), together):
+            rows, effect = rest[i : i + together], acting.effects[rng.integers(len(acting.effects))]
+            theta = acting.theta(effect, len(rows), rng)
+            effect.bind(machine.model)
+            found = trials(machine, psi[rows], int(rng.integers(2**31)), effect=effect, theta=theta, **how)
+            parts.append(_of(rows, found))
     out = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-    return out | {"kind": np.array([KINDS.index(k) for k in (*names, "effect")])[kind[out["row"]]]}
+    return out | {"kind": kind[out["row"]]}
 
 
 def lessons(
@@ -178,26 +177,3 @@ def _made(environment: str, psi: Array, seed: int, at: int) -> Batch:
 def _of(rows: NDArray[np.intp], found: Batch) -> Batch:
     """Windows of some rows, whose rows are told among all."""
     return found | {"row": rows[found["row"]]}
-
-
-def _scales(machine: Machine) -> dict[str, Callable[[np.random.Generator], Array]]:
-    """Kinds of faults of psi: functions that draw (d,) factors."""
-    names = machine.space.names
-    bodies = [n for n in names if n.endswith("_mass")][:1]
-    rubbing = [n for n in names if n.endswith("_friction")]
-    servos = [n for n in names if n.endswith("_damping")]  # the gain of a wheel's servo
-
-    def scaled(which: list[str], by: float) -> Array:
-        return np.where([n in which for n in names], by, 1.0)
-
-    def mass(rng: np.random.Generator) -> Array:
-        return scaled(bodies, float(geometric(rng.random(1), *_MASS)[0]) ** rng.choice([-1, 1]))
-
-    def friction(rng: np.random.Generator) -> Array:
-        return scaled(rubbing, float(geometric(rng.random(1), *_FRICTION)[0]))
-
-    def gain(rng: np.random.Generator) -> Array:
-        return scaled([servos[rng.integers(len(servos))]], rng.uniform(*_GAIN))
-
-    kinds = {"mass": (mass, bodies), "friction": (friction, rubbing), "gain": (gain, servos)}
-    return {name: draw for name, (draw, of) in kinds.items() if of}

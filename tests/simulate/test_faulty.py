@@ -1,14 +1,17 @@
 """Lessons for a fault classifier: half of the machines are sound, the others have a fault of the kind that is said."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from nfc_gym.core import InputError
 from nfc_gym.simulate import faulty as module
-from nfc_gym.simulate.faulty import KINDS, faulty, lessons
+from nfc_gym.simulate.fault_kinds import KINDS, fault_kinds
+from nfc_gym.simulate.faulty import faulty, lessons
 from nfc_gym.simulate.machine import Machine
+from nfc_gym.simulate.trials import trials
 
 JACKAL = "nfc_gym/JackalFlat-v0"
 
@@ -47,6 +50,40 @@ def test_faults_are_told_apart_by_their_kind() -> None:
     for shape in ((4, 2), (0, 17), (17,)):
         with pytest.raises(InputError, match="psi has shape"):
             lessons(JACKAL, np.zeros(shape), 0)
+
+
+def drawn(robot: str, monkeypatch: pytest.MonkeyPatch) -> tuple[set[str], dict[str, np.ndarray]]:
+    """Kinds of fault that a robot's windows have, and what its effects were given, by family."""
+    given: dict[str, list[np.ndarray]] = {}
+
+    def told(*args: Any, effect: Any = None, theta: Any = None, **how: Any) -> Any:
+        if effect is not None:
+            given.setdefault(effect.family, []).append(theta)
+        return trials(*args, effect=effect, theta=theta, **how)
+
+    monkeypatch.setattr(module, "trials", told)
+    machine = Machine(f"nfc_gym/{robot}Flat-v0")
+    found = faulty(machine, np.tile(machine.space.nominal, (60, 1)), 3)
+    return {KINDS[k] for k in found["kind"]}, {name: np.concatenate(parts) for name, parts in given.items()}
+
+
+def test_a_robot_whose_psi_has_no_friction_and_no_gains_is_given_such_faults(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds, given = drawn("Quadruped", monkeypatch)
+    assert kinds == {"mass", "friction", "gain", "effect"}
+    factor = given["fault_friction"]
+    assert len(set(factor[:, 0])) == len(factor)
+    assert 0.2 <= factor.min() < factor.max() <= 0.8
+    assert given["loss"].max() > 0.5  # more than the library thinks realistic
+    machine = Machine("nfc_gym/QuadrupedFlat-v0")
+    (slippery,), fields = fault_kinds(machine)["friction"].effects, {"geom_friction": np.ones((2, 3, 3))}
+    slippery.model(fields, np.array([[0.5], [1.0]]))
+    assert np.array_equal(fields["geom_friction"], [[[0.5, 1, 1]] * 3, [[1, 1, 1]] * 3])
+
+
+def test_what_flies_is_given_no_friction(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds, given = drawn("Quadcopter", monkeypatch)
+    assert {"mass", "gain"} <= kinds <= {"mass", "gain", "effect"}
+    assert "fault_friction" not in given
 
 
 def test_a_damaged_part_of_the_lessons_is_told_by_name(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from nfc_gym.inference import detector_file
 from nfc_gym.inference.detector import WindowDetector
 from nfc_gym.inference.faults import FaultClassifier, FaultConfig
 from nfc_gym.inference.train import TrainConfig
-from nfc_gym.simulate import faulty
+from nfc_gym.simulate import fault_kinds, faulty
 from nfc_gym.simulate import watch as module
 from nfc_gym.simulate.faulty import nominal
 from nfc_gym.simulate.machine import Machine
@@ -63,7 +63,7 @@ def test_it_finds_slippery_ground_and_a_run_that_was_stopped_goes_on(
     assert alarms[0].mean() > 0.8
     assert alarms[1].mean() < 0.2
     kinds = detector.scorer.told(broken["states"], broken["actions"]).mean(0)
-    assert kinds.argmax() == faulty.KINDS.index("friction")
+    assert kinds.argmax() == fault_kinds.KINDS.index("friction")
     np.testing.assert_array_equal(
         detector.scorer.score(broken["states"], broken["actions"]),
         found.detector.scorer.score(broken["states"], broken["actions"]),
