@@ -1,5 +1,6 @@
 """Lessons for a fault classifier: half of the machines are sound, the others have a fault of the kind that is said."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +53,8 @@ def test_faults_are_told_apart_by_their_kind() -> None:
             lessons(JACKAL, np.zeros(shape), 0)
 
 
-def drawn(robot: str, monkeypatch: pytest.MonkeyPatch) -> tuple[set[str], dict[str, np.ndarray]]:
-    """Kinds of fault that a robot's windows have, and what its effects were given, by family."""
+def drawn(robot: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Counter[str], dict[str, np.ndarray]]:
+    """How many windows have each kind of fault, and what its effects were given, by family."""
     given: dict[str, list[np.ndarray]] = {}
 
     def told(*args: Any, effect: Any = None, theta: Any = None, **how: Any) -> Any:
@@ -64,16 +65,16 @@ def drawn(robot: str, monkeypatch: pytest.MonkeyPatch) -> tuple[set[str], dict[s
     monkeypatch.setattr(module, "trials", told)
     machine = Machine(f"nfc_gym/{robot}Flat-v0")
     found = faulty(machine, np.tile(machine.space.nominal, (60, 1)), 3)
-    return {KINDS[k] for k in found["kind"]}, {name: np.concatenate(parts) for name, parts in given.items()}
+    return Counter(KINDS[k] for k in found["kind"]), {name: np.concatenate(parts) for name, parts in given.items()}
 
 
 def test_a_robot_whose_psi_has_no_friction_and_no_gains_is_given_such_faults(monkeypatch: pytest.MonkeyPatch) -> None:
     kinds, given = drawn("Quadruped", monkeypatch)
-    assert kinds == {"mass", "friction", "gain", "effect"}
+    assert set(kinds) == {"mass", "friction", "gain", "effect"}
     factor = given["fault_friction"]
     assert len(set(factor[:, 0])) == len(factor)
     assert 0.2 <= factor.min() < factor.max() <= 0.8
-    assert given["loss"].max() > 0.5  # more than the library thinks realistic
+    assert len(np.unique(given["loss"])) >= kinds["gain"] > 5  # each window's own; of the library some have the same
     machine = Machine("nfc_gym/QuadrupedFlat-v0")
     (slippery,), fields = fault_kinds(machine)["friction"].effects, {"geom_friction": np.ones((2, 3, 3))}
     slippery.model(fields, np.array([[0.5], [1.0]]))
@@ -82,7 +83,7 @@ def test_a_robot_whose_psi_has_no_friction_and_no_gains_is_given_such_faults(mon
 
 def test_what_flies_is_given_no_friction(monkeypatch: pytest.MonkeyPatch) -> None:
     kinds, given = drawn("Quadcopter", monkeypatch)
-    assert {"mass", "gain"} <= kinds <= {"mass", "gain", "effect"}
+    assert {"mass", "gain"} <= set(kinds) <= {"mass", "gain", "effect"}
     assert "fault_friction" not in given
 
 
