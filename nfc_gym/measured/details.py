@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nfc_gym.core.log import Log
 from nfc_gym.measured.bench import Bench
 from nfc_gym.measured.shooting import RolloutProblem
-from nfc_gym.measured.verdict import Models, Verified, squared
+from nfc_gym.measured.verdict import Models, Verified
 
 Array = NDArray[np.float64]
 _TRACES = 6
@@ -29,7 +29,7 @@ def details(bench: Bench, v: Verified, models: Models, logs: Sequence[Log]) -> d
 
 
 def _misfit(v: Verified, stage: str) -> dict[str, Any]:
-    squares = np.where(v.problem.mask, squared(v.white[stage]), np.nan)
+    squares = v.squares(stage, np.nan)
     places = dict.fromkeys(
         f"{p} {g}" if not p.startswith("sensor") else p
         for p, g in zip(v.problem.columns.place, v.problem.columns.group, strict=True)

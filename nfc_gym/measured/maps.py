@@ -14,7 +14,7 @@ from nfc_gym.measured.instant import InstantProblem
 from nfc_gym.measured.laws import Scanned
 from nfc_gym.measured.problem import Problem
 from nfc_gym.measured.shooting import RolloutProblem
-from nfc_gym.measured.verdict import Verified, squared
+from nfc_gym.measured.verdict import Verified
 from nfc_gym.physics.effects.base import Array
 from nfc_gym.physics.effects.law import degrees, turns
 
@@ -61,8 +61,7 @@ def _states(problem: Problem, model: mujoco.MjModel) -> tuple[Array, Array] | No
 
 
 def _per_block(v: Verified, stage: str) -> Array:
-    squares = np.where(v.problem.mask, squared(v.white[stage]), 0.0)
-    return squares.sum(1) / np.maximum(v.problem.mask.sum(1), 1)
+    return v.squares(stage).sum(1) / np.maximum(v.problem.mask.sum(1), 1)
 
 
 def _line(title: str, unit: str, x: Array, misfit: dict[str, Array]) -> dict[str, Any]:

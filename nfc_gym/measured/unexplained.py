@@ -9,7 +9,7 @@ from nfc_gym.measured import wording
 from nfc_gym.measured.forced import surest
 from nfc_gym.measured.laws import Proposal
 from nfc_gym.measured.search import Found
-from nfc_gym.measured.verdict import Verified, column_means
+from nfc_gym.measured.verdict import Verified
 from nfc_gym.physics.effects import FAMILIES
 from nfc_gym.physics.effects.base import Effect
 from nfc_gym.physics.effects.generic import GenericMemory, GenericVelocity
@@ -176,7 +176,7 @@ def _worst(v: Verified) -> tuple[str, str, float]:
     A wrong joint shows most in itself, however small a part of all the misfit that is: what it moves is the whole
     machine, in many more numbers.
     """
-    found, floor = column_means(v.problem, v.white["extended"]), np.maximum(v.floor, 1e-6)
+    found, floor = v.column_means("extended"), np.maximum(v.floor, 1e-6)
     count = v.problem.mask.sum(0)
     keys = list(zip(v.problem.columns.place, v.problem.columns.group, strict=True))
     times = {}

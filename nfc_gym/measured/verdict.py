@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 CAUSE = 0.5  # of the error beyond the noise: what claims must take away of it to be causes where something remains
 _OWNED, _AGREE = 2, 0.01  # twins that have covariances of their own; share of chi-squared that these may matter
 _TAIL = 1.96  # standard deviations to either side, within which 95 % lie
-_WILD = 1e6  # of a squared whitened number: more counts as this much
+_WILD = 1e6  # of a squared whitened number: more counts as this much,
+_TIMES = 1e3  # or as so many times what is usual, where that is far beyond the noise
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class Verified:
     """Residuals on the verification logs, in their own units and whitened by the noise alone.
 
     residual and white: stage -> (S, m); null: (K,) chi-squared of models without any unknown effect; shares: (K, C)
-    what each cluster of blocks adds to it; floor: (m,) mean square of each number, whitened, of such models.
+    what each cluster of blocks adds to it; floor: (m,) mean square of each number, whitened, of such models; most:
+    what a squared whitened number counts at most.
     """
 
     problem: Problem
@@ -53,26 +55,45 @@ class Verified:
     null: Array
     shares: Array
     floor: Array
+    most: float = _WILD
 
     def chi2(self, stage: str) -> float:
         """Mean square whitened residual; about 1 where noise explains it."""
-        return mean_square(self.problem, self.white[stage])
+        return mean_square(self.problem, self.white[stage], self.most)
+
+    def squares(self, stage: str, elsewhere: float = 0.0) -> Array:
+        """(S, m) squared whitened residuals, bounded; `elsewhere` where they do not count."""
+        return np.where(self.problem.mask, squared(self.white[stage], self.most), elsewhere)
+
+    def column_means(self, stage: str) -> Array:
+        """(m,) mean of these over the blocks in which each counts; 0 in none."""
+        return column_means(self.problem, self.white[stage], self.most)
 
 
-def squared(white: Array) -> Array:
+def squared(white: Array, most: float = _WILD) -> Array:
     """Squares of whitened numbers, bounded so that one wild block does not decide."""
-    return np.minimum(white**2, _WILD)
+    return np.minimum(white**2, most)
 
 
-def mean_square(problem: Problem, white: Array) -> float:
+def mean_square(problem: Problem, white: Array, most: float = _WILD) -> float:
     """Mean of whitened squares over what counts."""
-    return float(squared(white)[problem.mask].mean())
+    return float(squared(white, most)[problem.mask].mean())
 
 
-def column_means(problem: Problem, white: Array) -> Array:
+def column_means(problem: Problem, white: Array, most: float = _WILD) -> Array:
     """(m,) mean of whitened squares (S, m) of each compared number over the blocks in which it counts; 0 in none."""
-    squares = np.where(problem.mask, squared(white), 0.0)
+    squares = np.where(problem.mask, squared(white, most), 0.0)
     return squares.sum(0) / np.maximum(problem.mask.sum(0), 1)
+
+
+def bound(problem: Problem, white: Array) -> float:
+    """What a squared whitened number counts at most, given what is usual (S, m).
+
+    Where noise is next to nothing beside what a model leaves, as in logs that were smoothed, every number may lie a
+    thousand standard errors off, and a fixed bound would make all models alike.
+    """
+    usual = float(np.median(white[problem.mask] ** 2))
+    return max(_WILD, _TIMES * usual) if np.isfinite(usual) else _WILD
 
 
 def twin(
@@ -141,7 +162,8 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
             alike = len(owned) == _OWNED and _agree(owned)
     floor = np.mean(floors, 0) if floors else np.ones(problem.mask.shape[1])
     told = np.array(shares).reshape(replicas, -1)
-    return Verified(problem, residual, white_of, sigma, np.array(null), told, floor)
+    most = bound(problem, white_of["calibrated"])
+    return Verified(problem, residual, white_of, sigma, np.array(null), told, floor, most)
 
 
 def _agree(owned: Sequence[tuple[float, float]]) -> bool:
@@ -345,7 +367,7 @@ def excess_shares(v: Verified, problem: Problem, fitted: Fit, calibrated: tuple[
             if e is effect:
                 x[at : at + len(e.params)] = e.null
             at += len(e.params)
-        worse = mean_square(problem, measure.whiten(problem.residual(fitted.plant, x[None]))[0])
+        worse = mean_square(problem, measure.whiten(problem.residual(fitted.plant, x[None]))[0], v.most)
         shares[effect.id] = float(np.clip((worse - v.chi2("extended")) / excess, 0, 1))
     return shares
 
@@ -353,8 +375,7 @@ def excess_shares(v: Verified, problem: Problem, fitted: Fit, calibrated: tuple[
 def gain_interval(v: Verified, rng: np.random.Generator) -> tuple[float, float]:
     """95 % interval of the ratio of extended to calibrated chi-squared over the verification logs."""
     blocks = clusters(v.problem)
-    before = squared(v.white["calibrated"]).sum(1)
-    after = squared(v.white["extended"]).sum(1)
+    before, after = (squared(v.white[stage], v.most).sum(1) for stage in ("calibrated", "extended"))
     seed = int(rng.integers(2**31))
     ratio = bootstrap(after, blocks, np.random.default_rng(seed)) / np.maximum(
         bootstrap(before, blocks, np.random.default_rng(seed)), 1e-12

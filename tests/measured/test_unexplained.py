@@ -11,6 +11,7 @@ from nfc_gym.measured.laws import Proposal, Scanned
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.remainder import Remainder
 from nfc_gym.measured.unexplained import unexplained
+from nfc_gym.measured.verdict import Verified
 from nfc_gym.physics.effects.law_place import LawHeight
 from nfc_gym.physics.effects.law_waves import LawHarmonic
 from nfc_gym.physics.parameters import ParameterSpace
@@ -44,7 +45,8 @@ def said(
     found: Any = SimpleNamespace(generic=generic, hinted=hinted, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
     columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
-    v: Any = SimpleNamespace(problem=problem, white={"extended": np.array([[1.0, 3.0]])}, floor=np.ones(2))
+    white, none = {"extended": np.array([[1.0, 3.0]])}, np.zeros((0, 0))
+    v = Verified(problem, {}, white, none, none, none, floor=np.ones(2))  # type: ignore[arg-type]
     return unexplained(v, found, plant, [], [{"id": i, "alike": list(alike)} | more for i in weak], 0.06)
 
 

@@ -1,5 +1,6 @@
 """What verification says where there is nothing to verify on."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,8 @@ from nfc_gym.measured.cuts import Layout
 from nfc_gym.measured.outcome import _REPLICAS
 from nfc_gym.measured.shooting import RolloutProblem
 from nfc_gym.measured.states import estimate_states
-from nfc_gym.measured.verdict import Models, null_bound, taken_away, verify
+from nfc_gym.measured.verdict import Models, Verified, bound, gain_interval, null_bound, taken_away, verify
+from nfc_gym.physics.effects import build
 from nfc_gym.physics.parameters import ParameterSpace
 from nfc_gym.physics.rollout import Plant
 
@@ -51,6 +53,48 @@ def test_a_perfect_model_is_above_its_bound_once_in_twenty_whatever_twins_were_d
     bounds, perfect = np.array([null_bound(v) for v in twins]), draw(8000).sum(1)
     assert (perfect[:, None] > bounds).mean() == pytest.approx(0.05, abs=0.01)
     assert bounds.std() < 0.4 * perfect.std()
+
+
+def swung(noise: float, stiffness: float) -> Verified:
+    """A pendulum whose hinge has a spring of 2 N m/rad, as it is verified by models with none, and with this one."""
+    rng, time = np.random.default_rng(0), DT * np.arange(300)
+    sprung = MODEL.replace('axis="0 1 0"', 'axis="0 1 0" stiffness="2"')
+    model = mujoco.MjModel.from_xml_string(sprung)
+    data = mujoco.MjData(model)
+    command, angle = np.sin(3 * time), []
+    for u in command:
+        angle.append(float(data.qpos[0]))
+        data.ctrl[0] = u
+        mujoco.mj_step(model, data)
+    seen = {"joint:hinge:pos": Channel(np.array(angle) + noise * rng.normal(size=300), noise=noise)}
+    log = Log("run", time, {"ctrl:motor": command}, seen)
+    bare = mujoco.MjModel.from_xml_string(MODEL)
+    problem = RolloutProblem(bare, [log], [estimate_states(bare, log)], Layout(0.4, 0.0, (0.1, 0.4), 0.4, DT))
+    plant = Plant(bare, ParameterSpace(bare, []), nthread=1)
+    spring, theta = build("spring_offset", "hinge", {"stiffness": stiffness, "rest": 0.0})
+    plain, mended = (plant, plant.null), (plant.with_effects([spring]), theta)
+    return verify(problem, Models(plain, plain, mended), 2, rng)
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-8])
+def test_what_a_model_mends_shows_however_little_noise_the_logs_have(noise: float) -> None:
+    """Logs that were smoothed: every number may lie a thousand standard errors off, and most be mended."""
+    found = swung(noise, 1.5)
+    left = found.chi2("extended") / found.chi2("calibrated")
+    assert left < 0.3
+    low, high = gain_interval(found, np.random.default_rng(0))
+    assert low <= left <= high < 0.5
+
+
+def test_one_wild_block_does_not_decide() -> None:
+    found = swung(1e-3, 1.5)
+    usual = found.chi2("calibrated")
+    wild = {stage: white.copy() for stage, white in found.white.items()}
+    wild["calibrated"][0] = 1e9
+    spoilt = replace(found, white=wild)
+    assert usual < spoilt.chi2("calibrated") < 1e6
+    assert bound(found.problem, wild["calibrated"]) == found.most == 1e6
+    assert bound(found.problem, np.full_like(wild["calibrated"], np.inf)) == 1e6
 
 
 def test_what_clusters_add_is_the_whole_of_a_twin() -> None:
