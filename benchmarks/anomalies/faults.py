@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from nfc_gym.physics.effects import Effect, build
 from nfc_gym.physics.effects.param import Param
 from nfc_gym.physics.fields import ModelFields
+from nfc_gym.simulate.fault_kinds import flies
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.residuals import candidates, sizes
 
@@ -55,7 +56,7 @@ def faults(machine: Machine, effects: int, rng: np.random.Generator) -> list[Fau
             loss, theta = build("loss", actuator, {"fraction": 1 - k})
             out.append(Fault(f"gain of {actuator} x {k:g}", ones, loss, theta, wanted=k == GAIN[0]))
     own = [n for n in names if n.endswith("_friction")]
-    for k in FRICTION:
+    for k in () if flies(machine.model) else FRICTION:
         slippery = None if own else Friction(("ground",), (Param("factor", "1", 0.0, 1.0, null=1.0),))
         by, theta = (scaled(own, k), None) if own else (ones, np.array([k]))
         out.append(Fault(f"friction x {k:g}", by, slippery, theta, wanted=k == FRICTION[0]))

@@ -76,14 +76,15 @@ def fault_kinds(machine: Machine) -> dict[str, Scaled | Acting]:
         return scaled([servos[rng.integers(len(servos))]], rng.uniform(*_GAIN))
 
     kinds: dict[str, Scaled | Acting] = {"mass": Scaled(mass)} if bodies else {}
-    if rubbing or not _flies(machine.model):
+    if rubbing or not flies(machine.model):
         kinds["friction"] = Scaled(friction) if rubbing else _slippery()
     kinds["gain"] = Scaled(gain) if servos else _weak(machine)
     library = tuple(candidates(machine))
     return kinds | {"effect": Acting(library, lambda effect, n, rng: np.tile(_realistic(effect, rng), (n, 1)))}
 
 
-def _flies(model: mujoco.MjModel) -> bool:
+def flies(model: mujoco.MjModel) -> bool:
+    """Whether a robot is carried by thrust, and no friction beneath it."""
     return bool((model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE).any())  # thrust
 
 
