@@ -150,3 +150,24 @@ def test_what_cannot_be_repeated_is_refused() -> None:
     rough = replace(simulator, environment="nfc_gym/JackalRough-v0")
     with pytest.raises(InputError, match="on a plane only"):
         Repeated.of(rough, asked["states"], asked["actions"], known, rng)
+
+
+def test_what_comes_apart_is_nan_and_the_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rover at a million metres a second: what is simulated in its place begins where another did."""
+    machine, simulator, windows = simulated("nfc_gym/JackalFlat-v0")
+    (known, asked), rng = split(windows), np.random.default_rng(2)
+    again = Repeated.of(replace(simulator, names=("states",)), asked["states"], asked["actions"], known, rng)
+    theta, begin = rng.standard_normal((6, again.size)), Opening.starts
+
+    def flung(self: Opening, z: np.ndarray, v: np.ndarray) -> np.ndarray:
+        starts = begin(self, z, v)
+        starts[2, machine.model.nq : machine.model.nq + 3] = 1e6
+        return starts
+
+    whole = again(theta, 3)
+    monkeypatch.setattr(Opening, "starts", flung)
+    off = again(theta, 3)
+    assert np.isnan(off[2]).all()
+    others = [0, 1, 3, 4, 5]
+    assert np.isfinite(off[others]).all()
+    assert np.isfinite(whole).all()
