@@ -20,6 +20,7 @@ _LATE = 0.1  # s by which a drive may well be late, or for which it lags
 _IDLE = 0.1  # of their usual change, below which commands rest
 _SPARSE = 2.0  # times as far apart as usual that the samples that tell a state may lie
 _PUT_OFF = 0.5  # of a stride, at most, by which a start is put off
+_LEFT = 0.5  # of a stride, left over at a log's end, for which one more segment pays
 
 
 @dataclass(frozen=True)
@@ -154,12 +155,33 @@ def _starts(log: Log, layout: Layout, last: float) -> Iterator[int]:
     """Rows at which segments start, end to end, none later than `last`, s.
 
     A start near which a command steps is put off to where its state can be told (`Layout.put_off`), and those behind it
-    with it. So is one in a stretch that is masked, however long that is, unless every start of the log would be.
+    with it. So is one in a stretch that is masked, however long that is, unless every start of the log would be. Where
+    half a segment or more would be left over at the end, one more ends there and shares the rest with the one before.
     """
-    calm, late = _calm(log), min(_unknown(log, layout), max(last, 0.0) / 2)
+    calm, seen, row = _calm(log), _told(log, layout, last), None
+    for row in _in_turn(log, layout, last, calm, seen):
+        yield row
+    if row is not None and layout.put_off and seen[-1]:  # something is measured where it ends
+        first = int(np.searchsorted(log.time, log.time[row] + _LEFT * layout.stride - 1e-9))
+        end = int(np.searchsorted(log.time, last + 1e-9, side="right"))
+        fit = np.flatnonzero((calm[0] & seen)[first : min(end, len(log) - 1)])
+        if len(fit):
+            yield first + int(fit[-1])
+
+
+def _told(log: Log, layout: Layout, last: float) -> NDArray[np.bool_]:
+    """(T,) rows whose state is told by rows close by; all where no start of the log would be."""
     seen = _seen(log)
     if not layout.put_off or not (seen & (log.time <= last + 1e-9)).any():
         seen[:] = True
+    return seen
+
+
+def _in_turn(
+    log: Log, layout: Layout, last: float, calm: tuple[NDArray[np.bool_], NDArray[np.bool_]], seen: NDArray[np.bool_]
+) -> Iterator[int]:
+    """Rows at which segments start one behind the other."""
+    late = min(_unknown(log, layout), max(last, 0.0) / 2)
     for number in count():
         begin = number * layout.stride + late
         if begin > last + 1e-9:

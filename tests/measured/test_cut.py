@@ -50,7 +50,18 @@ def test_every_segment_holds_a_sample_beside_its_start(interval: float, jitter: 
 
 def test_segments_follow_each_other_to_the_end() -> None:
     np.testing.assert_array_equal(cut([log(0.01, 121)], LAYOUT).start, [0, 40, 80])
-    np.testing.assert_array_equal(cut([log(0.01, 120)], LAYOUT).start, [0, 40])
+    np.testing.assert_array_equal(cut([log(0.01, 100)], LAYOUT).start, [0, 40])
+
+
+def test_where_half_a_segment_would_be_left_over_one_more_ends_with_the_log() -> None:
+    """Not where it would start beside a step of a command, or in a stretch that is masked; then before that."""
+    np.testing.assert_array_equal(cut([log(0.01, 119)], LAYOUT).start, [0, 40, 78])
+    known = replace(LAYOUT, put_off=False)
+    np.testing.assert_array_equal(cut([log(0.01, 119)], known).start, [0, 40])
+    time = 0.01 * np.arange(110)
+    one = replace(log(0.01, 110), controls={"ctrl:motor": np.where(time > 0.685, 1.0, 0.0)})
+    np.testing.assert_array_equal(cut([one], LAYOUT).start, [0, 40, 66])
+    np.testing.assert_array_equal(cut([masked((62, 70), rows=110)], LAYOUT).start, [0, 40])
 
 
 def test_no_start_lies_where_commands_before_the_log_are_felt() -> None:
@@ -68,7 +79,8 @@ def test_no_start_lies_where_a_late_drive_is_at_commands_of_before_the_log() -> 
     remembers, time = replace(LAYOUT, history=0.5), 0.01 * np.arange(201)
     for rest, first in ((0.0, 10), (0.15, 0)):
         one = replace(log(0.01, 201), controls={"ctrl:motor": np.sin(3 * np.maximum(time - rest, 0.0))})
-        np.testing.assert_array_equal(cut([one], remembers).start, first + 40 * np.arange(5 if rest else 4))
+        starts = [*(first + 40 * np.arange(4)), 160]  # the log ends with the last
+        np.testing.assert_array_equal(cut([one], remembers).start, starts)
         assert cut([one], LAYOUT).start[0] == 0
         assert cut([one], replace(remembers, put_off=False)).start[0] == 0
         part = one.part(100, 201, "run@verify")
@@ -88,14 +100,15 @@ def test_no_start_lies_beside_a_step_of_a_command() -> None:
         where = cut([one], LAYOUT)
         assert len(steps) >= 2
         assert np.abs(where.start[:, None] - steps).min() >= 3
-        assert (np.diff(one.time[where.start]) >= LAYOUT.stride - 1e-9).all()
+        assert (np.diff(one.time[where.start])[:-1] >= LAYOUT.stride - 1e-9).all()
+        assert np.diff(one.time[where.start])[-1] >= LAYOUT.stride / 2 - 1e-9
         assert len(where.start) >= 4
         np.testing.assert_allclose(where.step * LAYOUT.dt, np.tile(LAYOUT.horizons, (len(where.start), 1)))
 
 
 def test_starts_stay_where_every_row_is_beside_a_step() -> None:
     busy = stepping(every=0.02)
-    np.testing.assert_array_equal(cut([busy], LAYOUT).start, cut([log(0.01, 240)], LAYOUT).start)
+    np.testing.assert_array_equal(cut([busy], LAYOUT).start, cut([log(0.01, 240)], LAYOUT).start[:-1])
 
 
 def masked(*stretches: tuple[int, int], rows: int = 241) -> Log:
@@ -108,8 +121,8 @@ def masked(*stretches: tuple[int, int], rows: int = 241) -> Log:
 
 def test_no_start_lies_in_a_masked_stretch() -> None:
     """Of 0.5 s, which is longer than a segment; nor where half of a cubic's seven samples lie beyond it."""
-    np.testing.assert_array_equal(cut([masked((70, 120))], LAYOUT).start, [0, 40, 123, 163])
-    np.testing.assert_array_equal(cut([masked((0, 20))], LAYOUT).start, [14, 54, 94, 134, 174])
+    np.testing.assert_array_equal(cut([masked((70, 120))], LAYOUT).start, [0, 40, 123, 163, 200])
+    np.testing.assert_array_equal(cut([masked((0, 20))], LAYOUT).start, [14, 54, 94, 134, 174, 200])
     np.testing.assert_array_equal(cut([masked((150, 241))], LAYOUT).start, [0, 40, 80, 120])
 
 
