@@ -239,6 +239,7 @@ def test_where_slopes_cannot_follow_segments_are_shorter(build: Build, monkeypat
     monkeypatch.setattr("nfc_gym.measured.foresight.followed", lambda *_: 2)
     cut = short.searched(logs)
     assert cut.columns.horizon.max() == segments.horizons[1]
-    assert len(cut) >= len(whole) * segments.length / segments.horizons[1]
+    apart = len(whole) - len(logs)  # the last of a log may share its beginning with the one before
+    assert len(cut) >= apart * segments.length / segments.horizons[1]
     assert len(short.searched(logs, 2)) == round(2 * segments.length / segments.horizons[1])
     assert short.problem(logs).columns.horizon.max() == segments.horizons[-1]
