@@ -96,7 +96,7 @@ def chi2(problem: RolloutProblem, plant: Plant, x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("history", [0.0, 0.2])
 def test_at_the_truth_the_residual_is_noise(plant: Plant, history: float) -> None:
-    problem = rollouts(plant, history=history)
+    problem = rollouts(plant, history=history, logs=60)
     right, wrong = np.array([DAMPING]), np.array([2 * DAMPING])
     assert problem.columns.group == ("joint angle",) * 3 + ("joint speed",) * 3
     np.testing.assert_allclose(problem.columns.horizon, [0.1, 0.2, 0.3] * 2)

@@ -22,7 +22,7 @@ from nfc_gym.measured.remarks import on_simplicity
 from nfc_gym.measured.rounds import Contest
 from nfc_gym.measured.search import Found, Options, Search
 from nfc_gym.measured.unexplained import unexplained
-from nfc_gym.measured.verdict import verdict
+from nfc_gym.measured.verdict import Verified, verdict
 from nfc_gym.physics.effects.saved import from_row
 
 MAPPING = """
@@ -144,7 +144,8 @@ def test_even_without_a_law_the_worst_place_is_named() -> None:
     columns = SimpleNamespace(place=("joint:a", "joint:b"), group=("joint angle", "joint speed"))
     problem = SimpleNamespace(mask=np.ones((5, 2), bool), columns=columns)
     # The first misses by more, the second by more of what noise alone would make it miss.
-    v = SimpleNamespace(problem=problem, white={"extended": np.tile([4.0, 3.0], (5, 1))}, floor=np.array([8.0, 0.9]))
+    white, none, floor = {"extended": np.tile([4.0, 3.0], (5, 1))}, np.zeros((0, 0)), np.array([8.0, 0.9])
+    v = Verified(problem, {}, white, none, none, none, floor)  # pyright: ignore[reportArgumentType]
     last = SimpleNamespace(ranking=[{"id": "lag:m", "generic": False, "share": 0.12}], reason="too small")
     found = SimpleNamespace(rounds=[last], rest=SimpleNamespace(dropped=[], scanned=None), generic=None, hinted=None)
     left = unexplained(v, found, SimpleNamespace(effects=(), model=None), [], [], 0.0)  # pyright: ignore[reportArgumentType]

@@ -44,7 +44,7 @@ effects: {only: [damping_poly]}
 """
 
 
-def record(file: Path, rng: np.random.Generator, seconds: float = 3.0) -> None:
+def record(file: Path, rng: np.random.Generator, seconds: float = 6.0) -> None:
     """A sled that is pulled to and fro over a floor of which the half with x > 0 lacks LOST of its friction."""
     model = mujoco.MjModel.from_xml_string(SLED.format(1.1 * FRICTION))
     model.opt.timestep = DT
