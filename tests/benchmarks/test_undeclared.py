@@ -111,6 +111,9 @@ def test_finished_trials_are_kept_and_failed_ones_run_again(tmp_path: Path, monk
         ran.append(task.seed)
         if task.seed == 2 and len(ran) < 5:
             raise RuntimeError("once")
+        (folder / "report").mkdir()
+        for name in ("report.html", "report.json", "model.xml"):
+            (folder / "report" / name).write_text(f"{task.seed}")
         return m.row.Row("jackal", "null", [], task.seed, oracle_x=math.nan, errors={"after": 1.0})
 
     monkeypatch.setattr(plan, "trial", fake)
@@ -119,6 +122,9 @@ def test_finished_trials_are_kept_and_failed_ones_run_again(tmp_path: Path, monk
     second = {r.seed: r for r, _ in plan.run(todo, 1, 1, plan.Kept(tmp_path))}
     assert sorted(second) == [0, 1, 2, 3]
     assert ran == [0, 1, 2, 3, 2]
+    for task in todo:
+        kept = {f.name: f.read_text() for f in (tmp_path / "reports" / task.name).iterdir()}
+        assert kept == {"report.html": str(task.seed), "report.json": str(task.seed)}
     assert second[0].errors == {"after": 1.0}
     assert math.isnan(second[0].oracle_x)
 
