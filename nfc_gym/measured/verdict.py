@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 CAUSE = 0.5  # of the error beyond the noise: what claims must take away of it to be causes where something remains
 _OWNED, _AGREE = 2, 0.01  # twins that have covariances of their own; share of chi-squared that these may matter
 _TAIL = 1.96  # standard deviations to either side, within which 95 % lie
-_WILD = 1e6  # of a squared whitened number: more counts as this much,
+_WILD = 1e4  # of a squared whitened number: more counts as this much,
 _TIMES = 1e3  # or as so many times what is usual, where that is far beyond the noise
 
 
