@@ -144,7 +144,7 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
     for stage, p, v in models.items():
         r = problem.residual(p, v[None])
         residual[stage], white_of[stage] = r[0], measure.whiten(r)[0]
-    null, shares, floors = [], [], []
+    most, null, shares, floors = bound(problem, white_of["calibrated"]), [], [], []
     alike, owned = problem.rough, list[tuple[float, float]]()
     for _ in range(replicas):
         made = twin(problem, measure, plant, x, rng, alike)
@@ -153,16 +153,15 @@ def verify(problem: Problem, models: Models, replicas: int, rng: np.random.Gener
                 "the model that fits the other logs is unstable on every segment that verifies, at half the physics "
                 "step: look whether these logs are of the same machine, in the same units (`nfc-gym check`)"
             )
-        null.append(mean_square(*made))
-        shares.append(_shares(problem, *made))
-        floors.append(column_means(*made))
+        null.append(mean_square(*made, most))
+        shares.append(_shares(problem, *made, most))
+        floors.append(column_means(*made, most))
         if not alike:  # a covariance is most of what a twin costs: where the first twins' say nothing new they do
             white = _shared(problem, measure, made[0]).whiten(made[0].residual(plant, x[None]))[0]
-            owned.append((null[-1], mean_square(made[0], white)))
+            owned.append((null[-1], mean_square(made[0], white, most)))
             alike = len(owned) == _OWNED and _agree(owned)
     floor = np.mean(floors, 0) if floors else np.ones(problem.mask.shape[1])
     told = np.array(shares).reshape(replicas, -1)
-    most = bound(problem, white_of["calibrated"])
     return Verified(problem, residual, white_of, sigma, np.array(null), told, floor, most)
 
 
@@ -172,10 +171,10 @@ def _agree(owned: Sequence[tuple[float, float]]) -> bool:
     return bool(abs(shared - own) <= _AGREE * own)
 
 
-def _shares(problem: Problem, made: Problem, white: Array) -> Array:
+def _shares(problem: Problem, made: Problem, white: Array, most: float) -> Array:
     """(C,) what each cluster of a problem's blocks adds to the chi-squared of its twin, whitened (S, m)."""
     blocks = clusters(problem)
-    squares = np.where(made.mask, squared(white), 0.0).sum(1)
+    squares = np.where(made.mask, squared(white, most), 0.0).sum(1)
     of = blocks[_rows(problem, made)]
     return np.bincount(of, squares, int(blocks.max()) + 1) / max(int(made.mask.sum()), 1)
 
@@ -375,7 +374,7 @@ def excess_shares(v: Verified, problem: Problem, fitted: Fit, calibrated: tuple[
 def gain_interval(v: Verified, rng: np.random.Generator) -> tuple[float, float]:
     """95 % interval of the ratio of extended to calibrated chi-squared over the verification logs."""
     blocks = clusters(v.problem)
-    before, after = (squared(v.white[stage], v.most).sum(1) for stage in ("calibrated", "extended"))
+    before, after = (v.squares(stage).sum(1) for stage in ("calibrated", "extended"))
     seed = int(rng.integers(2**31))
     ratio = bootstrap(after, blocks, np.random.default_rng(seed)) / np.maximum(
         bootstrap(before, blocks, np.random.default_rng(seed)), 1e-12
