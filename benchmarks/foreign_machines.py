@@ -27,7 +27,7 @@ from foreign.machines import CASES
 from foreign.running import Folders, run
 from foreign.score import Score, score
 from foreign.summary import GROUPS, by_group, by_machine, summarise
-from options import count, ended, json_file, number, write_json
+from options import count, ended, json_file, made, number, write_json
 from standin.plan import seed_of
 from undeclared_effects import master_seed
 
@@ -141,7 +141,7 @@ def run_and_score(args: argparse.Namespace, seed: int, folders: Folders) -> int:
     print(f"{len(rows)} of {len(args.only)} machines, {time.monotonic() - began:.0f} s; seed {seed}")
     for path in (args.json, args.out / "results.json"):
         if path:
-            write_json(path, {"rows": figures, "trials": [r.plain() for r in rows]})
+            write_json(path, {**made(args), "seed": seed, "rows": figures, "trials": [r.plain() for r in rows]})
     return 0 if args.kept or len(rows) == len(args.only) else 1
 
 

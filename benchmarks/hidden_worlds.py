@@ -23,7 +23,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from options import count, ended, json_file, write_json
+from options import count, ended, json_file, made, write_json
 from posteriors.keep import Kept, begun
 from worlds.counting import DROP, Drop, measure
 from worlds.scenarios import TABLE_III
@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             rows += [shown(r) for r in worlds(args, kept, place, scenario)]
     print(f"{sum(r['counts'] for r in rows)} of {len(rows)} worlds count")
     if args.json:
-        write_json(args.json, {"rows": [figure(r, args) for r in rows], "worlds": rows})
+        write_json(args.json, {**made(args), "rows": [figure(r, args) for r in rows], "worlds": rows})
     return 0
 
 

@@ -30,7 +30,7 @@ from pathlib import Path
 import gymnasium
 from damage import FITS, INPUTS, OPTIONS, healthy
 from damage.case import FORMATS
-from options import count, ended, json_file, write_json
+from options import count, ended, json_file, made, write_json
 from timing import Table
 
 from nfc_gym.cli import main as nfc_gym
@@ -264,7 +264,8 @@ def main() -> None:
     table.add("faults: tracebacks, hangs, warnings, losses, mute refusals", len(bench.faults), "1", at_most=0)
     table.add("slowest command", bench.slowest[0], "s", at_most=LIMIT)
     if args.json:
-        write_json(args.json, [asdict(r) | {"seeds": [seed]} for r in table.rows])
+        rows = [asdict(r) | {"seeds": [seed]} for r in table.rows]
+        write_json(args.json, {**made(args), "seed": seed, "rows": rows})
     sys.exit(bool(bench.faults))
 
 

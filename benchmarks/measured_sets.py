@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from options import count, ended, json_file, write_json
+from options import count, ended, json_file, made, write_json
 
 from nfc_gym.cli import app
 from nfc_gym.measured.dataset import load
@@ -169,7 +169,7 @@ def main() -> None:
         )
         print(f"    {r['claims']}")
     if args.json:
-        write_json(args.json, rows)
+        write_json(args.json, {**made(args), "rows": rows})
 
 
 if __name__ == "__main__":

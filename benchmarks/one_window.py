@@ -24,7 +24,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from options import count, ended, json_file, number, write_json
+from options import count, ended, json_file, made, number, write_json
 from posteriors import metrics
 from posteriors.cases import AXLE, GROUND, SAMPLES
 from posteriors.keep import Kept, begun
@@ -159,14 +159,14 @@ def main(argv: list[str] | None = None) -> int:
     print(f"seed {seed}; {len(wanted) - len(tasks)} of {len(wanted)} windows are there already", flush=True)
     until = time.monotonic() + args.stop
     asked = (task for _, task in tasks if time.monotonic() < until)
-    made = enumerate(map(judged, asked)) if args.jobs == 1 else unordered(judged, zip(asked), args.jobs)
-    for done, (k, cell) in enumerate(made, 1):
+    cells = enumerate(map(judged, asked)) if args.jobs == 1 else unordered(judged, zip(asked), args.jobs)
+    for done, (k, cell) in enumerate(cells, 1):
         kept.keep(tasks[k][0], cell)
         print(f"{done} of {len(tasks)}: {tasks[k][0]} {_short(cell)}", flush=True)
     table = rows(kept, args.robots)
     print("\n".join(map(said, table)))
     if args.json is not None:
-        write_json(args.json, {"seed": seed, "simulations": args.simulations, "rows": table})
+        write_json(args.json, {**made(args), "seed": seed, "simulations": args.simulations, "rows": table})
     return 0
 
 

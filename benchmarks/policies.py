@@ -31,7 +31,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from options import count, ended, json_file, number, read_json, write_json
+from options import count, ended, json_file, made, number, read_json, write_json
 from posteriors.keep import Kept, begun
 from worlds import paper, tables
 from worlds.learning import Budget
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(text)
         if args.json:
             rows = [row for _, rows in parts for row in rows]
-            write_json(args.json, {"rows": rows, "seed": args.seed})
+            write_json(args.json, {**made(args), "rows": rows, "seed": args.seed})
     return 0
 
 

@@ -25,7 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from options import count, ended, json_file, number, write_json
+from options import count, ended, json_file, made, number, write_json
 from posteriors.keep import begun, belongs
 from standin import plan
 from standin.heads import ENVIRONMENTS, STRONG, Course, judged, taught, threads
@@ -78,7 +78,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--stop", type=number(0), default=float("inf"), metavar="SECONDS", help="begin no trial after so long")
     add("--out", type=Path, metavar="DIR", help="keeps windows, heads and finished trials, and results.json")
     add("--json", type=json_file, metavar="FILE",
-        help="write the rows here: a list of {name, value, unit, baseline, goal, holds, seeds}")  # fmt: skip
+        help="write rows {name, value, unit, baseline, goal, holds, seeds} here, and how they were made")  # fmt: skip
     return parser.parse_args(argv)
 
 
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     print(table(rows))
     for path in (folder / "results.json", args.json):
         if path:
-            write_json(path, rows)
+            write_json(path, {**made(args), "seed": seed, "rows": rows})
     return rows
 
 

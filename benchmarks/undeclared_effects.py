@@ -23,7 +23,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from options import count, ended, json_file, number, read_json, write_json
+from options import count, ended, json_file, made, number, read_json, write_json
 from standin import plan
 from standin.robots import ROBOTS
 from standin.row import Row, Task, from_json, to_json
@@ -57,8 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{len(rows)} of {planned_count} trials, {time.monotonic() - began:.0f} s; seed {seed}")
     for path in (args.json, args.out / "results.json" if args.out else None):
         if path:
-            content = {"rows": results, "trials": [to_json(r) for r in rows]}
-            write_json(path, content)
+            write_json(path, {**made(args), "seed": seed, "rows": results, "trials": [to_json(r) for r in rows]})
     return 0 if args.kept or len(rows) == planned_count else 1
 
 

@@ -3,11 +3,18 @@
 import argparse
 import json
 import math
+import os
+import platform
 import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import mujoco
+import numpy as np
+
+import nfc_gym
 from nfc_gym.core.errors import InputError, NfcError
 from nfc_gym.core.files import write_whole
 
@@ -53,6 +60,35 @@ def json_file(text: str) -> Path:
     except OSError as error:
         raise argparse.ArgumentTypeError(f"{text!r}: its folder cannot be made: {error.strerror}") from None
     return path
+
+
+def made(args: argparse.Namespace) -> dict[str, Any]:
+    """How figures were made, to stand beside their rows: date, machine, versions and the command's settings.
+
+    Of folders and files only the names: where they lay says nothing of the figures.
+    """
+    settings = {k: [_plain(v) for v in s] if isinstance(s, list | tuple) else _plain(s) for k, s in vars(args).items()}
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "machine": {"processor": _processor(), "cores": os.cpu_count()},
+        "versions": {
+            "python": platform.python_version(), "numpy": np.__version__, "mujoco": mujoco.__version__,
+            "nfc_gym": nfc_gym.__version__,
+        },
+        "settings": settings,
+    }  # fmt: skip
+
+
+def _plain(setting: Any) -> Any:
+    return setting.name if isinstance(setting, Path) else setting
+
+
+def _processor() -> str:
+    """Its name as the system says it."""
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text(encoding="utf-8").splitlines() if about.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def write_json(path: Path, content: Any) -> None:

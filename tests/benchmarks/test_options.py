@@ -65,6 +65,27 @@ def test_rows_of_another_run_are_read_or_refused(tmp_path: Path) -> None:
     assert read_json(file, "worlds") == {"worlds": [1]}
 
 
+def test_figures_say_how_they_were_made(tmp_path: Path) -> None:
+    import os
+    import platform
+    from datetime import UTC, datetime
+
+    from options import made, write_json
+
+    before = datetime.now(UTC).date()
+    settings = {"out": tmp_path / "out", "sets": [tmp_path / "a", "b"], "stop": math.inf, "jobs": 2, "seed": None}
+    file = tmp_path / "rows.json"
+    write_json(file, made(argparse.Namespace(**settings)))
+    told = json.loads(file.read_text())
+    assert before <= datetime.fromisoformat(told["date"]).date() <= datetime.now(UTC).date()
+    assert told["machine"]["processor"]
+    assert told["machine"]["cores"] == os.cpu_count()
+    assert told["versions"]["python"] == platform.python_version()
+    assert set(told["versions"]) == {"python", "numpy", "mujoco", "nfc_gym"}
+    assert told["settings"] == {"out": "out", "sets": ["a", "b"], "stop": None, "jobs": 2, "seed": None}
+    assert str(tmp_path) not in file.read_text()
+
+
 def test_a_queue_with_a_failure_ends_in_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:  # fmt: skip
@@ -211,7 +232,9 @@ def test_a_structure_run_is_of_one_seed_and_one_course(tmp_path: Path, monkeypat
     monkeypatch.setattr(structure, "told_rows", lambda *_: [structure.row("r", "area", 1, "1", 0.5, 0.95)])
     words = ["--trials", "0", "--windows", "512", "--out", str(tmp_path / "out")]
     assert structure.main([*words, "--seed", "5", "--json", str(tmp_path / "rows.json")]) == 0
-    (row,) = json.loads((tmp_path / "rows.json").read_text())
+    told = json.loads((tmp_path / "rows.json").read_text())
+    (row,) = told["rows"]
+    assert (told["seed"], told["settings"]["windows"]) == (5, 512)
     assert row["name"] == "r: area"
     table = timing.Table()
     table.add("r: area", 1.0, "1", baseline=0.5, at_least=0.95, seeds=(5,))

@@ -146,8 +146,14 @@ def test_a_run_begins_with_the_trials_of_another(tmp_path: Path, capsys: pytest.
     words = ["--robots", "ant", "--nulls", "1", "--trials", "0", "--kept"]
     first = [*words, "--seed", "7", "--out", str(tmp_path / "a"), "--json", str(tmp_path / "a.json")]
     assert m.main.main(first) == 0
-    assert m.main.main([*words, "--begin", str(tmp_path / "a.json"), "--out", str(tmp_path / "b")]) == 0
-    assert "1 of 1 trials" in capsys.readouterr().out.splitlines()[-1]
+    told = json.loads((tmp_path / "a.json").read_text())
+    assert told["settings"]["robots"] == ["ant"]
+    older = tmp_path / "older.json"  # a file of before runs said how they were made
+    older.write_text(json.dumps({k: told[k] for k in ("rows", "trials")}))
+    for name in ("a", "older"):
+        begun = ["--begin", str(tmp_path / f"{name}.json"), "--out", str(tmp_path / f"of_{name}")]
+        assert m.main.main([*words, *begun]) == 0
+        assert capsys.readouterr().out.splitlines()[-1].startswith("1 of 1 trials")
 
 
 def test_a_folder_keeps_its_seed(tmp_path: Path) -> None:
