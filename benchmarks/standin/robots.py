@@ -24,6 +24,7 @@ class Robot:
       log: machine, seconds and seed to columns.
       mapping: mapping file, given the weighed mass.
       goal: share of single effects to be named right.
+      seconds: goal of the loop's time on two cores that do nothing else.
     """
 
     psi: Mapping[str, float]
@@ -33,6 +34,7 @@ class Robot:
     log: Callable[[Machine, float, int], dict[str, Array]]
     mapping: Callable[[float], str]
     goal: float
+    seconds: float
 
 
 ROBOTS: dict[str, Robot] = {
@@ -44,12 +46,27 @@ ROBOTS: dict[str, Robot] = {
         quadcopter.fly,
         quadcopter_mapping,
         0.95,
+        60.0,
     ),
     "jackal": Robot(
-        standin.JACKAL_PSI, "base_mass", kinds.JACKAL, kinds.JACKAL_OUTSIDE, standin.drive_jackal, jackal_mapping, 0.90
+        standin.JACKAL_PSI,
+        "base_mass",
+        kinds.JACKAL,
+        kinds.JACKAL_OUTSIDE,
+        standin.drive_jackal,
+        jackal_mapping,
+        0.90,
+        180.0,
     ),
     "quadruped": Robot(
-        quadruped.PSI, "base_mass", kinds.QUADRUPED, kinds.QUADRUPED_OUTSIDE, quadruped.log, quadruped_mapping, 0.85
+        quadruped.PSI,
+        "base_mass",
+        kinds.QUADRUPED,
+        kinds.QUADRUPED_OUTSIDE,
+        quadruped.log,
+        quadruped_mapping,
+        0.85,
+        360.0,
     ),
-    "ant": Robot(ant.PSI, "torso_mass", kinds.ANT, kinds.ANT_OUTSIDE, ant.log, ant_mapping, 0.85),
+    "ant": Robot(ant.PSI, "torso_mass", kinds.ANT, kinds.ANT_OUTSIDE, ant.log, ant_mapping, 0.85, 360.0),
 }

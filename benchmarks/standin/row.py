@@ -82,7 +82,8 @@ class Row:
       errors: error over the oracle's by stage (nominal, psi only, after, and the baselines'), at the longest horizon,
         geometric mean over the groups of quantities; empty where the library has no such law.
       oracle_x: X of the oracle over X_null on the verification logs, about 1 if both codes mean the same effect.
-      foretold: of a miss, whether the identifiability table says that it had to be.
+      foretold: where something hidden is not named (it alone, or of a pair), whether the identifiability table says of
+        all that is not that it had to be so.
       effect, psi: parameters of the rightly named effects, and of the model.
       sindy: what sparse regression names, and whether that is right.
       seconds: of the loop alone, wall clock; `cpu` of the whole trial, core-seconds.

@@ -87,6 +87,18 @@ def psi_estimates(report: Report, psi: Mapping[str, float], weighed: str) -> lis
     ]
 
 
+def misses_foretold(report: Report, hidden: Hidden, known: Sequence[tuple[Effect, Array]]) -> bool | None:
+    """Whether the table foretells each hidden effect that no claim names; None where all are named.
+
+    Args:
+      report: the loop's.
+      hidden: what the machine hides.
+      known: the library's own effects for it, with their true parameters, in the order of its parts.
+    """
+    unnamed = [k for k, t in zip(known, parts(hidden), strict=True) if not any(named(c, t) for c in report["effects"])]
+    return all(foretold(report, *k) for k in unnamed) if unnamed else None
+
+
 def foretold(report: Report, truth: Effect, theta: Array) -> bool:
     """Whether the identifiability table says beforehand that an effect would be missed, or taken for another.
 

@@ -69,9 +69,18 @@ def summarise(rows: Sequence[Row], seed: int) -> list[dict[str, Any]]:
     for robot in ROBOTS:
         times = [r for r in rows if r.robot == robot]
         if times:
-            out.value(f"{robot}: the loop, median a trial", _median(r.seconds for r in times), "s", times)
+            _time(out, robot, times)
             out.value(f"{robot}: the whole trial, median", _median(r.cpu for r in times), "core-s", times)
     return out.rows
+
+
+def _time(out: Summary, robot: str, rows: Sequence[Row]) -> None:
+    """The goal is of two free cores. A trial has the cores it is given, often one and shared: above says nothing."""
+    seconds, goal = _median(r.seconds for r in rows), ROBOTS[robot].seconds
+    out.value(
+        f"{robot}: the loop, median a trial", seconds, "s", rows, goal=f"<= {goal:g} s on two free cores",
+        holds=True if seconds <= goal else None,
+    )  # fmt: skip
 
 
 def _median(values: Any) -> float:
@@ -138,6 +147,10 @@ def _outside(out: Summary, rows: Sequence[Row]) -> None:
     for family in dict.fromkeys(r.families[0] for r in rows):
         part = [r for r in rows if r.families == [family]]
         out.share(f"outside the library: {family}, coordinate right", len(_right(part)), len(part), part)
+    for low, high in BINS:
+        part = [r for r in rows if low <= r.ratio < high]
+        name = f"outside the library: coordinate right, X/X_null {low:g} to {high:g}"
+        out.share(name, len(_right(part)), len(part), part)
 
 
 def _nulls(out: Summary, rows: Sequence[Row]) -> None:
@@ -166,14 +179,24 @@ def _parameters(out: Summary, rows: Sequence[Row]) -> None:
             f"effects' parameters in their 95 % interval ({covered} of {len(found)})", share, "1", right,
             goal="0.85 to 0.99", holds=share >= 0.85 and (share <= 0.99 or few), interval=wilson(covered, len(found)),
         )  # fmt: skip
-    out.share("effects' parameters within 5 %", *share_within(found, 0.05), right)
+    out.share("effects' parameters within 5 %", *share_within(found, 0.05), right, least=1.0)
+    off = [e.off for e in found if math.isfinite(e.off)]
+    if off:
+        out.value("effects' parameters, relative error, median", _median(off), "1", right)
     for what, settled in (("nothing is missing any more", True), ("something is, so that they need not be", False)):
         part = [r for r in _right(rows) if (r.verdict in SETTLED) == settled]
         psi = [e for r in part for e in r.psi]
         out.share(f"psi in its 95 % interval, where {what}", sum(e.covered for e in psi), len(psi), part)
+    _foretold(out, rows)
+
+
+def _foretold(out: Summary, rows: Sequence[Row]) -> None:
+    """Of single effects and pairs alone: the table has no row of what is outside the library, so it foretells none."""
     misses = [r for r in rows if r.foretold is not None]
-    foretold = sum(bool(r.foretold) for r in misses)
-    out.share("misses that the identifiability table foretold", foretold, len(misses), misses, least=0.9)
+    for of, part in (("", misses), (", of pairs", [r for r in misses if r.group == "pair"])):
+        foretold = sum(bool(r.foretold) for r in part)
+        name = f"misses that the identifiability table foretold{of}"
+        out.share(name, foretold, len(part), part, least=None if of else 0.9)
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

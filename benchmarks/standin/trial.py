@@ -21,7 +21,7 @@ from .kinds import Outside
 from .outside import Both
 from .robots import ROBOTS, Robot
 from .row import Row, Task
-from .score import estimates, foretold, psi_estimates, score
+from .score import estimates, misses_foretold, psi_estimates, score
 
 LEAST, MOST = 1.3, 30.0  # X / X_null of what is hidden, log-uniform
 _PLACES = 3  # that are drawn until an effect acts: friction at a joint that these motions never turn is no effect
@@ -104,8 +104,7 @@ def _compare(row: Row, task: Task, folder: Path, report: dict, machine: Machine)
     best = oracle(bench, fitting, machine)
     if known is None or best is None:
         raise ValueError(f"{machine.hidden.text}: the library proposes no such effect for this model")
-    if task.group == "single" and row.outcome != "right":
-        row.foretold = foretold(report, *known[0])
+    row.foretold = misses_foretold(report, machine.hidden, known)
     row.oracle_x = chi2(problem, *best) / report["chi2"]["null"]
     fits = json.loads((folder / "report" / "fit.json").read_text())
     calibrated = unpack(fits["calibrated"], bench.plant)

@@ -224,6 +224,24 @@ def test_a_miss_is_foretold_by_its_size_or_by_its_mimic() -> None:
     assert not m.score.foretold(report(), slope, theta)
 
 
+def test_of_a_pair_each_effect_that_is_not_named_must_be_foretold() -> None:
+    m = modules()
+    families = import_module("nfc_gym.physics.effects").FAMILIES
+    known = [(families[f]((at,)), np.array([size])) for f, at, size in (("coulomb", "j", 0.1), ("loss", "a", 0.2))]
+    both = m.outside.Both([m.kinds.Coulomb("j", 0.1), m.kinds.Loss("a", 0.2)])
+    sizes = {"coulomb:j": 0.3, "loss:a": 0.1}  # too small to be seen, and large enough
+    table = [{"id": i, "smallest_detectable": least, "worst_mimic": None} for i, least in sizes.items()]
+
+    def told(*claims: dict) -> bool | None:
+        return m.score.misses_foretold(report(*claims) | {"identifiability": table}, both, known)
+
+    friction, loss = claim("coulomb", "j"), claim("loss", "a")
+    assert told(loss) is True
+    assert told(friction) is False
+    assert told() is False
+    assert told(friction, loss, claim("lag", "a")) is None
+
+
 def test_what_sparse_regression_names_is_read_generously_but_at_its_place() -> None:
     pytest.importorskip("pysindy")
     sparse, m = import_module("standin.sparse"), modules()
@@ -265,6 +283,10 @@ def test_summary_counts_and_compares_with_the_goals() -> None:
     rows += [row("ant", "cogging", o, group="outside") for o in ("right", "right", "right", "silent")]
     rows[9].foretold = rows[10].foretold = True
     rows[11].foretold = False
+    rows += [row("jackal", "lag", o, group="pair") for o in ("half", "missed")]
+    rows[-2].foretold, rows[-1].foretold = True, False
+    for r in rows:
+        r.seconds, r.cpu = {"jackal": 200.0, "ant": 300.0}.get(r.robot, 50.0), 1.0
     estimate = m.row.Estimate("lag.time_constant", "s", 0.02, 0.0205, 0.019, 0.022)
     rows[0].effect = [estimate, m.row.Estimate("lag.time_constant", "s", 0.02, 0.03, 0.028, 0.032)]
     figures = m.summary.summarise(rows, 11)
@@ -279,10 +301,24 @@ def test_summary_counts_and_compares_with_the_goals() -> None:
     assert (of("false claims in 2 nulls")["value"], of("false claims in 2 nulls")["holds"]) == (1, True)
     assert of("effects' parameters in their 95 % interval (1 of 2)")["holds"] is False
     assert of("effects' parameters within 5 % (1 of 2)")["value"] == 0.5
-    assert of("misses that the identifiability table foretold (2 of 3)")["holds"] is False
+    assert of("effects' parameters within 5 % (1 of 2)")["holds"] is False
+    assert of("effects' parameters, relative error, median")["value"] == pytest.approx(0.2625)
+    assert of("misses that the identifiability table foretold (3 of 5)")["holds"] is False
+    assert of("misses that the identifiability table foretold, of pairs (1 of 2)")["holds"] is None
+    assert of("outside the library: coordinate right, X/X_null 3 to 10 (3 of 4)")["high"] < 1
     assert of("outside the library: silent (1 of 4)")["holds"] is False
     assert of("outside the library: said so, coordinate right (3 of 4)")["value"] == 0.75
     assert of("jackal: named right (")["seeds"] == [11] + [1] * 12
+    times = {robot: of(f"{robot}: the loop, median") for robot in ("quadcopter", "jackal", "ant")}
+    assert {robot: (r["goal"], r["holds"]) for robot, r in times.items()} == {
+        "quadcopter": ("<= 60 s on two free cores", True),
+        "jackal": ("<= 180 s on two free cores", None),  # cores were shared, so that above says nothing
+        "ant": ("<= 360 s on two free cores", True),
+    }
+    printed = m.summary.table(figures)
+    for r in figures:
+        if " of " in r["name"]:
+            assert f"{r['low']:.2f} to {r['high']:.2f}" in next(x for x in printed.split("\n") if r["name"] in x)
     json.dumps(figures, allow_nan=False)
 
 
