@@ -35,9 +35,11 @@ class ForwardProblem(InstantProblem):
         ]
         return found
 
-    def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str]]:
+    def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str, str]]:
         """One column a component; of an orientation, which is predicted here and not compared, four."""
-        return [(o.group, o.unit, o.place) for o in self.observers for _ in range(4 if o.quaternion else o.size)]
+        return [
+            (o.group, o.unit, o.place, o.name) for o in self.observers for _ in range(4 if o.quaternion else o.size)
+        ]
 
     def evaluate(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
         """See `InstantProblem`."""

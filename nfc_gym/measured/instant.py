@@ -141,8 +141,8 @@ class InstantProblem(Problem):
         """Predictions (P, T, C) along each track, of one time step, for parameter vectors (P, size)."""
 
     @abstractmethod
-    def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str]]:
-        """(group, unit, place) of each of the C columns."""
+    def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str, str]]:
+        """(group, unit, place, channel) of each of the C columns."""
 
     def _layout(self, model: mujoco.MjModel, length: float) -> None:
         """Cut every track into blocks; within a block smoothed samples are thinned to independent ones."""
@@ -164,9 +164,8 @@ class InstantProblem(Problem):
         self.mask = np.stack([self.tracks[i].mask[r].ravel() for i, r in zip(self.log_of, self.rows, strict=True)])
         self.time_of = np.array([self.tracks[i].time[r[0]] for i, r in zip(self.log_of, self.rows, strict=True)])
         what = self.describe(model) * per
-        self.columns = Columns(
-            tuple(w[0] for w in what), tuple(w[1] for w in what), np.zeros(len(what)), tuple(w[2] for w in what)
-        )
+        group, unit, place, channel = zip(*what, strict=True)
+        self.columns = Columns(group, unit, np.zeros(len(what)), place, channel)
 
     @property
     def window(self) -> int:

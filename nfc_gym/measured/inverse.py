@@ -46,13 +46,14 @@ class InverseProblem(InstantProblem):
         """Inverse dynamics along tracks, which most candidates' fits ask for at the same psi."""
         return Recent(_WALKED)
 
-    def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str]]:
+    def describe(self, model: mujoco.MjModel) -> list[tuple[str, str, str, str]]:
         """One column an actuator."""
         moments, names = levers(model), actuator_names(model)
         hinges = model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_HINGE)
         turning = [bool(hinges[moments[a] != 0].all()) for a in self.actuators]
         kinds = [("torque", "N m") if turns else ("force", "N") for turns in turning]
-        return [(*kind, f"actuator:{names[a]}") for kind, a in zip(kinds, self.actuators, strict=True)]
+        at = [names[a] for a in self.actuators]
+        return [(*kind, f"actuator:{name}", f"force:{name}") for kind, name in zip(kinds, at, strict=True)]
 
     def evaluate(self, plant: Plant, x: Array, tracks: Sequence[Track]) -> list[Array]:
         """See `InstantProblem`."""

@@ -17,12 +17,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Columns:
-    """What the m numbers of a block are: report group, unit, seconds after the start, and the place in the model."""
+    """What the m numbers of a block are: report group, unit, seconds after the start, place in the model, channel."""
 
     group: tuple[str, ...]
     unit: tuple[str, ...]
     horizon: Array
     place: tuple[str, ...]
+    channel: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.group)

@@ -132,7 +132,7 @@ class RolloutProblem(Problem):
         return difference.reshape(*difference.shape[:-2], -1)
 
     def _describe(self) -> Columns:
-        group, unit, horizon, place = [], [], [], []
+        group, unit, horizon, place, channel = [], [], [], [], []
         for o in self._observers:
             for h in self._kit.layout.horizons:
                 for _ in range(o.size):
@@ -140,7 +140,8 @@ class RolloutProblem(Problem):
                     unit.append(o.unit)
                     horizon.append(h)
                     place.append(o.place)
-        return Columns(tuple(group), tuple(unit), np.array(horizon), tuple(place))
+                    channel.append(o.name)
+        return Columns(tuple(group), tuple(unit), np.array(horizon), tuple(place), tuple(channel))
 
     def stretches(self) -> list[Stretch]:
         """The measured states along each block."""

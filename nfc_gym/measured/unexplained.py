@@ -1,6 +1,6 @@
 """The rest in words: which degree of freedom is wrong, what the misfit looks like there, and what comes nearest."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -78,9 +78,10 @@ def unexplained(
             guess.law.bind(plant.model)
             at = _place(plant.model, guess.law, any(guess is p for p in scanned.proposals))
             return at | out | {"description": f"{_guess(guess)}{_elsewhere(v, at)}; {reason}{near}"}
-    place, coordinate, times = _worst(v)
-    text = f"furthest beyond the noise, with {times:.3g} times its mean square; {reason}{near}"
-    return {"coordinate": coordinate, "where": place} | out | {"description": text}
+    worst = _worst(v)
+    quantity = f" in its {worst.group}" if worst.named else ""
+    text = f"furthest beyond the noise{quantity}, with {worst.times:.3g} times its mean square; {reason}{near}"
+    return {"coordinate": worst.channel, "where": worst.place} | out | {"description": text}
 
 
 def _inner(sentence: str) -> str:
@@ -116,21 +117,25 @@ def _place(model: mujoco.MjModel, law: Effect, sure: bool = True) -> dict[str, s
     What repeats with the turn of a part comes from that part, whatever it pushes, if it is `sure` that it repeats.
     """
     if sure and law.family == LawHarmonic.family:
-        return _degree(model, law.where[-1].removesuffix("@body"), False)
-    return _degree(model, law.where[0].removesuffix("@body"), law.family in _SPEEDS)
+        return _degree(model, law.where[-1], False)
+    return _degree(model, law.where[0], law.family in _SPEEDS)
 
 
 def _degree(model: mujoco.MjModel, name: str, speed: bool) -> dict[str, str]:
-    """The same of a degree of freedom: a joint's, or one of the six of a free one."""
+    """The same of a degree of freedom: a joint's, or one of the six of a free one, `[i]` and with `@body` its own axes.
+
+    No component of a quaternion is the turn about an axis, and no place is along a body's own: what shows these is
+    their rate. MuJoCo's free joints turn about the body's own axes.
+    """
     joint, _, rest = name.partition("[")
     if not rest:
         return {"coordinate": f"joint:{joint}:{'vel' if speed else 'pos'}", "where": f"joint:{joint}"}
-    i = int(rest[0])
+    i, name, own = int(rest[0]), name.removesuffix("@body"), rest.endswith("@body")
     dof, _ = degrees(model)[name]
     body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.dof_bodyid[dof]))
-    kind = ("linvel" if i < 3 else "angvel") if speed else ("pos" if i < 3 else "quat")
+    channel = "angvel@body" if i > 2 else "linvel@body" if own else "linvel" if speed else "pos"
     # a body without a name has no channel
-    return {"coordinate": f"body:{body}:{kind}[{i % 3}]" if body else f"joint:{name}", "where": f"joint:{name}"}
+    return {"coordinate": f"body:{body}:{channel}[{i % 3}]" if body else f"joint:{name}", "where": f"joint:{name}"}
 
 
 def _joint_of(law: Effect) -> str:
@@ -164,14 +169,29 @@ def _nearest(found: Found) -> tuple[str | None, float]:
 
 def _elsewhere(v: Verified, at: dict[str, str]) -> str:
     """Where the misfit is largest, if that is not where the force acts that would do something about it."""
-    place, coordinate, times = _worst(v)
-    if place == at["where"] or at["coordinate"].startswith(f"{place}:"):
+    worst = _worst(v)
+    if worst.place == at["where"] or at["coordinate"].startswith(f"{worst.place}:"):
         return ""
-    return f"; furthest beyond the noise is {coordinate}, with {times:.3g} times its mean square"
+    words = f"{worst.place} ({worst.group})" if worst.named else worst.place
+    return f"; furthest beyond the noise is {words}, with {worst.times:.3g} times its mean square"
 
 
-def _worst(v: Verified) -> tuple[str, str, float]:
-    """(place, in words, times) of the columns whose misfit is most times what a perfect model would show there.
+class _Worst(NamedTuple):
+    """Place, report group and channel of columns, and how many times a perfect model's misfit theirs is."""
+
+    place: str
+    group: str
+    channel: str
+    times: float
+
+    @property
+    def named(self) -> bool:
+        """Whether the group says more than the place."""
+        return not self.place.startswith("sensor")
+
+
+def _worst(v: Verified) -> _Worst:
+    """The columns whose misfit is most times what a perfect model would show there.
 
     A wrong joint shows most in itself, however small a part of all the misfit that is: what it moves is the whole
     machine, in many more numbers.
@@ -184,4 +204,5 @@ def _worst(v: Verified) -> tuple[str, str, float]:
         of = np.array([k == key for k in keys])
         times[key] = float((count * found)[of].sum() / max((count * floor)[of].sum(), 1e-9))
     place, group = max(times, key=lambda k: times[k])
-    return place, place if place.startswith("sensor") else f"{place} ({group})", times[(place, group)]
+    channel = v.problem.columns.channel[keys.index((place, group))]
+    return _Worst(place, group, channel, times[(place, group)])

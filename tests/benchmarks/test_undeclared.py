@@ -188,13 +188,15 @@ def test_outcomes_outside_the_library() -> None:
     m = modules()
     cogs = m.outside.Cogging("front_left_wheel", 1.0, 3, 0.0)
     kind = m.robots.ROBOTS["jackal"].outside["cogging"]
-    said = report(verdict="unexplained", coordinate="joint:front_left_wheel (joint speed)")
+    said = report(verdict="unexplained", coordinate="joint:front_left_wheel:vel")
     assert outcome(said, cogs, kind).outcome == "right"
-    assert outcome(report(verdict="unexplained", coordinate="body:base (velocity)"), cogs, kind).outcome == "elsewhere"
+    older = report(verdict="unexplained", coordinate="joint:front_left_wheel (joint speed)")  # of earlier reports
+    assert outcome(older, cogs, kind).outcome == "right"
+    assert outcome(report(verdict="unexplained", coordinate="body:base:linvel"), cogs, kind).outcome == "elsewhere"
     assert outcome(report(verdict="nothing missing"), cogs, kind).outcome == "silent"
     assert outcome(report(claim("coulomb", "front_left_wheel")), cogs, kind).outcome == "wrong"
     load, near = m.outside.LooseLoad("base", 1.0, 0.1, 0.0), m.robots.ROBOTS["jackal"].outside["loose_load"]
-    partly = report(claim("payload", "base"), verdict="partly explained", coordinate="body:base (velocity)")
+    partly = report(claim("payload", "base"), verdict="partly explained", coordinate="body:base:angvel@body[1]")
     assert outcome(partly, load, near).outcome == "right"
     assert outcome(report(claim("payload", "base")), load, near).outcome == "silent"
 

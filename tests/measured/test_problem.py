@@ -99,6 +99,7 @@ def test_at_the_truth_the_residual_is_noise(plant: Plant, history: float) -> Non
     problem = rollouts(plant, history=history, logs=60)
     right, wrong = np.array([DAMPING]), np.array([2 * DAMPING])
     assert problem.columns.group == ("joint angle",) * 3 + ("joint speed",) * 3
+    assert problem.columns.channel == ("joint:hinge:pos",) * 3 + ("joint:hinge:vel",) * 3
     np.testing.assert_allclose(problem.columns.horizon, [0.1, 0.2, 0.3] * 2)
     assert chi2(problem, plant, right).mean() == pytest.approx(1, abs=0.2)
     assert chi2(problem, plant, wrong).mean() > 3
@@ -286,6 +287,7 @@ def test_inverse_problem_gives_the_forces_of_the_closed_form(plant: Plant) -> No
     assert (residual[1] ** 2 / sd**2).mean() > 100
     assert problem.columns.group[0] == "torque"
     assert problem.columns.place[0] == "actuator:motor"
+    assert problem.columns.channel[0] == "force:motor"
     np.testing.assert_allclose(problem.take(np.array([4, 2])).residual(plant, x), residual[:, [4, 2]], atol=1e-12)
     twin = problem.synthetic(plant, x[1], np.random.default_rng(1))
     assert (twin.residual(plant, x[1:]) ** 2 / sd**2).mean() == pytest.approx(1, abs=0.2)

@@ -141,7 +141,8 @@ def test_no_law_is_looked_for_where_effects_leave_too_little_for_it(
 
 
 def test_even_without_a_law_the_worst_place_is_named() -> None:
-    columns = SimpleNamespace(place=("joint:a", "joint:b"), group=("joint angle", "joint speed"))
+    place, channel = ("joint:a", "joint:b"), ("joint:a:pos", "joint:b:vel")
+    columns = SimpleNamespace(place=place, group=("joint angle", "joint speed"), channel=channel)
     problem = SimpleNamespace(mask=np.ones((5, 2), bool), columns=columns)
     # The first misses by more, the second by more of what noise alone would make it miss.
     white, none, floor = {"extended": np.tile([4.0, 3.0], (5, 1))}, np.zeros((0, 0)), np.array([8.0, 0.9])
@@ -150,8 +151,9 @@ def test_even_without_a_law_the_worst_place_is_named() -> None:
     found = SimpleNamespace(rounds=[last], rest=SimpleNamespace(dropped=[], scanned=None), generic=None, hinted=None)
     left = unexplained(v, found, SimpleNamespace(effects=(), model=None), [], [], 0.0)  # pyright: ignore[reportArgumentType]
     assert left["where"] == "joint:b"
-    assert left["coordinate"] == "joint:b (joint speed)"
-    assert left["description"].startswith("furthest beyond the noise, with 10 times its mean square; too small; the")
+    assert left["coordinate"] == "joint:b:vel"
+    said = "furthest beyond the noise in its joint speed, with 10 times its mean square; too small; the"
+    assert left["description"].startswith(said)
     assert (left["nearest"], left["nearest_share"]) == ("lag:m", 0.12)
 
 

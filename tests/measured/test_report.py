@@ -61,7 +61,7 @@ def test_the_verdict_comes_first_with_errors_units_and_logs() -> None:
 def test_each_verdict_has_its_own_words_sign_and_colour(word: str) -> None:
     report = example(0 if word in ("nothing missing", "unexplained") else 1) | {"verdict": word}
     if "expl" in word and word != "explained":
-        left = {"coordinate": "joint:arm (joint angle)", "where": "joint:arm", "description": "a bump"}
+        left = {"coordinate": "joint:arm:pos", "where": "joint:arm", "description": "a bump"}
         report["unexplained"] = left | {"nearest": "gain:motor", "nearest_share": 0.12}
     page = render(report, pictures())
     own = story.VERDICTS[word]
@@ -69,7 +69,7 @@ def test_each_verdict_has_its_own_words_sign_and_colour(word: str) -> None:
     assert own.meaning in page
     assert f'<header class="{own.cls}">' in page
     assert not any(v.meaning in page or v.cls == own.cls or v.sign == own.sign for v in others)
-    assert ("joint:arm (joint angle)" in page) == (report["unexplained"] is not None)
+    assert ("joint:arm:pos" in page) == (report["unexplained"] is not None)
     assert ("12\N{NO-BREAK SPACE}%" in page) == (report["unexplained"] is not None)
 
 

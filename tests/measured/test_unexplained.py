@@ -7,11 +7,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from nfc_gym.measured.channels import parse_channel
 from nfc_gym.measured.laws import Proposal, Scanned
+from nfc_gym.measured.observe import observer
 from nfc_gym.measured.ranking import Round
 from nfc_gym.measured.remainder import Remainder
 from nfc_gym.measured.unexplained import unexplained
 from nfc_gym.measured.verdict import Verified
+from nfc_gym.physics.effects.law_motion import LawPower
 from nfc_gym.physics.effects.law_place import LawHeight
 from nfc_gym.physics.effects.law_waves import LawHarmonic
 from nfc_gym.physics.parameters import ParameterSpace
@@ -43,7 +46,8 @@ def said(
     rest = Remainder(fitted=None, scanned=Scanned(believable, nearest, {}, evidence or {}))  # type: ignore[arg-type]
     rest.bare = None if bare is None else Scanned([], bare, {}, {})
     found: Any = SimpleNamespace(generic=generic, hinted=hinted, rest=rest, rounds=[Round([], 0.0, rows)], nearest=None)
-    columns = SimpleNamespace(place=("joint:knee", "joint:knee"), group=("joint angle", "joint speed"))
+    place, channel = ("joint:knee",) * 2, ("joint:knee:pos", "joint:knee:vel")
+    columns = SimpleNamespace(place=place, group=("joint angle", "joint speed"), channel=channel)
     problem = SimpleNamespace(columns=columns, mask=np.ones((1, 2), bool))
     white, none = {"extended": np.array([[1.0, 3.0]])}, np.zeros((0, 0))
     v = Verified(problem, {}, white, none, none, none, floor=np.ones(2))  # type: ignore[arg-type]
@@ -82,7 +86,7 @@ def test_what_moves_in_a_body_is_at_the_body() -> None:
     ("generic", "coordinate", "where"),
     [
         ("generic_position:root[2]", "body:car:pos[2]", "joint:root[2]"),
-        ("generic_velocity:root[4]", "body:car:angvel[1]", "joint:root[4]"),
+        ("generic_velocity:root[4]", "body:car:angvel@body[1]", "joint:root[4]"),
         ("generic_velocity:knee", "joint:knee:vel", "joint:knee"),
     ],
 )
@@ -126,7 +130,7 @@ def test_what_repeats_with_another_parts_turn_comes_from_that_part() -> None:
     near = Proposal(law, law.null, 0.2)
     assert said(None, nearest=near, sure=True)["coordinate"] == "joint:knee:pos"
     # by chance any push may seem to repeat with something
-    assert said(None, nearest=near)["coordinate"] == "body:car:quat[2]"
+    assert said(None, nearest=near)["coordinate"] == "body:car:angvel@body[2]"
 
 
 def test_what_is_no_cause_leaves_all_of_it_to_be_placed() -> None:
@@ -174,10 +178,28 @@ def test_a_force_without_a_law_is_placed_where_its_evidence_leads() -> None:
     lift = LawHeight(("root[2]",))
     near = Proposal(lift, lift.null, 0.2)
     found = said(None, evidence={"root": 300.0, "knee": 160.0}, nearest=near)
-    assert found["coordinate"].startswith("body:car:")
-    assert found["coordinate"].endswith("[2]")
+    assert (found["coordinate"], found["where"]) == ("body:car:pos[2]", "joint:root[2]")
     unnamed = said(None, evidence={"root": 300.0}, nearest=near, text=MODEL.replace('<body name="car"', "<body"))
     assert (unnamed["coordinate"], unnamed["where"]) == ("joint:root[2]", "joint:root[2]")
     assert said(None, evidence={"knee": 300.0, "root": 160.0}, nearest=near)["coordinate"] == "joint:knee:pos"
     # a lead that is no lead: where the misfit is most times the noise
-    assert said(None, evidence={"root": 300.0, "knee": 295.0})["coordinate"] == "joint:knee (joint speed)"
+    assert said(None, evidence={"root": 300.0, "knee": 295.0})["coordinate"] == "joint:knee:vel"
+
+
+@pytest.mark.parametrize(
+    ("law", "coordinate"),
+    [
+        (LawPower(("root[0]",)), "body:car:linvel[0]"),
+        (LawPower(("root[0]@body",)), "body:car:linvel@body[0]"),
+        (LawPower(("root[3]",)), "body:car:angvel@body[0]"),
+        (LawHeight(("root[2]",)), "body:car:pos[2]"),
+    ],
+)
+def test_where_the_rest_is_has_the_name_of_a_channel_and_the_axis_of_a_component(law: Any, coordinate: str) -> None:
+    found = said(None, nearest=Proposal(law, law.null, 0.2))
+    assert found["coordinate"] == coordinate
+    channel = parse_channel(coordinate.partition("[")[0])
+    assert observer(mujoco.MjModel.from_xml_string(MODEL), coordinate.partition("[")[0]) is not None
+    assert channel.own_frame == ("@body" in coordinate)
+    turned = law.where[0].removesuffix("@body")
+    assert found["where"] == f"joint:{turned}"
