@@ -103,6 +103,7 @@ def report(folder: Path) -> Mapping[str, Any]:
 def test_one_drag_and_a_wind_for_each_day(report: Mapping[str, Any]) -> None:
     (found,) = report["effects"]
     assert (found["id"], found["conditions"]) == ("wind:sled:conditions", ["breeze", "calm", "gale"])
+    assert (found["family"], found["where"]) == ("wind", "sled")
     assert report["verdict"] == "explained"
     values = found["parameters"]
     assert values["drag"]["value"] == pytest.approx(DRAG, rel=0.05)
