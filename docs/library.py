@@ -80,11 +80,52 @@ As a row, as `ApplyEffects` takes it and `effects.yaml` holds it, with a value o
   at 1. An effect vanishes where its parameters are 0, or at the null that is named. A *shape* parameter has no null: it
   says what the effect is like, and the others say how much of it there is. What is *of the day* may differ between the
   `condition`s of the logs. *Own unit* is that of the place: of an actuator's command, of a channel, of a joint's force.
-- **kept in**: where a run writes what it found. `model.xml` carries what MJCF can say, and what it carries needs no
-  wrapper: plain MuJoCo simulates it (from rest at a command of 0, see
-  [results.md](results.md#modelxml)). `effects.yaml` lists the others. Both are named where it depends: a delay
-  shorter than a physics step, a lag of an actuator that has an activation already, or soil that resists wheels
-  besides letting them sink is nothing that MJCF can say.
+- **kept in**: where a run writes what it found. What `model.xml` carries needs no wrapper: plain MuJoCo simulates it
+  (from rest at a command of 0, see [results.md](results.md#modelxml)). `effects.yaml` lists the others;
+  [below](#why-these-are-in-effectsyaml) is why. Both are named where it depends: a delay shorter than a physics step,
+  a lag of an actuator that has an activation already, or soil that resists wheels besides letting them sink is in
+  `effects.yaml`.
+"""
+
+WHY = """
+## Why these are in `effects.yaml`
+Of some of them MuJoCo 4.0 has a law of its own. It is not used where it is another law, belongs to the whole model, or
+wants an actuator that the model does not have: a passive `dcmotor` (`input="none"`) adds no command, but an actuator,
+and the effects and tools of this package take the command of an actuator to be the column of its number. "Nothing"
+means that MuJoCo's manual has no element or attribute for it.
+
+- `stribeck`: the `lugre` friction of a `dcmotor` has Stribeck's curve behind a bristle that bends before it slips; such
+  an actuator would be one more. Ours sets `frictionloss` anew in every step, so that the solver holds a joint at rest.
+- `load_friction`, `directional_friction`: nothing; `frictionloss` is one number for both directions and any load.
+- `hysteresis`: the `lugre` friction of a passive `dcmotor`, with `damping` 0 and `static` equal to `coulomb`, is this
+  very law (its stiffness is level / transition), so MJCF could say it by one more actuator. `springyield` is another
+  one: the joint's only spring, which yields all at once at its threshold.
+- `backlash`: a second joint with limits and a rotor's inertia. It would change the model's coordinates, of which no log
+  measures the new one. Ours keeps the rotor's state to itself.
+- `cogging`: the `cogging` of a passive `dcmotor` is this very torque, so MJCF could say it by one more actuator.
+- `lag`, `delay`: in `model.xml` but for what the table's introduction names.
+- `dead_zone`: nothing for an actuator; only the spring of a tendon has a dead band.
+- `torque_speed`: a `dcmotor` with `input="ff"` and a limit `Vmax` has the same falling line where it drives, if the
+  actuator is made anew as such a motor; braking, its limit grows with speed. Ours acts on actuators of any kind
+  that move a hinge, a slide or a fixed tendon, and does not limit braking.
+- `supply_sag`: nothing that takes a measured signal.
+- `thermal`: the `thermal` of a `dcmotor` heats its winding's resistance by its current, in electrical constants of the
+  motor. Ours has three numbers, and takes from the command of an actuator of any kind.
+- `drag_linear`, `drag_quadratic`: fluid forces by `density` and `viscosity`, which belong to the whole model; what a
+  body makes of them follows from its inertia, or from an ellipsoid about a geom with lift and added mass beside
+  drag. Ours is a coefficient for each axis of one body, and independent of its inertia, which is fitted too.
+- `wind`: `option wind` works through those fluid forces, on all bodies alike, and does nothing without them. Ours is a
+  push on one body and its drag, and the push may differ from day to day.
+- `gust`: nothing that begins and ends; `option wind` is steady.
+- `rotor_drag`, `ground_effect`: nothing that depends on the thrust of other actuators, or on height.
+- `external_force`: no constant force on a body is part of a model (`xfrc_applied` and `qfrc_applied` are of the
+  simulation); an actuator that always pushes would be one more.
+- `slip`: nothing; a geom has one sliding friction, the two of a contact `pair` do not turn with a wheel, and
+  `surfacevel` imposes a velocity on a surface.
+- `friction_patch`: nothing; friction is a whole geom's.
+- `sinkage`: its depth is a negative `margin` in `model.xml`; of resistance there is nothing.
+- `sensor_bias`, `sensor_gain`, `misalignment`: nothing; MuJoCo's sensors have `noise`, `cutoff` and `delay` alone.
+  `sensor_delay`: those that are sensors of the model have a `delay`; ours acts on joints' and bodies' channels too.
 """
 
 LAWS = """
@@ -309,7 +350,7 @@ def rows(generic: bool) -> list[str]:
 
 def page() -> str:
     """The whole page."""
-    return "\n".join([TOP, *rows(generic=False), LAWS + "\n".join(rows(generic=True)), USE])
+    return "\n".join([TOP, *rows(generic=False), WHY + LAWS + "\n".join(rows(generic=True)), USE])
 
 
 if __name__ == "__main__":

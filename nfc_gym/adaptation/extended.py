@@ -1,8 +1,8 @@
 """What `nfc-gym close-loop` found, as a policy is to be adapted to it: calibrated parameters and named effects.
 
-Its folder holds `effects.yaml` (what MJCF cannot say), `model.xml` (all the rest) and `report.json` (every effect with
-the interval of its sizes, every parameter). Parts of that will do: a hand-written `effects.yaml`, which may have `psi`
-too, or a `model.xml` that was sent alone.
+Its folder holds `effects.yaml` (what `model.xml` does not carry), `model.xml` (all the rest) and `report.json` (every
+effect with the interval of its sizes, every parameter). Parts of that will do: a hand-written `effects.yaml`, which may
+have `psi` too, or a `model.xml` that was sent alone.
 """
 
 import hashlib

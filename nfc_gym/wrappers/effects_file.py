@@ -1,4 +1,4 @@
-"""`effects.yaml`: what a model lacks and MJCF cannot say, and the model that it was found for."""
+"""`effects.yaml`: what a model lacks and `model.xml` does not carry, and the model that it was found for."""
 
 import hashlib
 import os
