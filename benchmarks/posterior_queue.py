@@ -1,7 +1,7 @@
 """All cells of posterior_table.py on a machine with several GPUs: processors simulate, GPUs train, both all the time.
 
     python benchmarks/posterior_queue.py --out DIR [--gpus 0 1] [--per-gpu 3] [--jobs 9] [--budget 60] [--stop 1200]
-        [--windows JackalFlat=100000 AntFlat=100000 ...] [--residuals JackalFlat ...] [--quick]
+        [--windows JackalFlat=100000 AntFlat=100000 ...] [--residuals JackalFlat ...] [--json FILE] [--quick]
 
 Environments come in the order of WINDOWS, or of `--windows`. One after the other is simulated by `--jobs` processes;
 as soon as one's windows are there, its cells are trained, ours first, by `--per-gpu` processes on each GPU, each of
@@ -23,7 +23,8 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from options import count, ended, number
+from options import count, ended, json_file, number, write_json
+from posteriors.keep import results
 from posteriors.methods import INPUTS, METHODS, cell_name
 from posteriors.paper import ROBOTS, TERRAINS
 from posteriors.sets import HALF, JUDGE, TRAIN, environment, stored
@@ -205,6 +206,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         scratch, args.out = args.out is None, args.out or Path(folder)
         code = fill(args)
+        if args.json:
+            write_json(args.json, results(args.out))
         if scratch and (args.out / "table.md").is_file():  # which goes with its folder
             print((args.out / "table.md").read_text())
         return code
@@ -280,6 +283,7 @@ def _arguments() -> argparse.Namespace:
     add("--rate", type=number(0), default=1e-3, help="largest step size (default %(default)s)")
     add("--draws", type=count(1), default=8,
         help="of noise a window and training step, of score models (default %(default)s)")  # fmt: skip
+    add("--json", type=json_file, metavar="FILE", help="write all results of DIR here: {name: {figure: value}}")
     add("--few", type=count(1), default=50,
         help="windows that are replayed, or whose maps are drawn (default %(default)s)")  # fmt: skip
     add("--ceiling-windows", type=count(1), default=8, help="that a ceiling is the mean of (default %(default)s)")

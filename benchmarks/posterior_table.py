@@ -3,7 +3,7 @@
     python benchmarks/posterior_table.py --out DIR [--robots Jackal Ant ...] [--terrain Flat Rough] [--windows 100000]
         [--methods mdn-rff mdn-tcn sde-nn sde-rff sde-fks sde-tcn flow-tcn sbi-npe sbi-npse]
         [--inputs window summaries] [--effects 0] [--seeds 0] [--epochs 100] [--budget SECONDS]
-        [--extras ceiling residuals motion axle rounds plots]
+        [--extras ceiling residuals motion axle rounds plots] [--json FILE]
     python benchmarks/posterior_table.py --quick
 
 Windows are simulated once into DIR and used by every method; a cell (robot, ground, method, inputs, seed) that is
@@ -34,7 +34,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # a second thread waits for its core whenever another process has it
 
 import torch
-from options import count, ended, number
+from options import count, ended, json_file, number, write_json
 from posteriors import extras, plots, report
 from posteriors.cases import WAYS
 from posteriors.ceilings import ceiling_of
@@ -106,6 +106,8 @@ def main() -> None:
                 else:
                     robot_on(run, robot, terrain)
         print(run.show())
+        if args.json:
+            write_json(args.json, kept.values())
 
 
 def robot_on(run: Run, robot: str, terrain: str) -> None:
@@ -275,6 +277,8 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--axles", type=count(0), default=100, help="windows with a lost axle (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help="a toy: Jackal on flat ground, in a minute")
+    parser.add_argument("--json", type=json_file, metavar="FILE",
+                        help="write all results of DIR here: {name: {figure: value}}")  # fmt: skip
     args = parser.parse_args()
     if args.out is None and not args.quick:
         parser.error("name a folder: --out DIR")

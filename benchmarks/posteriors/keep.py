@@ -97,7 +97,12 @@ class Kept:
 
     def values(self) -> dict[str, dict[str, Any]]:
         """Every result that there is, by name."""
-        return {f.stem: json.loads(f.read_text()) for f in sorted(self.cells.glob("*.json"))}
+        return results(self.out)
+
+
+def results(out: Path) -> dict[str, dict[str, Any]]:
+    """Every result that is kept in a folder, by name."""
+    return {f.stem: json.loads(f.read_text()) for f in sorted((out / "cells").glob("*.json"))}
 
 
 def write(file: Path, value: Any) -> None:

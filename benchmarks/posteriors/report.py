@@ -1,5 +1,6 @@
 """The tables, in Markdown, from all results of a folder."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -17,6 +18,7 @@ _NAMES = {
     "linear": "states, actions and physics summaries, from a linear start",
     "map": "states, actions and elevation map",
 }
+_EXTRAS = {"residuals", "motion", "axle", "rounds"}  # results that are no method's cell
 
 
 def shown(pair: Iterable[float] | None, digits: int = 3) -> str:
@@ -184,6 +186,14 @@ def _others(results: Results) -> list[str]:
     """What is no method's cell, as it is: one line a figure."""
     rows = []
     for name, found in results.items():
-        if name.split("_")[-1] in ("residuals", "motion", "axle", "rounds"):
-            rows += [[name, k, shown(v) if isinstance(v, list) and len(v) == 2 else str(v)] for k, v in found.items()]
+        if _EXTRAS.intersection(name.split("_")):  # a name may say more after it, as residuals_waves does
+            rows += [[name, k, _figure(v)] for k, v in found.items()]
     return ["## More\n", lines(["", "figure", "value"], rows)] if rows else []
+
+
+def _figure(value: Any) -> str:
+    """As it is; a mean with as many digits as its error has zeros, three at least."""
+    if not isinstance(value, list) or len(value) != 2:
+        return str(value)
+    small = 0 < value[1] < 1
+    return shown(value, max(3, math.ceil(-math.log10(value[1]))) if small else 3)

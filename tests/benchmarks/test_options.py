@@ -104,19 +104,36 @@ def test_a_queue_with_a_failure_ends_in_1(
     assert said.splitlines()[-1].endswith("FAILED: JackalFlat; no table yet")
 
 
-def test_a_queue_without_a_folder_prints_its_table(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_queue_without_a_folder_prints_its_table_and_writes_its_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:  # fmt: skip
     import posterior_queue
+    from posteriors.keep import Kept
 
     def filled(args: Any) -> int:
         (args.out / "table.md").write_text("the table")
+        Kept(args.out, {}).keep("JackalFlat_ceiling", {"joint": [0.8, 0.1]})
         return 0
 
     monkeypatch.setattr(posterior_queue, "fill", filled)
-    monkeypatch.setattr(sys, "argv", ["posterior_queue.py", "--quick"])
+    monkeypatch.setattr(sys, "argv", ["posterior_queue.py", "--quick", "--json", str(tmp_path / "results.json")])
     assert posterior_queue.main() == 0
     assert "the table" in capsys.readouterr().out
+    assert json.loads((tmp_path / "results.json").read_text()) == {"JackalFlat_ceiling": {"joint": [0.8, 0.1]}}
+
+
+def test_a_table_writes_its_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import posterior_table
+
+    def ceiling(run: Any, robot: str, terrain: str) -> None:
+        run.kept.once(f"{robot}{terrain}_ceiling", lambda: {"joint": [0.8, 0.1]})
+
+    monkeypatch.setattr(posterior_table, "robot_on", ceiling)
+    file = tmp_path / "results.json"
+    words = ["--robots", "Jackal", "--terrain", "Flat", "--out", str(tmp_path), "--json", str(file)]
+    monkeypatch.setattr(sys, "argv", ["posterior_table.py", *words])
+    assert posterior_table.main() is None
+    assert json.loads(file.read_text()) == {"JackalFlat_ceiling": {"joint": [0.8, 0.1]}}
 
 
 @pytest.mark.parametrize("name", ["anomaly", "inference", "posterior_queue", "posterior_table", "structure"])

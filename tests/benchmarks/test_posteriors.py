@@ -171,11 +171,13 @@ def test_the_tables_print_what_there_is() -> None:
     text = report.table({
         "JackalFlat_sde-tcn_window_0": one, "JackalFlat_mdn-rff_window_0": less, "JackalFlat_ceiling": ceiling,
         "JackalFlat_sbi-npe_window_0": {"missing": "sbi is not installed"},
+        "JackalFlat_residuals_waves": {"delta_e: variogram score": [0.125, 0.00042]},
     })  # fmt: skip
     assert "0.50" in text  # efficiency: 0.4 of 0.8
     assert "+0.200 ± 0.000" in text  # window by window
     assert "sbi is not installed" in text
     assert "-1.00 ± 0.10 / 1.21" in text  # beside the paper's
+    assert "| JackalFlat_residuals_waves | delta_e: variogram score | 0.1250 ± 0.0004 |" in text
 
 
 def test_noise_is_drawn_anew_with_each_pass_and_the_same_for_a_seed() -> None:
