@@ -32,6 +32,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 from anomalies.course import Course, Part, Settings, parts, replayed
+from anomalies.strength import STRONG
 from anomalies.unconditional import Unconditional
 from numpy.typing import NDArray
 from options import count, ended, json_file, number, write_json
@@ -51,7 +52,7 @@ Array = NDArray[np.float64]
 Scores = dict[str, Array]
 RATES = (0.05, 0.01, 0.001)
 LEVEL = 0.01  # share of nominal windows in which each fault of the bank alone would be believed
-GOAL, STRONG = 0.995, 5.0  # rate found at a false-positive rate of 0.001; X / X_null from which an effect has that goal
+GOAL = 0.995  # rate found at a false-positive rate of 0.001
 DETECTORS = ("replay", "bank", "judge", "contrast", "unconditional")
 
 

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anomalies.faults import Fault, faults
+from anomalies.strength import start_of
 from nfc_gym.core import Fidelity
 from nfc_gym.inference.windows import Batch
 from nfc_gym.simulate.bank import ReplayBank, faults_of
 from nfc_gym.simulate.faulty import about_nominal, faulty
 from nfc_gym.simulate.machine import Machine
 from nfc_gym.simulate.replay import Replay
-from nfc_gym.simulate.start import disturbed
 from nfc_gym.simulate.trials import trials
 
 Array = NDArray[np.float64]
@@ -98,11 +98,8 @@ class Course:
     def replayed(self, part: Part) -> dict[str, list]:
         """`replay` (n,), its mean X, not cut, as `x`, and the `gains` (n, names) of the bank."""
         windows = self.windows(part)
-        model, start = self.machine.model, None
-        if self.machine.kind.name not in ("jackal", "quadcopter"):  # these observe their whole state
-            true = windows["start"][:, 1 : 1 + model.nq + model.nv]
-            rng = np.random.default_rng([self.settings.seed, 3, ROLES.index(part.role), part.fault, part.number])
-            start = disturbed(self.machine, true, rng.standard_normal((len(true), 2 * model.nv)))
+        rng = np.random.default_rng([self.settings.seed, 3, ROLES.index(part.role), part.fault, part.number])
+        start = start_of(self.machine, windows, rng)
         steps = self.replay.steps(windows["states"], windows["actions"], start)
         gains = self.bank.gains(windows["states"], windows["actions"], start)
         found = {"replay": self.replay.summed(steps), "x": steps.mean(1), "gains": gains}

@@ -60,13 +60,35 @@ def faults(machine: Machine, effects: int, rng: np.random.Generator) -> list[Fau
         slippery = None if own else Friction(("ground",), (Param("factor", "1", 0.0, 1.0, null=1.0),))
         by, theta = (scaled(own, k), None) if own else (ones, np.array([k]))
         out.append(Fault(f"friction x {k:g}", by, slippery, theta, wanted=k == FRICTION[0]))
-    library = candidates(machine)
-    for i in rng.choice(len(library), min(effects, len(library)), replace=False):
-        one = library[i]
-        size = sizes(one, rng.random((1, 2 * len(one.params))))[0]
-        low, high = np.array([(p.low, p.high) for p in one.params]).T
-        for k in EFFECT:
-            theta = np.clip(np.where([p.shape for p in one.params], size, one.null + k * (size - one.null)), low, high)
-            said = ", ".join(f"{p.name} {v:.3g} {p.unit}" for p, v in zip(one.params, theta, strict=True))
-            out.append(Fault(f"{one.family}:{'+'.join(one.where)} {said}", ones, one, theta))
+    for effect, size in drawn(machine, effects, rng):
+        each = (grown(effect, size, k) for k in EFFECT)
+        out += [Fault(told(effect, theta), ones, effect, theta) for theta in each]
     return out
+
+
+def drawn(machine: Machine, effects: int, rng: np.random.Generator) -> list[tuple[Effect, Array]]:
+    """So many effects of the library, each with a realistic size (k,)."""
+    library = candidates(machine)
+    chosen = [library[i] for i in rng.choice(len(library), min(effects, len(library)), replace=False)]
+    return [(effect, sizes(effect, rng.random((1, 2 * len(effect.params))))[0]) for effect in chosen]
+
+
+def grown(effect: Effect, size: Array, by: float) -> Array:
+    """(k,) parameters of `by` times the size, within their bounds; what only shapes the effect stays."""
+    low, high = np.array([(p.low, p.high) for p in effect.params]).T
+    shapes = [p.shape for p in effect.params]
+    return np.clip(np.where(shapes, size, effect.null + by * (size - effect.null)), low, high)
+
+
+def most_of(effect: Effect, size: Array) -> float:
+    """How many times the size brings every parameter to its bound, shapes aside; beyond it nothing grows."""
+    away = size - effect.null
+    bound = np.array([p.high if d > 0 else p.low for p, d in zip(effect.params, away, strict=True)])
+    grows = np.array([not p.shape for p in effect.params]) & (away != 0)
+    return float(((bound - effect.null)[grows] / away[grows]).max(initial=1.0))
+
+
+def told(effect: Effect, theta: Array) -> str:
+    """Family, places and parameters (k,) of an effect."""
+    said = ", ".join(f"{p.name} {v:.3g} {p.unit}" for p, v in zip(effect.params, theta, strict=True))
+    return f"{effect.family}:{'+'.join(effect.where)} {said}"
