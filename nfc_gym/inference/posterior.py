@@ -14,6 +14,7 @@ from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.whole import require_whole
 from nfc_gym.inference import checkpoint
+from nfc_gym.inference.memory import enough_memory
 from nfc_gym.inference.network import Encoded, Network
 from nfc_gym.inference.random import seeded
 from nfc_gym.inference.replay import Passes
@@ -153,7 +154,7 @@ class NeuralPosterior:
 
         Raises:
           InputError: n is no whole number of 1 or more, `rng` draws no numbers, a setting that this density does not
-            take, or no window was given.
+            take, no window was given, or there is no memory for so many.
         """
         require_whole("sample: n", n, 1)
         if not isinstance(rng, np.random.Generator):
@@ -161,7 +162,10 @@ class NeuralPosterior:
         self._require_settings("sample", how, self.network.density.drawing)
         kept, maps = self._window(), None
         blocks = 2 if "delta_s" in self.parts else 1
-        with seeded(rng, kept.mean.device):
+        full = (
+            f"sample: no memory for {n} draws on {kept.mean.device}: draw fewer at a time, or use .to('cpu') on a GPU"
+        )
+        with enough_memory(full), seeded(rng, kept.mean.device):
             if "delta_e" in self.parts:
                 pairs = [self.network.sample_terrain(min(_MAPS, n - at), kept, **how) for at in range(0, n, _MAPS)]
                 drawn = torch.cat([p[0] for p in pairs])
@@ -186,7 +190,7 @@ class NeuralPosterior:
 
         Raises:
           InputError: x has no psi, holds what this network does not infer or of another width, a setting that this
-            density does not take, or no window was given.
+            density does not take, no window was given, or there is no memory for so many.
         """
         self._require_settings("log_prob", how, self.network.density.judging)
         kept = self._window()
@@ -215,7 +219,8 @@ class NeuralPosterior:
             slope = torch.where(varies, scale.log_slope(delta), np.log(2 * np.pi) / 2).sum(1)
             change = change + slope.double().cpu().numpy()
         at = torch.cat(points, 1)
-        value = self.network.log_prob(at[None], kept, len(points), **how)[0]
+        with enough_memory(f"log_prob: no memory for {len(at)} points on {at.device}: ask for fewer at a time"):
+            value = self.network.log_prob(at[None], kept, len(points), **how)[0]
         return np.where(((u < 0) | (u > 1)).any(1), -np.inf, value.double().cpu().numpy() + change)
 
     @torch.no_grad()

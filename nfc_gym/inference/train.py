@@ -17,6 +17,7 @@ from nfc_gym.inference.compiled import Compiled, Losses
 from nfc_gym.inference.data import Batch, TensorWindows, WindowSet, resident
 from nfc_gym.inference.graphs import Graphs
 from nfc_gym.inference.learner import Learner
+from nfc_gym.inference.memory import enough_memory
 from nfc_gym.inference.optimiser import Optimiser
 from nfc_gym.inference.progress import Report, quiet
 from nfc_gym.inference.random import mixed, seeded
@@ -131,14 +132,10 @@ def train(
     if file is not None and file.is_file():
         load_state(file, run, run.describe())
         report.message(f"goes on from step {run.step} of {run.total}")
-    try:
-        with seeded(config.seed):
-            run.loop(file, report)
-    except torch.OutOfMemoryError as e:
-        raise InputError(
-            f"training: no memory for {config.batch} windows a step on {device}: use batch={max(1, config.batch // 2)}"
-            + (f"; it goes on from what {folder} holds" if folder else "")
-        ) from e
+    said = f"training: no memory for {config.batch} windows a step on {device}: use batch={max(1, config.batch // 2)}"
+    kept = f"; it goes on from what {folder} holds" if folder else ""
+    with enough_memory(said + kept), seeded(config.seed):
+        run.loop(file, report)
     network.load_state_dict(run.best.state_dict())
     network.eval()
     return run.outcome

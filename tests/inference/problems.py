@@ -26,17 +26,17 @@ def mix(size: int) -> Tensor:
     return torch.eye(size) + 0.3 * torch.randn(size, size, generator=torch.Generator().manual_seed(7)) / size**0.5
 
 
-def linear_windows(n: int, size: int = 3, seed: int = 0) -> TensorWindows:
-    """`n` pairs of z ~ N(0, I) and x."""
+def linear_windows(n: int, size: int = 3, seed: int = 0, a: Tensor | None = None) -> TensorWindows:
+    """`n` pairs of z ~ N(0, I) and x, by A = `mix(size)` or another."""
     g = torch.Generator().manual_seed(seed)
     z = torch.randn(n, size, generator=g)
-    x = z @ mix(size).T + NOISE * torch.randn(n, size, generator=g)
+    x = z @ (mix(size) if a is None else a).T + NOISE * torch.randn(n, size, generator=g)
     return TensorWindows({"states": x[:, None], "actions": torch.zeros(n, 0, 0), "psi": torch.special.ndtr(z)})
 
 
-def gaussian(x: Tensor) -> torch.distributions.MultivariateNormal:
-    """The posterior of z given x (..., size)."""
-    a = mix(x.shape[-1])
+def gaussian(x: Tensor, a: Tensor | None = None) -> torch.distributions.MultivariateNormal:
+    """The posterior of z given x (..., size), by the A of `linear_windows`."""
+    a = mix(x.shape[-1]) if a is None else a
     covariance = torch.linalg.inv(torch.eye(len(a)) + a.T @ a / NOISE**2)
     return torch.distributions.MultivariateNormal(x @ a / NOISE**2 @ covariance, covariance)
 

@@ -148,6 +148,32 @@ def test_on_the_linear_base_draws_and_densities_are_the_closed_form() -> None:
     assert abs(wrong.mean()) < 0.02
 
 
+def test_no_memory_is_an_error_that_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    posterior, window = cart()
+    given, drawn = posterior.given(window), posterior.given(window).sample(7, rng())
+
+    def full(*_: object, **__: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    def fuller(*_: object, **__: object) -> torch.Tensor:
+        return torch.empty(2**58)
+
+    for lacks in (full, fuller):
+        monkeypatch.setattr(given.network, "sample", lacks)
+        monkeypatch.setattr(given.network, "log_prob", lacks)
+        with pytest.raises(InputError, match="sample: no memory for 40 draws on cpu: draw fewer at a time"):
+            given.sample(40, rng())
+        with pytest.raises(InputError, match="log_prob: no memory for 7 points on cpu: ask for fewer"):
+            given.log_prob(drawn)
+
+    def wrong(*_: object, **__: object) -> None:
+        raise RuntimeError("another mistake")
+
+    monkeypatch.setattr(given.network, "sample", wrong)
+    with pytest.raises(RuntimeError, match="another mistake"):
+        given.sample(40, rng())
+
+
 def test_an_untrained_posterior_is_the_prior_in_physical_units() -> None:
     windows = linear_windows(100)
     given = NeuralPosterior(network(windows)).given(Window(windows.tensors["states"][0], np.zeros((0, 0))))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from problems import box, gaussian, killed, linear_windows, motion_windows, network
+from problems import box, gaussian, killed, linear_windows, mix, motion_windows, network
 from safetensors.torch import save_file
 
 from nfc_gym.core import InputError
@@ -42,6 +42,26 @@ def test_each_density_learns_the_posterior_of_a_linear_gaussian(density: str) ->
     assert after < 0.15 * before
     assert after < 0.12
     assert out.held_out[out.best - 1] < out.start
+
+
+@pytest.mark.parametrize(
+    ("density", "linear"), [("score", False), ("score", True), ("mixture", False), ("flow", False)]
+)
+def test_what_a_window_cannot_show_comes_back_as_wide_as_the_prior(density: str, linear: bool) -> None:
+    """Of three parameters the second moves nothing: trained, all else is told and it is N(0, 1) in z, its prior."""
+    a = mix(3)
+    a[:, 1] = 0
+    every = linear_windows(4000, a=a)
+    net = network(every, density=density, components=1, draws=2, linear=linear)
+    train(net, *every.split(0.1), replace(QUICK, epochs=9, batch=128, rate=5e-3))
+    x = linear_windows(10, seed=9, a=a).tensors["states"]
+    with torch.no_grad():
+        z = net.sample(2000, net.encode(x, torch.zeros(10, 0, 0)))
+    told = gaussian(x[:, 0], a)
+    assert told.stddev[0, 1] == pytest.approx(1.0)
+    assert told.stddev[0, [0, 2]].max() < 0.5
+    torch.testing.assert_close(z.std(1).mean(0), told.stddev[0], rtol=0.1, atol=0.02)
+    assert z[..., 1].mean(1).abs().max() < 0.2  # what moves the others does not move it
 
 
 def test_on_the_linear_base_it_is_the_closed_form() -> None:
