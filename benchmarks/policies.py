@@ -10,7 +10,13 @@ scenarios. With `--counting` Table II takes the worlds that `hidden_worlds.py --
 Every cell (table, world, method, seed) is kept in --out, so the same command goes on where it was stopped; `--stop
 SECONDS` begins no new cell after that time, and `--kept` begins none: tables of what there is. `--beside DIR` takes the
 random policy, the unadapted policy and the oracle of an earlier run in the same worlds, of all its seeds, and runs
-none. What is hidden is drawn from `--seed`, itself drawn once and kept.
+none. `--also DIR ...` shows cells of other runs in the same worlds in the same tables, also where other numbers of
+episodes judged them (the tables say how many):
+
+    python benchmarks/policies.py --tables III --seed 1 --seeds 0 --steps 500000 --envs 32 --executed 5 --kept \\
+        --out benchmarks/results/policies_eight --also benchmarks/results/policies_tdmpc2_eight
+
+What is hidden is drawn from `--seed`, itself drawn once and kept.
 Pretrained policies are those that `pretrain.py --out DIR` made, else the package's; posteriors (also .npz) and
 detectors are `<place>.safetensors` in their folders; so are TD-MPC2's world models, which `tdmpc2_pretrain.py` makes.
 The control rate is that of one robot's decisions on this machine.
@@ -41,6 +47,7 @@ from worlds.scenarios import TABLE_III
 from worlds.world import ENGINES, World
 
 from nfc_gym.adaptation.threads import limit_threads
+from nfc_gym.core.errors import InputError
 
 REFERENCES = ("random", "unadapted", "oracle")  # what returns are measured by
 ADAPTED = ("nfc", "no_nfc", "tdmpc2")  # to what was executed: they take longest, and go the same way in both tables
@@ -59,6 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         kept = Kept(out, {"seed": args.seed, "episodes": args.episodes, "steps": args.steps, "envs": args.envs,
                           "executed": args.executed, "task": args.task, "engine": args.engine})  # fmt: skip
         cells = filled(args, kept, out, began)
+        for folder in args.also:
+            joined(args, folder, cells)
         if args.beside:
             references(args, cells)
         rng = np.random.default_rng(0)
@@ -105,6 +114,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--device", default="cpu")
     add("--seed", type=count(0), help="of what is hidden; default drawn once, and kept in --out")
     add("--beside", type=Path, metavar="DIR", help="--out of an earlier run, perhaps with another budget")
+    add("--also", nargs="+", type=Path, default=[], metavar="DIR", help="--out of other runs whose cells are shown too")
     add("--stop", type=number(0), metavar="SECONDS")
     add("--kept", action="store_true", help="make the tables of the cells in --out")
     add("--out", type=Path, metavar="DIR")
@@ -195,6 +205,28 @@ def references(args: argparse.Namespace, cells: tables.Cells) -> None:
             for file in sorted((args.beside / "cells").glob(f"{table}_{world.name}_{method}_*.json")):
                 key = (table, world.place, world.scenario, world.seed, int(file.stem.rpartition("_")[2]))
                 cells.add(key, method, json.loads(file.read_text()))
+
+
+def joined(args: argparse.Namespace, folder: Path, cells: tables.Cells) -> None:
+    """Cells of another run, of the methods, worlds and seeds that are asked for and not there yet.
+
+    Raises:
+      InputError: no such folder, or something else was hidden there.
+    """
+    if not (folder / "cells").is_dir():
+        raise InputError(f"--also {folder}: no cells there; want the --out of another run")
+    for table, world, _, seed in asked(args):
+        key = (table, world.place, world.scenario, world.seed, seed)
+        there = cells.found.get(key, {})
+        for method in [m for m in args.methods if m not in there]:
+            file = folder / "cells" / f"{table}_{world.name}_{method}_{seed}.json"
+            if file.is_file():
+                cell = json.loads(file.read_text())
+                hidden = {c["hidden"] for c in (cell, *there.values()) if "hidden" in c}
+                if len(hidden) > 1:
+                    raise InputError(f"{file} is of another world than other cells of its name, as what is "
+                                     f"hidden shows ({'; '.join(sorted(hidden))}): leave its folder out")  # fmt: skip
+                cells.add(key, method, cell)
 
 
 def files(args: argparse.Namespace, place: str) -> tuple[str, str | None, str | None, str | None]:

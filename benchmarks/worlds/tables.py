@@ -9,7 +9,7 @@ from posteriors.report import lines
 
 from nfc_gym.measured.hidden import Array
 
-from . import paper
+from . import figures, paper
 from .figures import Interval, bootstrap, normalised, running_min_max
 from .judge import Episodes
 from .methods import METHODS
@@ -19,6 +19,7 @@ LEAST = (
 )
 RATE = "control rate, Hz: ours / the paper's"
 Key = tuple[str, str, str, int, int]  # table, place, scenario, seed of what is hidden, seed of learning
+World = tuple[str, str, int]  # place, scenario, seed of what is hidden
 
 
 @dataclass
@@ -57,10 +58,10 @@ class Cells:
         return float(np.mean(rates)) if rates else float("nan")
 
 
-def references(cells: Cells, place: str) -> dict[tuple[str, str, int], tuple[float, float]]:
+def references(cells: Cells, place: str) -> dict[World, tuple[float, float]]:
     """Mean return of the random policy and of the oracle, by (place, scenario, hidden seed), over all their seeds."""
     out = {}
-    worlds = {k[1:4] for k in cells.found if k[:2] == ("II", place)}
+    worlds = dict.fromkeys(k[1:4] for k in cells.found if k[:2] == ("II", place))
     for world in worlds:
         means = []
         for method in ("random", "oracle"):
@@ -100,16 +101,23 @@ def paired(cells: Cells, place: str, one: str, other: str, rng: np.random.Genera
     return bootstrap([first[k] - second[k] for k in first if k in second], rng)
 
 
-def recovered(cells: Cells, place: str, method: str) -> float:
-    """Share of (oracle - unadapted) that a method brought back.
+def recovered(cells: Cells, place: str, method: str) -> dict[World, float]:
+    """Share of (oracle - unadapted) that a method brought back, in each world by itself: what was lost differs.
 
-    NaN where one of them is missing, or where the oracle is hardly better than the unadapted policy: it was trained
-    for too short a time then, or nothing was lost.
+    A world is left out where one of them is missing, or where the oracle is hardly better than the unadapted policy:
+    it was trained for too short a time then, or nothing was lost.
     """
-    after, before = (
-        np.mean([g.mean() for g in groups(cells, place, m).values()] or [np.nan]) for m in (method, "unadapted")
-    )
-    return float((after - before) / (1 - before)) if before < 1 - LEAST else float("nan")
+    after, before = (_by_world(groups(cells, place, m)) for m in (method, "unadapted"))
+    shares = {w: figures.recovered(after[w], before[w], 1.0) for w in after if before.get(w, 1.0) < 1 - LEAST}
+    return {w: share for w, share in shares.items() if share == share}
+
+
+def _by_world(own: dict[Key, Array]) -> dict[World, float]:
+    """Mean over a world's seeds of learning."""
+    found: dict[World, list[float]] = {}
+    for key, values in own.items():
+        found.setdefault(key[1:4], []).append(float(values.mean()))
+    return {world: float(np.mean(means)) for world, means in found.items()}
 
 
 def shown(interval: Interval, digits: int = 2) -> str:
@@ -127,7 +135,7 @@ def shown_rate(hertz: float, method: str) -> str:
 
 def table_two(cells: Cells, methods: Iterable[str], rng: np.random.Generator) -> tuple[str, list[dict[str, Any]]]:
     """Text and figures of Table II."""
-    text, figures = [], []
+    text, found = [], []
     for place in cells.places("II"):
         rows = []
         for name in methods:
@@ -137,19 +145,44 @@ def table_two(cells: Cells, methods: Iterable[str], rng: np.random.Generator) ->
             theirs, ours = paper.return_of(name, place), min_max(cells, place, name)
             rows.append([METHODS[name].title, why or shown(value), shown(returns, 0), "-" if ours != ours else
                          f"{ours:.2f}", "-" if theirs is None else f"{theirs:.2f}",
-                         shown_rate(cells.hertz("II", place, name), name), str(len(own))])  # fmt: skip
+                         shown_rate(cells.hertz("II", place, name), name), _counted(own)])  # fmt: skip
             if why is None:
-                figures.append(_figure(f"{place}: {METHODS[name].title}, normalised return", value, "1", theirs, own))
-        head = ["", "normalised return, 95 %", "return, 95 %", "min-max", "the paper's", RATE, "cells"]
+                title = f"{place}: {METHODS[name].title}"
+                found.append(_figure(f"{title}, normalised return", value, "1", None, own))
+                if ours == ours:
+                    goal = theirs if name == "nfc" else None
+                    found.append(_figure(f"{title}, min-max", _plain(ours), "1", theirs, own, goal))
+        head = ["", "normalised return, 95 %", "return, 95 %", "min-max", "the paper's", RATE,
+                "cells (worlds, episodes)"]  # fmt: skip
         text.append(f"### {place}\n\n{lines(head, rows)}\n{_contributions(cells, place, rng)}")
-    shares = [s for s in (recovered(cells, place, "nfc") for place in cells.places("II")) if s == s]
-    if shares:
-        middle = Interval(float(np.median(shares)), min(shares), max(shares))
-        figures.append(_figure("share of (oracle - unadapted) recovered, median over places (lowest, highest)", middle,
-                               "1", None, {}, paper.RECOVERED))  # fmt: skip
     if not text:
         return "", []
-    return "## Table II: return in the hidden world (random 0, oracle 1)\n\n" + "\n".join(text), figures
+    said, summed = _summary(cells, found)
+    head = "## Table II: return in the hidden world (random 0, oracle 1)"
+    return f"{head}\n\n" + "\n".join([*text, said]), found + summed
+
+
+def _summary(cells: Cells, found: list[dict[str, Any]]) -> tuple[str, list[dict[str, Any]]]:
+    """What PPO w/ NFC comes to over all worlds and places, beside what it is to come to."""
+    shares = [s for place in cells.places("II") for s in recovered(cells, place, "nfc").values()]
+    judged = [row["holds"] for row in found if row["unit"] == "1" and row["goal"] is not None]
+    said, rows = [], []
+    if shares:
+        middle = Interval(float(np.median(shares)), min(shares), max(shares))
+        rows.append(_figure("share of (oracle - unadapted) recovered, median over worlds (lowest, highest)", middle,
+                            "1", None, {}, paper.RECOVERED))  # fmt: skip
+        said.append(f"- share of (oracle - unadapted) recovered, median of {len(shares)} worlds (lowest, highest): "
+                    f"{shown(middle)}; goal {paper.RECOVERED:g}")  # fmt: skip
+    if judged:
+        rows.append(_figure("places where min-max is at least the paper's", _plain(sum(judged)), "places", None, {},
+                            paper.MIN_MAX))  # fmt: skip
+        said.append(f"- min-max at least the paper's: {sum(judged)} of {len(judged)} places; goal {paper.MIN_MAX}")
+    return ("### PPO w/ NFC, all places\n\n" + "\n".join(said) + "\n" if said else ""), rows
+
+
+def _counted(own: dict[Key, Array]) -> str:
+    """How many cells, of how many worlds and episodes: rows of a place need not be of the same worlds."""
+    return f"{len(own)} ({len({k[1:4] for k in own})}, {sum(len(e) for e in own.values())})" if own else "0"
 
 
 def _contributions(cells: Cells, place: str, rng: np.random.Generator) -> str:
@@ -162,39 +195,51 @@ def _contributions(cells: Cells, place: str, rng: np.random.Generator) -> str:
             if k[:2] == ("II", place) and "notes" in v.get("oracle", {})]  # fmt: skip
     if rose:
         out.append(f"- the oracle's curve has levelled in {sum(map(bool, rose))} of {len(rose)} cells")
-    share = recovered(cells, place, "nfc")
-    if share == share:
-        out.append(f"- share of (oracle - unadapted) recovered: {share:.2f}")
+    for (_, scenario, seed), share in recovered(cells, place, "nfc").items():
+        out.append(f"- share of (oracle - unadapted) recovered, {scenario} {seed}: {share:.2f}")
     return "\n".join(out) + ("\n" if out else "")
 
 
 def table_three(cells: Cells, methods: Iterable[str], rng: np.random.Generator) -> tuple[str, list[dict[str, Any]]]:
     """Text and figures of Table III; a ground's scenarios are taken together, as the paper does."""
-    rows, figures = [], []
+    rows, found = [], []
     for name in methods:
         for place in cells.places("III"):
             ground, own = place.removeprefix("Jackal"), cells.of("III", place, name)
             why = cells.missing("III", place, name)
-            row = [METHODS[name].title, ground, str(sum(len(e.returns) for e in own.values()))]
+            row = [METHODS[name].title, ground, str(sum(len(e.returns) for e in own.values())), _by_scenario(own)]
             for key, words in paper.FIGURES.items():
                 value = bootstrap([np.array(getattr(e, key), float) for e in own.values()], rng)
                 theirs = paper.drive_of(name, ground, key)
                 row.append(why or f"{shown(value)} / {'-' if theirs is None else f'{theirs:g}'}")
                 if own:
                     goal = paper.GOALS.get((key, ground)) if name == "nfc" else None
-                    figures.append(_figure(f"{place}: {METHODS[name].title}, {words}", value, words, theirs, own, goal,
+                    found.append(_figure(f"{place}: {METHODS[name].title}, {words}", value, words, theirs, own, goal,
                                            at_least=key == "success"))  # fmt: skip
             hertz = cells.hertz("III", place, name)
             row.append(shown_rate(hertz, name))
             if own and hertz == hertz:
-                measured = Interval(hertz, float("nan"), float("nan"))
-                figures.append(_figure(f"{place}: {METHODS[name].title}, control rate", measured, "Hz",
+                found.append(_figure(f"{place}: {METHODS[name].title}, control rate", _plain(hertz), "Hz",
                                        paper.RATES.get(name), own))  # fmt: skip
             rows.append(row)
     if not rows:
         return "", []
-    head = ["", "ground", "episodes", *(f"{words}: ours / the paper's" for words in paper.FIGURES.values()), RATE]
-    return f"## Table III: the Jackal's broken axle, figure of eight\n\n{lines(head, rows)}\n", figures
+    head = ["", "ground", "episodes", "success by scenario", *(f"{words}: ours / the paper's" for words in
+            paper.FIGURES.values()), RATE]  # fmt: skip
+    return f"## Table III: the Jackal's broken axle, figure of eight\n\n{lines(head, rows)}\n", found
+
+
+def _by_scenario(own: dict[Key, Episodes]) -> str:
+    """Success in each scenario, over its seeds: rows of a ground need not be of the same scenarios."""
+    found: dict[str, list[float]] = {}
+    for key, episodes in own.items():
+        found.setdefault(key[2], []).extend(episodes.success)
+    return ", ".join(f"{scenario} {np.mean(each):.2f}" for scenario, each in found.items()) or "-"
+
+
+def _plain(value: float) -> Interval:
+    """A figure without an interval."""
+    return Interval(float(value), float("nan"), float("nan"))
 
 
 def _figure(

@@ -127,20 +127,67 @@ def test_the_tables_stand_between_their_references() -> None:
         cells.add(key, "tdmpc2", {"missing": "needs a world model"})
     names = ["random", "oracle", "unadapted", "no_nfc", "tdmpc2"]
     text, rows = tables.table_two(cells, names, np.random.default_rng(0))
-    values = {r["name"].split(": ")[1].split(",")[0]: r["value"] for r in rows}
+    own = [r for r in rows if r["name"].endswith(", normalised return")]
+    values = {r["name"].split(": ")[1].split(",")[0]: r["value"] for r in own}
     assert values["random"] == pytest.approx(0)
     assert values["oracle"] == pytest.approx(1)
     assert values["PPO w/o NFC"] == pytest.approx(0.75)
     assert "needs a world model" in text
     assert "0.64" in text  # the paper's
-    assert tables.recovered(cells, "AntFlat", "no_nfc") == pytest.approx(0.5)
+    assert tables.recovered(cells, "AntFlat", "no_nfc") == {("AntFlat", "psi+effect", 7): pytest.approx(0.5)}
     cells.add(("II", "AntRough", "psi", 7, 0), "oracle", cell([100.0, 100.0]))
     for method, level in {"random": 0.0, "unadapted": 99.0, "no_nfc": 120.0}.items():
         cells.add(("II", "AntRough", "psi", 7, 0), method, cell([level, level]))
-    assert np.isnan(tables.recovered(cells, "AntRough", "no_nfc"))  # an oracle that is none
+    assert not tables.recovered(cells, "AntRough", "no_nfc")  # an oracle that is none
     assert tables.min_max(cells, "AntFlat", "no_nfc") == pytest.approx(151 / 201)  # from -1, a curve's, to 200
     gain = tables.paired(cells, "AntFlat", "no_nfc", "unadapted", np.random.default_rng(0))
     assert gain.value == gain.low == gain.high == pytest.approx(0.25)
+
+
+def test_a_share_is_of_its_own_world_and_the_median_over_all_worlds() -> None:
+    pytest.importorskip("torch", reason="methods learn with torch")
+    from worlds import tables
+
+    cells = tables.Cells()
+    for place, seed, level in (("AntFlat", 7, 180.0), ("AntFlat", 8, 110.0), ("AntRough", 7, 160.0)):
+        for method, earned in {"random": 0.0, "oracle": 200.0, "unadapted": 100.0, "nfc": level}.items():
+            cells.add(("II", place, "psi", seed, 0), method, cell([earned]))
+    # a world in which nothing was lost: pooled with the other it would hide what was recovered there
+    for method, earned in {"random": 0.0, "oracle": 10.0, "unadapted": 2000.0}.items():
+        cells.add(("II", "AntFlat", "psi", 9, 0), method, cell([earned]))
+    text, rows = tables.table_two(cells, ["random", "oracle", "unadapted", "nfc"], np.random.default_rng(0))
+    assert tables.recovered(cells, "AntFlat", "nfc") == {
+        ("AntFlat", "psi", 7): pytest.approx(0.8), ("AntFlat", "psi", 8): pytest.approx(0.1)
+    }  # fmt: skip
+    middle = next(r for r in rows if r["name"].startswith("share"))
+    assert (middle["value"], middle["low"], middle["high"]) == pytest.approx((0.6, 0.1, 0.8))
+    assert "psi 8: 0.10" in text
+    assert "| 3 (3, 3) |" in text  # unadapted: cells, worlds, episodes
+    assert "| 2 (2, 2) |" in text  # with NFC
+
+
+def test_the_paper_s_figures_are_goals_of_nfc_alone() -> None:
+    pytest.importorskip("torch", reason="methods learn with torch")
+    from worlds import paper, tables
+
+    cells = tables.Cells()
+    for place, level in (("AntFlat", 199.0), ("JackalFlat", 160.0)):  # of 200: the paper's 0.98 and 0.87
+        for method, earned in {"random": 0.0, "oracle": 200.0, "nfc": level}.items():
+            cells.add(("II", place, "psi", 7, 0), method, cell([earned, earned]))
+    _, rows = tables.table_two(cells, ["random", "oracle", "nfc"], np.random.default_rng(0))
+    held = {r["name"]: (r["goal"], r["holds"]) for r in rows if r["goal"]}
+    assert held == {
+        "AntFlat: PPO w/ NFC, min-max": (">= 0.98", True),
+        "JackalFlat: PPO w/ NFC, min-max": (">= 0.87", False),
+        "places where min-max is at least the paper's": (">= 7", False),
+    }
+    cells.add(("III", "JackalRough", "axle", 7, 0), "nfc", cell([1.0, 2.0]))  # all figures are 1
+    cells.add(("III", "JackalRough", "axle+mud", 7, 0), "nfc", cell([1.0, 2.0]))
+    text, rows = tables.table_three(cells, ["nfc"], np.random.default_rng(0))
+    assert [(r["goal"], r["holds"]) for r in rows] == [(">= 0.72", True), ("<= 2.1", True), ("<= 3.19", True),
+                                                       ("<= 6.26", True)]  # fmt: skip
+    assert paper.GOALS["orientation_jerk", "Flat"] == 2.98
+    assert "axle 1.00, axle+mud 1.00" in text
 
 
 def test_control_rates_stand_beside_the_paper_s() -> None:

@@ -180,6 +180,32 @@ def test_a_table_takes_its_references_from_an_earlier_run(tmp_path: Path) -> Non
     assert cells.found == {("II", "JackalFlat", "axle", 5, 0): found}
 
 
+def test_a_table_shows_cells_of_other_runs_in_the_same_world_alone(tmp_path: Path) -> None:
+    import json
+
+    import policies
+    from worlds import tables
+
+    from nfc_gym.core.errors import InputError
+
+    (tmp_path / "cells").mkdir()
+    for method, hidden in (("tdmpc2", "a load"), ("nfc", "another load")):
+        file = tmp_path / "cells" / f"III_JackalFlat_axle_5_{method}_0.json"
+        file.write_text(json.dumps({"hidden": hidden}))
+    said = ["--tables", "III", "--grounds", "Flat", "--scenarios", "axle", "--seed", "5", "--seeds", "0"]
+    args = policies.parse([*said, "--also", str(tmp_path)])
+    cells, key = tables.Cells(), ("III", "JackalFlat", "axle", 5, 0)
+    cells.add(key, "nfc", {"hidden": "a load"})  # is there, so the other run's is not taken
+    policies.joined(args, tmp_path, cells)
+    assert cells.found == {key: {"nfc": {"hidden": "a load"}, "tdmpc2": {"hidden": "a load"}}}
+    cells = tables.Cells()
+    cells.add(key, "oracle", {"hidden": "a load"})
+    with pytest.raises(InputError, match="another world"):
+        policies.joined(args, tmp_path, cells)
+    with pytest.raises(InputError, match="no cells there"):
+        policies.joined(args, tmp_path / "cells", cells)
+
+
 def test_what_is_found_to_count_must_do_so_with_other_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     import hidden_worlds
     from worlds.counting import Drop
