@@ -6,6 +6,7 @@ from gymnasium.vector import VectorEnv
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from nfc_gym.envs import scene
 from nfc_gym.envs.batching import Ids
 from nfc_gym.envs.robot import Robot
 from nfc_gym.envs.simulations import Simulations
@@ -21,10 +22,12 @@ class ReadableVectorEnv(VectorEnv):
     Attributes:
       frame_skip: physics steps a control step.
       rough: heightfields in place of a plane.
+      height_limits: between which the ground must lie [m].
     """
 
     frame_skip: int
     rough: bool
+    height_limits = (scene.LOWEST, scene.HIGHEST)
     _sims: Simulations
     _view: View
 

@@ -85,6 +85,11 @@ def yaw(quat: Array) -> Array:
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
+def planar(qpos: Array) -> Array:
+    """x and y [m] and heading [rad] (..., 3) of positions (..., nq) with the base's place and quaternion first."""
+    return np.concatenate([qpos[..., :2], yaw(qpos[..., 3:7])[..., None]], -1)
+
+
 def turned(quat: Array, heading: Array) -> Array:
     """Quaternion (4,) turned about the world's z axis by headings (...) [rad], (..., 4)."""
     c, s = np.cos(heading / 2), np.sin(heading / 2)

@@ -13,6 +13,7 @@ from nfc_gym.envs import scene
 from nfc_gym.envs.batching import Ids, terrain_ids
 from nfc_gym.envs.contract import FLAT, UNSTABLE, psi_of, rest_key, seen_psi
 from nfc_gym.envs.forking import safe_to_fork
+from nfc_gym.envs.rotations import planar
 from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.view import View
 from nfc_gym.physics.fields import ModelFields
@@ -114,6 +115,19 @@ class Simulations:
             new = np.empty((self.n, *value.shape[1:]), value.dtype) if old is None else old.copy()
             new[ids] = value
             self.view.task[name] = new
+
+    def coming(
+        self, generators: Sequence[np.random.Generator], maps: Sequence[Heightfield]
+    ) -> tuple[Ids, NDArray[np.float64]]:
+        """Where episodes would begin that drew from these generators and maps: (n,) map of each, and (n, 3) poses."""
+        u = np.array([generator.random(1 + self.robot.draws) for generator in generators])
+        which = (u[:, 0] * len(maps)).astype(np.intp)
+        stack, one = np.stack([m.heights for m in maps]), maps[0]
+
+        def ground(xy: NDArray) -> NDArray[np.float64]:
+            return surface(stack, xy, one.resolution, one.origin, which.reshape(-1, *[1] * (xy.ndim - 2)))[0]
+
+        return which, planar(self.robot.begin(u[:, 1:], ground).qpos)
 
     def still(self, ids: Ids, stage: mujoco.mjtStage = mujoco.mjtStage.mjSTAGE_ACC) -> None:
         """Put simulations back to rest, and compute stages of them."""

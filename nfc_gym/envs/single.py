@@ -31,6 +31,7 @@ from nfc_gym.envs.contract import (
 )
 from nfc_gym.envs.look import look
 from nfc_gym.envs.robot import Robot
+from nfc_gym.envs.rotations import planar
 from nfc_gym.envs.screen import Screen
 from nfc_gym.envs.settings import Settings
 from nfc_gym.envs.view import View
@@ -53,6 +54,7 @@ class RobotEnv(gymnasium.Env):
       model, data: the simulation. Edits of the model last until the next reset where psi or `fields` touched them.
       fields: `ModelFields` of `model`; what is written through it goes back to nominal at every reset.
       psi_space: names, units, bounds and nominal values of psi.
+      height_limits: between which the ground must lie [m].
       control_hooks: called with this environment before a control step's first physics step, its command being set.
       substep_hooks: called with this environment before every physics step; while empty, a control step is one call.
       after_hooks: called with this environment after the last physics step, before anything is observed.
@@ -62,6 +64,7 @@ class RobotEnv(gymnasium.Env):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012
+    height_limits = (scene.LOWEST, scene.HIGHEST)  # m
 
     def __init__(
         self,
@@ -142,6 +145,22 @@ class RobotEnv(gymnasium.Env):
     def perceived(self) -> Heightfield:
         """The terrain that `elevation` is taken from: the simulated one, unless a reset was told another."""
         return self._perceived
+
+    def coming(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Heightfield, NDArray[np.float64]]:
+        """Where a reset with these arguments would begin, for whoever lays ground around it; nothing is changed.
+
+        Returns:
+          The terrain without a residual, and (3,) x and y [m] and heading [rad] of the start on it.
+
+        Raises:
+          InputError: as `reset`.
+        """
+        own = whole(seed)
+        given, u = self._checked(options, own), self._next_draws(own)
+        ground = given["heightfield"] if "heightfield" in given else self._next_map(u[0]) if self.rough else FLAT
+        return ground, planar(self.robot.begin(u[1:], ground.height).qpos)
 
     # ---- Gymnasium's interface ------------------------------------------------------------------------------------
 
@@ -246,14 +265,17 @@ class RobotEnv(gymnasium.Env):
         if "terrain_id" in given:
             given["heightfield"] = self._pool.map(given["terrain_id"])
         if "terrain_residual" in given:  # which may lift a map too high, also one that is yet to be drawn
-            ground = given["heightfield"] if "heightfield" in given else self._coming(seed)
+            ground = given["heightfield"] if "heightfield" in given else self._next_map(self._next_draws(seed)[0])
             given["risen"] = scene.risen(ground, given["terrain_residual"])
         return given
 
-    def _coming(self, seed: int | None) -> Heightfield:
-        """The map that a reset with this seed is about to draw."""
+    def _next_draws(self, seed: int | None) -> NDArray[np.float64]:
+        """What a reset with this seed is about to draw: for the map, then for the start."""
         generator = copy.deepcopy(self.np_random) if seed is None else seeding.np_random(seed)[0]
-        return self._pool.map(self._pool.draw(generator.random()))
+        return generator.random(1 + self.robot.draws)
+
+    def _next_map(self, u: float) -> Heightfield:
+        return self._pool.map(self._pool.draw(u))
 
     def _set_psi(self, given: Mapping[str, Any]) -> None:
         space = self.psi_space
@@ -267,7 +289,7 @@ class RobotEnv(gymnasium.Env):
         self._psi, self._seen = psi, seen_psi(space, belief)
 
     def _set_terrain(self, given: Mapping[str, Any], u: float) -> None:
-        terrain = given["heightfield"] if "heightfield" in given else self._pool.map(self._pool.draw(u))
+        terrain = given["heightfield"] if "heightfield" in given else self._next_map(u)
         self._terrain, self._perceived = given.get("risen", terrain), given.get("perceived", terrain)
         scene.write(self.model, 0, self._terrain.heights)
 

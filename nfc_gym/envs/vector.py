@@ -4,6 +4,7 @@ Environment i with seed s + i goes through the same states, to the bit, as a `Ro
 has its own psi (`Batch.expand`) and its own terrain, one heightfield of a pool that `geom_dataid` chooses.
 """
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
@@ -144,6 +145,24 @@ class RobotVectorEnv(ReadableVectorEnv, VectorEnv):  # type: ignore[override]
         simulated = [scene.checked(m, f"maps[{k}]") for k, m in enumerate(maps)]
         shown = None if perceived is None else [scene.checked(m, f"perceived[{k}]") for k, m in enumerate(perceived)]
         self._build(simulated, shown)
+
+    def coming(
+        self, *, seed: int | Sequence[int | None] | None = None, maps: Sequence[Heightfield]
+    ) -> tuple[Ids, NDArray[np.float64]]:
+        """Where a reset of all would begin if these were the maps, for whoever lays ground there; nothing is changed.
+
+        Returns:
+          (n,) which of the maps each simulation draws, and (n, 3) x and y [m] and heading [rad] of its start.
+
+        Raises:
+          InputError: as `reset`.
+        """
+        seeds = self.check_reset(seed, None)[2]
+        generators = [
+            seeding.np_random(seeds[i])[0] if i in seeds else copy.deepcopy(generator)
+            for i, generator in enumerate(self._sims.generators)
+        ]
+        return self._sims.coming(generators, maps)
 
     # ---- Gymnasium's interface ------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ from nfc_gym.terrain.camera import DepthCamera
 from nfc_gym.terrain.egocentric import elevation
 from nfc_gym.terrain.generate import KINDS, make, obstacles, pool
 from nfc_gym.terrain.heightfield import RESOLUTION, SHAPE, Heightfield, surface
+from nfc_gym.terrain.lay import lay
 from nfc_gym.terrain.mesh import from_mesh, to_mesh
 from nfc_gym.terrain.model import HfieldAsset, asset, bounds, write, write_pool
 from nfc_gym.terrain.perceived import PerceivedMap
@@ -23,6 +24,7 @@ __all__ = [
     "bounds",
     "elevation",
     "from_mesh",
+    "lay",
     "make",
     "obstacles",
     "pool",

@@ -26,11 +26,11 @@ from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper, finite
 from nfc_gym.wrappers.batched import batch_simulation_of
 from nfc_gym.wrappers.belief import Belief
 from nfc_gym.wrappers.dynamics import Injection, Mode, checked_mode, component_names
+from nfc_gym.wrappers.ground import Ground
 from nfc_gym.wrappers.order import PSI, TERRAIN, beneath
 from nfc_gym.wrappers.psi import Psi, Space, space_of
 from nfc_gym.wrappers.simulation import Simulation, SingleSimulation, simulation_of
 from nfc_gym.wrappers.source import Source, sampler_of
-from nfc_gym.wrappers.terrain import Ground
 
 Array = NDArray[np.float64]
 
@@ -64,13 +64,12 @@ def ground_of(env: gym.Env, sim: SingleSimulation, belief: Belief) -> Ground | N
     """The ground that an episode's first action chooses; None where the posterior says nothing of it.
 
     Raises:
-      InputError: it speaks of a map of another shape than the environment's.
+      InputError: it speaks of a map that is neither the environment's heightfield nor the robot's grid.
     """
     if not belief.mode_count:
         return None
     ground = Ground(env, sim, "Hallucinate")
-    if belief.shape != ground.shape:
-        raise InputError(f"Hallucinate: delta_e has shape {belief.shape}, the ground {ground.shape}")
+    ground.require(belief.shape, "Hallucinate")
     sim.late_ground = True
     return ground
 
@@ -106,12 +105,14 @@ class Hallucinate(_Hallucinating, EnvWrapper):
         as they are.
       beta: how far from the mean pi_h = 1 leads, in standard deviations.
       modes: principal modes of delta_e at most.
-      samples: how many are drawn, once, to tell mean and covariance.
+      samples: how many are drawn, once, to tell mean and covariance. A neural posterior's delta_e takes a second a
+        draw without a GPU: say fewer there, though more than pi_h has entries.
       space: psi of an environment that has none of its own, as for `RandomizePsi`.
       mode, components: of delta_s, as for `ResidualDynamics`; entries that are no physical state are left out.
 
     Where the posterior speaks of delta_e, the first step begins the episode again from the same draws, those of the
-    environment and of this package's wrappers beneath, on the ground that was asked for. The action's layout is
+    environment and of this package's wrappers beneath, on the ground that was asked for: of maps in the robot's grid it
+    is laid where the robot starts, as `ResidualTerrain` lays it. The action's layout is
     (own, psi, modes, delta_s): `belief` has the sizes; `fidelity` is what holds.
     """
 
@@ -184,7 +185,7 @@ class Hallucinate(_Hallucinating, EnvWrapper):
             mean = self.belief.at(np.zeros(self.belief.size), self.beta).psi
             options = self.psi.options(world.psi, options, {"psi_belief": mean} if self.psi.own else None)
         if self.ground is not None and world.delta_e is not None:
-            options = self.ground.options(world.delta_e, options)
+            options = self.ground.options(world.delta_e, options, seed)
         if self.injection is not None and world.delta_s is not None:
             self.injection.bias = self.injection.delta = world.delta_s
         self.sim.begin_episode()

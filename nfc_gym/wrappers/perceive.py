@@ -18,9 +18,9 @@ from nfc_gym.physics.state import yaw
 from nfc_gym.terrain.egocentric import SIZE
 from nfc_gym.wrappers.base import EnvWrapper, VectorEnvWrapper
 from nfc_gym.wrappers.batched import batch_simulation_of
+from nfc_gym.wrappers.ground import read_ground
 from nfc_gym.wrappers.rows import Rows, with_last
 from nfc_gym.wrappers.simulation import simulation_of
-from nfc_gym.wrappers.terrain import read_ground
 
 Camera = terrain.DepthCamera | Mapping[str, Any]
 KEY = "elevation"

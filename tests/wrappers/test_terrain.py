@@ -13,7 +13,7 @@ import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym import terrain
 from nfc_gym.core import Fidelity, InputError
 from nfc_gym.wrappers import PerceiveTerrain, ResidualTerrain
-from nfc_gym.wrappers.terrain import read_ground
+from nfc_gym.wrappers.ground import read_ground
 
 ROUGH = {"terrain_pool": 2, "difficulty": 0.3}
 BOWL = np.fromfunction(lambda i, j: 0.001 * ((i - 128) ** 2 + (j - 128) ** 2) / 100, (256, 256))
@@ -110,7 +110,7 @@ def test_bad_input_is_refused_by_name() -> None:
     with pytest.raises(InputError, match="NoModel"):
         ResidualTerrain(NoModel(), BOWL)
     with pytest.raises(InputError, match=r"\(256, 256\)"):
-        ResidualTerrain(gym.make("nfc_gym/JackalRough-v0", **ROUGH), BOWL[:128, :128])
+        ResidualTerrain(gym.make("nfc_gym/JackalRough-v0", **ROUGH), BOWL[:100, :100])
     with pytest.raises(InputError, match="-5 to 11"):
         ResidualTerrain(gym.make("nfc_gym/JackalRough-v0", **ROUGH), BOWL + 30).reset()
     with pytest.raises(InputError, match="psi"):
