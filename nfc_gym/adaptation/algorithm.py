@@ -57,7 +57,8 @@ class AdaptConfig:
         own, or else the simulator's.
       hallucinate: train pi_h too, which leans the draws in the policy's favour.
       parts: of the belief, those that are used where it speaks of them; ("psi",) is the paper's "w/o delta fidelity".
-        A neural posterior's delta_e is of the ground around the robot, not of a map, and is not used.
+        On rough ground a neural posterior's delta_e is laid where each simulation starts (`VectorResidualTerrain`);
+        pi_h does not move it.
       beta: how far, in standard deviations of the belief, pi_h = 1 leads.
       judged: episodes by which weights are chosen: those from before the first mission, those that each mission left
         and those on the way now compete in worlds of the present belief, and the best are deployed, while learning goes

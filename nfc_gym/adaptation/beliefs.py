@@ -17,7 +17,7 @@ from nfc_gym.adaptation.imagined import among, spoken
 from nfc_gym.adaptation.trajectory import Dataset, Trajectory
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
-from nfc_gym.core.posterior import Sampler
+from nfc_gym.core.posterior import Sampler, without_maps
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.proposals import TRUNCATED, SequentialConfig
 from nfc_gym.inference.sequential import sequential
@@ -63,15 +63,9 @@ def asked(posterior: Any, trajectory: Trajectory) -> Window | None:
 
 
 def believed(posterior: Any, trajectory: Trajectory) -> Sampler:
-    """What a posterior with `given` says of a trajectory.
-
-    A network's delta_e is left out: it is of the ground around the robot at one moment, and worlds are whole maps.
-    """
+    """What a posterior with `given` says of a trajectory."""
     window = asked(posterior, trajectory)
-    if window is None:
-        return Unseen(posterior.prior)
-    given = posterior.given(window)
-    return given.of(*(p for p in given.parts if p != "delta_e")) if isinstance(given, NeuralPosterior) else given
+    return Unseen(posterior.prior) if window is None else posterior.given(window)
 
 
 @dataclass(frozen=True)
@@ -190,7 +184,7 @@ def require_spoken(posterior: Any, wanted: Sequence[str]) -> None:
     """
     posterior = posterior.posterior if isinstance(posterior, Fixed | Sequential) else posterior
     if isinstance(posterior, NeuralPosterior):
-        among([p for p in posterior.parts if p != "delta_e"], wanted)
+        among(posterior.parts, wanted)
     elif isinstance(posterior, Inference):
         among(getattr(posterior, "parts", wanted), wanted)
     elif not callable(getattr(posterior, "given", None)):  # of a `Fidelity`, the names of its parts
@@ -199,7 +193,7 @@ def require_spoken(posterior: Any, wanted: Sequence[str]) -> None:
 
 def _psi(belief: Sampler, n: int, space: ParameterSpace) -> np.ndarray | None:
     """(n, d) draws of its psi; None where it says nothing of it."""
-    drawn = belief.sample(n, np.random.default_rng(0))
+    drawn = without_maps(belief).sample(n, np.random.default_rng(0))
     if not isinstance(drawn, Fidelity):
         raise InputError(
             f"adapt: the posterior's sample(n, rng) must return a Fidelity, such as Fidelity(psi=array), got "

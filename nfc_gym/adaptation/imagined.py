@@ -11,7 +11,8 @@ from nfc_gym.adaptation.sight import Sight, VectorSight
 from nfc_gym.adaptation.worlds import VectorStaggered, vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import PARTS, Fidelity
-from nfc_gym.core.posterior import Sampler
+from nfc_gym.core.posterior import Sampler, without_maps
+from nfc_gym.inference.posterior import NeuralPosterior
 from nfc_gym.inference.random import mixed
 from nfc_gym.wrappers import (
     VectorApplyEffects,
@@ -37,7 +38,8 @@ class Parts:
 
     def sample(self, n: int, rng: np.random.Generator) -> Fidelity:
         """See `Sampler`."""
-        drawn = self.posterior.sample(n, rng)
+        posterior = self.posterior if "delta_e" in self.parts else without_maps(self.posterior)
+        drawn = posterior.sample(n, rng)
         return Fidelity(**{part: getattr(drawn, part) for part in self.parts})
 
 
@@ -79,7 +81,9 @@ class _Again:
 # What a belief may have besides the parts of a fidelity: `effects(n, rng)`, and standard deviations of what is sensed.
 EFFECTS, NOISE = "effects", "noise"
 ALL = (*PARTS, EFFECTS, NOISE)
-_EFFECTS = 1  # stream of random numbers: what a simulation lacks is not to go with when its first episode ends
+# Streams of random numbers: what a simulation lacks, and its ground, are not to go with when its first episode ends.
+_EFFECTS, _GROUND = 1, 2
+_MAPS = 64  # of a network's draws of delta_e, at most: each takes a second without a GPU
 
 
 def require_parts(wanted: Sequence[str]) -> None:
@@ -97,7 +101,9 @@ def spoken(posterior: Sampler, wanted: Sequence[str]) -> tuple[str, ...]:
     """
     require_parts(wanted)
     more = tuple(p for p in (EFFECTS, NOISE) if getattr(posterior, p, None) is not None)
-    return among((*posterior.sample(2, np.random.default_rng(0)).given, *more), wanted)
+    network = isinstance(posterior, NeuralPosterior)  # which says it without seconds of drawing maps
+    given = posterior.parts if network else posterior.sample(2, np.random.default_rng(0)).given
+    return among((*given, *more), wanted)
 
 
 def among(given: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
@@ -133,7 +139,7 @@ def imagined(
     belief = getattr(belief, "near", lambda: belief)()
     envs: VectorEnv = vector_env(environment, n, threads=threads, episode=episode, **(settings or {}))
     if "delta_e" in found and envs.unwrapped.rough:  # type: ignore[attr-defined]
-        envs = VectorResidualTerrain(envs, Parts(belief, ("delta_e",)))
+        envs = VectorResidualTerrain(envs, _grounds(belief, n, seed))
     moving = tuple(p for p in found if p in ("psi", "delta_s"))
     acting = getattr(belief, EFFECTS)(n, np.random.default_rng(mixed(seed, _EFFECTS))) if EFFECTS in found else []
     if acting:  # each simulation has sizes of its own
@@ -144,9 +150,17 @@ def imagined(
     if hallucinate and moving:
         envs = VectorHallucinate(envs, Parts(belief, moving), beta=beta)
     elif moving:
-        joint = Joint(belief)
+        joint = Joint(without_maps(belief))
         if "psi" in moving:
             envs = VectorRandomizePsi(envs, Parts(joint, ("psi",)))
         if "delta_s" in moving:
             envs = VectorResidualDynamics(envs, Parts(joint.again if "psi" in moving else joint, ("delta_s",)))
     return VectorSight(VectorStaggered(envs, episode, seed) if staggered else envs, sight)
+
+
+def _grounds(belief: Sampler, n: int, seed: int) -> Sampler:
+    """What residual terrain is drawn from: of a network as many draws as there are simulations, made once."""
+    only = Parts(belief, ("delta_e",))
+    if not isinstance(belief, NeuralPosterior):
+        return only
+    return only.sample(min(n, _MAPS), np.random.default_rng(mixed(seed, _GROUND)))

@@ -3,7 +3,7 @@
 from nfc_gym.core.errors import InputError, MissingExtra, NfcError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.log import Channel, Log
-from nfc_gym.core.posterior import Posterior, Sampler, load_source, register_loader
+from nfc_gym.core.posterior import Posterior, Sampler, load_source, register_loader, without_maps
 
 __all__ = [
     "Channel",
@@ -16,4 +16,5 @@ __all__ = [
     "Sampler",
     "load_source",
     "register_loader",
+    "without_maps",
 ]

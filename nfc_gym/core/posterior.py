@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 from zipfile import BadZipFile
 
 import numpy as np
@@ -31,6 +31,13 @@ class Posterior(Sampler, Protocol):
     def log_prob(self, x: Fidelity) -> Array:
         """(n,) log density of a batch of fidelities, in nats."""
         ...
+
+
+def without_maps(source: Any) -> Any:
+    """The same saying nothing of delta_e, where it can be asked for some of its parts: a map takes as long to draw as a
+    thousand psi, and many look at psi and delta_s alone."""
+    parts = getattr(source, "parts", ())
+    return source.of(*(p for p in parts if p != "delta_e")) if "delta_e" in parts and hasattr(source, "of") else source
 
 
 Loader = Callable[[Path], Sampler]

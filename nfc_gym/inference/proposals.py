@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
+from nfc_gym.core.posterior import without_maps
 from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.normal import Normal
@@ -245,7 +246,7 @@ def told(posterior: Believed, psi: Array) -> Array:
 
 def drawn(posterior: Believed, n: int, rng: np.random.Generator) -> Array:
     """(n, d) psi of a posterior, physical units."""
-    psi = posterior.sample(n, rng).psi
+    psi = without_maps(posterior).sample(n, rng).psi
     assert psi is not None  # a posterior always speaks of psi
     return psi
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.core.posterior import Sampler, load_source
+from nfc_gym.core.posterior import Sampler, load_source, without_maps
 from nfc_gym.physics.parameters import ParameterSpace
 
 Array = NDArray[np.float64]
@@ -77,9 +77,7 @@ def read_belief(path: Path, space: ParameterSpace, seed: int) -> Belief:
     source: Any = load_source(path)
     if not isinstance(source, Sampler):
         raise InputError(f"{path}: {type(source).__name__} is no posterior; want what `nfc-gym infer --out` wrote")
-    parts = getattr(source, "parts", ())
-    if "delta_e" in parts:  # maps take seconds to draw, and nothing here looks at them
-        source = source.of(*(p for p in parts if p != "delta_e"))
+    source = without_maps(source)  # logs hold no ground
     drawn = source.sample(_DRAWS, np.random.default_rng(seed))
     if drawn.psi is None:
         raise InputError(f"{path}: says nothing of psi")

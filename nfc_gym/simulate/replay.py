@@ -27,7 +27,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.core.posterior import Sampler
+from nfc_gym.core.posterior import Sampler, without_maps
 from nfc_gym.core.whole import require_share, require_whole
 from nfc_gym.envs.quadcopter import Quadcopter
 from nfc_gym.envs.simulations import Simulations
@@ -302,7 +302,7 @@ def _psi(machine: Machine, belief: Sampler | None, draws: int, rng: np.random.Ge
     space = machine.space
     if belief is None:
         return np.tile(space.nominal, (draws, 1))
-    psi = belief.sample(draws, rng).psi
+    psi = without_maps(belief).sample(draws, rng).psi
     if psi is None or psi.shape != (draws, len(space)):
         have = "says nothing of psi" if psi is None else f"has psi of shape {psi.shape}"
         raise InputError(f"replay: the belief {have}; want {(draws, len(space))}: {', '.join(space.names)}")

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable
-from nfc_gym.core.posterior import Sampler, load_source
+from nfc_gym.core.posterior import Sampler, load_source, without_maps
 from nfc_gym.core.whole import require_share, require_whole
 from nfc_gym.inference.windows import Manifest, Windows, WindowWriter
 from nfc_gym.physics.parameters import ParameterSpace
@@ -119,7 +119,7 @@ def _opened(proposal: Sampler | str | Path | None) -> Sampler | None:
 
 def drawn(sampler: Sampler, machine: Machine, seed: int, shard: int, n: int) -> Array:
     """u (n, d) that a proposal gives the windows of a shard; errors as `units`."""
-    return units(sampler.sample(n, generator(seed, shard, PROPOSAL)).psi, machine.space, n)
+    return units(without_maps(sampler).sample(n, generator(seed, shard, PROPOSAL)).psi, machine.space, n)
 
 
 def units(psi: Array | None, space: ParameterSpace, n: int) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.files import require_writable
-from nfc_gym.core.posterior import Sampler
+from nfc_gym.core.posterior import Sampler, without_maps
 from nfc_gym.inference import detector_file
 from nfc_gym.inference.data import TensorWindows
 from nfc_gym.inference.detector import WindowDetector
@@ -111,7 +111,7 @@ def watch(
 def _believed(machine: Machine, belief: Sampler | None, width: float, n: int, rng: np.random.Generator) -> Array:
     """(n, d) physical units."""
     if belief is not None:
-        return np.asarray(belief.sample(n, rng).psi, float)
+        return np.asarray(without_maps(belief).sample(n, rng).psi, float)
     if not 0 <= width <= 1:
         raise InputError(f"watch: width is a share of the prior's range, 0 to 1, got {width:g}")
     return about_nominal(machine.space, width, n, rng)

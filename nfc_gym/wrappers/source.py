@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
-from nfc_gym.core.posterior import Sampler, load_source
+from nfc_gym.core.posterior import Sampler, load_source, without_maps
 from nfc_gym.physics.parameters import numbers
 
 Array = NDArray[np.float64]
@@ -33,6 +33,8 @@ class Draws:
     def __init__(self, source: Source, part: str, who: str) -> None:
         self.part, self.who = part, who
         self.sampler = sampler_of(source, part, who)
+        if part != "delta_e":
+            self.sampler = without_maps(self.sampler)
         # One draw of its own generator shows what the source gives before any episode depends on it.
         self.shape = self.draw(1, np.random.default_rng(0)).shape[1:]
 
