@@ -16,6 +16,10 @@ from nfc_gym.core import InputError, Sampler, kinds, load_source
 from nfc_gym.core.files import require_writable
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.table import Table
+
     from nfc_gym.inference.jobs import Told
     from nfc_gym.inference.posterior import Window
     from nfc_gym.inference.train import Outcome
@@ -129,6 +133,13 @@ def train(
     maps: Annotated[
         bool, typer.Option("--maps", help="See the elevation map; needs windows simulated with --maps.")
     ] = False,
+    delta_e: Annotated[
+        bool,
+        typer.Option("--delta-e", help="Infer the residual terrain too; needs --maps and the density score."),
+    ] = False,
+    families: Annotated[
+        bool, typer.Option("--families", help="Say too how likely each family of effects is at work.")
+    ] = False,
     structure: Annotated[
         bool,
         typer.Option("--structure", help="In place of a posterior: a head for close-loop, which family it lacks."),
@@ -149,7 +160,8 @@ def train(
     seed: Annotated[int, typer.Option(min=0, help="Of the first weights, the order and the noise.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto is a GPU where there is one.")] = "auto",
 ) -> None:
-    """Train a posterior: from a window of motion to a distribution over psi (and delta_s) that could have made it.
+    """Train a posterior: from a window of motion to a distribution over psi (and delta_s, delta_e) that could have made
+    it.
 
     Done once a robot; `nfc-gym infer` then takes milliseconds a window. A twentieth of the windows is held out, and the
     weights kept are those of the epoch that did best on it. What a window tells of psi, in nats a parameter, is printed
@@ -160,14 +172,22 @@ def train(
     What the motion does not show comes back as wide as the prior, however long one trains: simulate motion like the one
     that you will log.
 
+    With --maps --delta-e one network infers psi, delta_s and delta_e jointly, and with --families it has all its heads.
+    delta_e is what the ground around the robot is beyond the map that it perceives, 128 x 128 cells: ResidualTerrain,
+    Hallucinate and `nfc-gym adapt` lay it where the robot starts. Train it on windows of rough ground, on a GPU: on
+    flat ground it is the camera's error alone.
+
     With --structure the file holds a structure head instead: shown motion and what a calibrated model without effects
     misses of it, it says which family of effects is at work; `nfc-gym close-loop --posterior` then looks there first.
 
     Example: nfc-gym train windows/jackal --out jackal.safetensors
     """
     with outcome(ctx, resumes=True):
-        of_posteriors = _asked(ctx, "encoder", "density", "delta_s", "maps", "mirror")
+        of_posteriors = _asked(ctx, "encoder", "density", "delta_s", "maps", "delta_e", "families", "mirror")
         _require_used(not structure, "for a posterior: give it without --structure", **of_posteriors)
+        terrain = _asked(ctx, "delta_e")
+        _require_used(maps, "what the ground is beyond the map that is seen: give --maps too", **terrain)
+        _require_used(density == "score", f"inferred by --density score, not {density}: leave that out", **terrain)
         kinds.require_kind(out, kinds.STRUCTURE if structure else kinds.POSTERIOR)
         require_writable(out.absolute().parent)
         jobs = learning()
@@ -186,8 +206,9 @@ def train(
             done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
         else:
             config = NetworkConfig(
-                encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s
-            )
+                encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s,
+                delta_e=delta_e, families=_families(windows) if families else (),
+            )  # fmt: skip
             prior = PriorBox.of(machine.space, machine.kind.name)
             image = Reflection(machine.mirrors) if mirror else None
             done = jobs.train_posterior(windows, prior, out, config, training, device=device, mirror=image, **how)
@@ -211,6 +232,13 @@ def _machine(windows: Path) -> "Machine":
     from nfc_gym.simulate.machine import Machine
 
     return Machine(Manifest.read(windows).environment)
+
+
+def _families(windows: Path) -> tuple[str, ...]:
+    """Of effects that windows have."""
+    from nfc_gym.inference.windows import Manifest
+
+    return tuple(Manifest.read(windows).families)
 
 
 def learned(done: "Outcome") -> str:
@@ -253,8 +281,14 @@ def infer(
         Path | None,
         typer.Option(metavar="FILE", help=".npz: the draws; .safetensors: the posterior given this window."),
     ] = None,
-    samples: Annotated[int, typer.Option(min=1, help="Draws.")] = 1000,
+    samples: Annotated[
+        int | None, typer.Option(min=1, help="Draws; default 1000, with --delta-e 32.", show_default=False)
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    delta_e: Annotated[
+        bool,
+        typer.Option("--delta-e", help="Draw the residual terrain too, jointly: a second a draw without a GPU."),
+    ] = False,
     log: Annotated[str | None, typer.Option(metavar="NAME", help="Of a mapping's logs; default the first.")] = None,
     until: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where the window ends in that log.")] = None,
     refine: Annotated[
@@ -282,6 +316,10 @@ def infer(
     alone, and sharper on all robots but the Jackal. It needs no trained posterior: give the environment's id, and it
     begins with the prior.
 
+    A posterior trained with --delta-e infers the residual terrain too. --delta-e draws it, prints what it adds to the
+    perceived ground at a few places around the robot, and keeps it in the .npz beside psi; ResidualTerrain and
+    Hallucinate lay it where the robot starts. The posterior in a .safetensors holds it with and without this option.
+
     Either kind of --out goes into RandomizePsi, into `nfc-gym simulate --proposal` and into `nfc-gym close-loop
     --posterior`.
 
@@ -292,6 +330,8 @@ def infer(
         mapped = window.is_dir() or window.suffix in (".yaml", ".yml")
         _require_used(mapped, f"of a mapping's logs, and {window} is no mapping file", log=log, until=until)
         _require_used(refine is not None, "for --refine: give --refine N too", jobs=jobs)
+        _require_used(refine is None, "not refined, which is of psi alone", **_asked(ctx, "delta_e"))
+        samples = samples or (32 if delta_e else 1000)
         inference = learning()
         from nfc_gym.inference.progress import Spoken
 
@@ -306,12 +346,14 @@ def infer(
                 refined, environment=environment, simulations=refine, seed=seed, jobs=jobs or 0, report=report
             )
         drawn, found = inference.infer(
-            posterior if trained else None, seen, samples=samples, seed=seed, out=out, refined=anew, report=report
-        )
+            posterior if trained else None, seen, samples=samples, seed=seed, out=out, refined=anew, report=report,
+            maps=delta_e,
+        )  # fmt: skip
         _print_table(found, inference.AS_WIDE)
+        if drawn.delta_e is not None:
+            _print_ground(drawn.delta_e)
         if out is not None and out.suffix == ".npz":
-            parts = [part for part in ("psi", "delta_s") if getattr(drawn, part) is not None]
-            say_written(out, f"{samples} draws of {' and '.join(parts)}")
+            say_written(out, f"{samples} draws of {' and '.join(drawn.given)}")
         elif out is not None:
             say_written(out, "the posterior given this window")
 
@@ -325,6 +367,22 @@ def _print_table(found: "list[Told]", as_wide: float) -> None:
         note = "  not shown" if each.width >= as_wide else ""
         interval = f"{each.low:.4g} to {each.high:.4g}"
         table.add_row(each.name, each.unit, f"{each.median:.4g}", interval, f"{each.width:.2f}{note}")
+    _print(table)
+
+
+def _print_ground(maps: "NDArray[np.float64]") -> None:
+    """What draws of delta_e (n, 128, 128) say of places around the robot."""
+    from rich.table import Table
+
+    from nfc_gym.inference.around import heights
+
+    table = Table("delta_e", "median, m", "90 % interval")
+    for each in heights(maps):
+        table.add_row(each.place, f"{each.median:.3f}", f"{each.low:.3f} to {each.high:.3f}")
+    _print(table)
+
+
+def _print(table: "Table") -> None:
     Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 140).print(table)
 
 

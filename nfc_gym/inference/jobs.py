@@ -14,6 +14,7 @@ from nfc_gym.core import kinds
 from nfc_gym.core.errors import InputError
 from nfc_gym.core.fidelity import Fidelity
 from nfc_gym.core.files import replacing, require_writable
+from nfc_gym.core.posterior import without_maps
 from nfc_gym.inference import checkpoint
 from nfc_gym.inference.config import NetworkConfig, Sizes
 from nfc_gym.inference.data import StoredWindows
@@ -116,8 +117,9 @@ def train_posterior(
     stored = Windows(folder, robot=prior.robot, psi_names=prior.names)
     require_prior(stored, prior)
     say_unfinished(stored, report)
-    if config.elevation and "map" not in stored.names:
-        raise InputError(f"{folder}: the windows have no elevation maps; make them with `nfc-gym simulate ... --maps`")
+    for name, what, wanted in (("map", "elevation maps", config.elevation), ("delta_e", "delta_e", config.delta_e)):
+        if wanted and name not in stored.names:
+            raise InputError(f"{folder}: the windows have no {what}; make them with `nfc-gym simulate ... --maps`")
     if config.families:
         config = replace(config, families=tuple(stored.manifest.families))
     about = stored.manifest
@@ -200,7 +202,7 @@ Refined = Callable[[NeuralPosterior | None, Window], NormalPosterior]
 
 def infer(
     posterior: Path | None, window: Path | Window, *, samples: int = 1000, seed: int = 0, out: Path | None = None,
-    refined: Refined | None = None, report: Report = quiet,
+    refined: Refined | None = None, report: Report = quiet, maps: bool = False,
 ) -> tuple[Fidelity, list[Told]]:  # fmt: skip
     """Draw from a posterior given a window.
 
@@ -209,14 +211,17 @@ def infer(
       window: see `read_window`; or the window itself.
       samples: how many.
       seed: of the draws.
-      out: `.npz` for the draws (`psi`, and `delta_s` where it is inferred), or `.safetensors` for the posterior given
-        this window; wrappers and `nfc-gym simulate --proposal` take either.
+      out: `.npz` for the draws (`psi`, and `delta_s` where it is inferred, with `maps` also `delta_e`), or
+        `.safetensors` for the posterior given this window; wrappers and `nfc-gym simulate --proposal` take either.
       refined: makes a posterior given the window, `simulate.refined`; None gives the window to the one there is.
-      report: is told where the window is unlike all that the posterior was trained on.
+      report: is told where the window is unlike all that the posterior was trained on, that there is delta_e to draw,
+        and of a network with such a head how likely each family of effects is.
+      maps: draw delta_e too, jointly with the rest: a second a draw without a GPU.
 
     Raises:
-      InputError: a damaged file, a structure head, a window that is not the network's or whose actions are far outside
-        [-1, 1], another ending, something else than that is at `out`, or nothing can be written there.
+      InputError: maps of a posterior that infers none, a damaged file, a structure head, a window that is not the
+        network's or whose actions are far outside [-1, 1], another ending, something else than that is at `out`, or
+        nothing can be written there.
     """
     if out is not None and out.suffix not in (".npz", ".safetensors"):
         raise InputError(f"{out}: draws are kept in .npz, the posterior given the window in .safetensors")
@@ -236,14 +241,20 @@ def infer(
         seen = _as_trained(found, seen, name)
         _say_unlike(found, seen, report)
     given = _given(found, seen, refined)
-    parts = [p for p in given.parts if p != "delta_e"]
-    drawn = given.of(*parts).sample(samples, np.random.default_rng(seed))
+    if maps and "delta_e" not in given.parts:
+        raise InputError(
+            f"{posterior}: infers {' and '.join(given.parts)}, no delta_e; `nfc-gym train ... --maps --delta-e` trains "
+            "one that does"
+        )
+    _say_more(given, maps, report)
+    asked = given if maps else without_maps(given)
+    drawn = asked.sample(samples, np.random.default_rng(seed))
     if out is not None and out.suffix == ".safetensors":
         given.save(out)
     elif out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         with replacing(out) as part, part.open("wb") as file:
-            np.savez(file, **{p: getattr(drawn, p) for p in parts})
+            np.savez(file, **{p: getattr(drawn, p) for p in drawn.given})
     return drawn, told(given.prior, np.asarray(drawn.psi))
 
 
@@ -253,6 +264,15 @@ def _given(found: NeuralPosterior | None, seen: Window, refined: Refined | None)
     if found is None:
         raise InputError("infer: want a posterior, or to refine from none")
     return found.given(seen)
+
+
+def _say_more(given: NeuralPosterior | NormalPosterior, maps: bool, report: Report) -> None:
+    """What else a posterior has to say than psi."""
+    if isinstance(given, NeuralPosterior) and given.network.structure is not None:
+        likely = sorted(given.families().items(), key=lambda each: -each[1])
+        report.message(f"family of effects: {', '.join(f'{name} {share:.2f}' for name, share in likely)}")
+    if "delta_e" in given.parts and not maps:
+        report.message("it infers delta_e too, a second a draw without a GPU: --delta-e draws it")
 
 
 def _as_trained(posterior: NeuralPosterior, window: Window, name: str) -> Window:
