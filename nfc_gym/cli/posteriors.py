@@ -16,10 +16,9 @@ from nfc_gym.core import InputError, Sampler, kinds, load_source
 from nfc_gym.core.files import require_writable
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from rich.table import Table
 
+    from nfc_gym.inference.around import Height
     from nfc_gym.inference.jobs import Told
     from nfc_gym.inference.posterior import Window
     from nfc_gym.inference.train import Outcome
@@ -351,7 +350,9 @@ def infer(
         )  # fmt: skip
         _print_table(found, inference.AS_WIDE)
         if drawn.delta_e is not None:
-            _print_ground(drawn.delta_e)
+            from nfc_gym.inference.around import heights
+
+            _print_ground(heights(drawn.delta_e))
         if out is not None and out.suffix == ".npz":
             say_written(out, f"{samples} draws of {' and '.join(drawn.given)}")
         elif out is not None:
@@ -370,14 +371,12 @@ def _print_table(found: "list[Told]", as_wide: float) -> None:
     _print(table)
 
 
-def _print_ground(maps: "NDArray[np.float64]") -> None:
-    """What draws of delta_e (n, 128, 128) say of places around the robot."""
+def _print_ground(found: "list[Height]") -> None:
+    """Median and 90 % interval of delta_e at places around the robot."""
     from rich.table import Table
 
-    from nfc_gym.inference.around import heights
-
     table = Table("delta_e", "median, m", "90 % interval")
-    for each in heights(maps):
+    for each in found:
         table.add_row(each.place, f"{each.median:.3f}", f"{each.low:.3f} to {each.high:.3f}")
     _print(table)
 
