@@ -6,6 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from nfc_gym.core.errors import InputError
 from nfc_gym.measured.export import corrected
 from nfc_gym.physics.effects import FAMILIES, complete_inertia, propose
 from nfc_gym.physics.effects.base import Effect, Scales
@@ -16,6 +17,7 @@ from nfc_gym.physics.rollout import Plant
 PAGE = Path(__file__).resolve().with_suffix(".md")
 NUMBERED = 3  # parameters with names like c0, c1, ... from which on only the first and the last are named
 MOST = 12  # effects of a family that are tried for where they are kept; of laws, which are all alike, two
+RULER = "tyre_c"  # the geom that has priority over the ground
 FEW_UNITS = 2  # more than so many are the unit of whatever the effect sits on
 
 # Something of everything, so that every family finds a place; no two kinds of object share a name.
@@ -37,7 +39,7 @@ MODEL = """
       <body name="hub_r" pos="0 -.2 0"><joint name="axle_r" axis="0 1 0" damping=".01"/>
         <geom name="tyre_r" type="ellipsoid" size=".1 .03 .1" mass=".3"/></body>
       <body name="hub_c" pos="-.3 0 0"><joint name="axle_c" axis="0 1 0" damping=".01"/>
-        <geom name="tyre_c" type="ellipsoid" size=".1 .03 .1" mass=".3"/></body>
+        <geom name="tyre_c" type="ellipsoid" size=".1 .03 .1" mass=".3" priority="1"/></body>
     </body>
     <body name="arm" pos="0 5 1.5"><joint name="shoulder" axis="0 1 0" damping=".02"/>
       <geom name="upper" type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".2"/>
@@ -330,6 +332,18 @@ def kept(effects: Sequence[Effect], made: mujoco.MjSpec, model: mujoco.MjModel) 
     return " or ".join(sorted(found, reverse=True))
 
 
+def on_geoms(effects: Sequence[Effect], model: mujoco.MjModel) -> bool:
+    """Whether a law that is proposed for the whole ground alone can be given for single geoms that touch it as well."""
+    first = effects[0]
+    if first.generic or any(e.where != ("ground",) for e in effects):
+        return False
+    try:
+        type(first)((RULER,), first.params).bind(model)
+    except InputError:
+        return False
+    return True
+
+
 def rows(generic: bool) -> list[str]:
     """The table's lines, in the library's order."""
     made = spec()
@@ -342,7 +356,8 @@ def rows(generic: bool) -> list[str]:
         own = [e for e in every if e.family == family.family]
         if not own:
             raise RuntimeError(f"{family.family} has no place in the model above: add what it sits on")
-        place, numbers, file = names.places(own), parameters(family, own), kept(own, made, model)
+        place = names.places(own) + (" or geoms" if on_geoms(own, model) else "")
+        numbers, file = parameters(family, own), kept(own, made, model)
         what = f"{family.summary} ({family.remark})" if family.remark else family.summary
         lines.append(f"| `{family.family}` | {what} | {place} | {numbers} | {file} |")
     return lines

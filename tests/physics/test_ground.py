@@ -137,6 +137,23 @@ def test_soft_ground_sinks_by_weight_over_stiffness(mass: float, floor: str, bal
     assert np.ptp(q[-100:]) < 1e-9
 
 
+def test_single_geoms_are_softer_where_their_own_values_rule() -> None:
+    """Of a sled's three feet the one in front sinks (1 + softness)^2 times as deep, and the others as before."""
+    softness, text = 2.0, SLED.replace("<geom", f"<geom {FLAT}")
+    depth = []
+    for of in ((None, []), make("compliance", "a", {"softness": softness, "damping": 0.0})):
+        q = run(mujoco.MjModel.from_xml_string(text.format(0.6, 0.2, 1)), *of, 3000).qpos[0, 0, -1]
+        pitch = 2 * np.arctan2(q[5], q[3])
+        depth.append([0.05 - (q[2] - np.sin(pitch) * x) for x in (0.2, -0.2)])
+    (front, back), (softer, same) = depth
+    assert same == pytest.approx(back, rel=0.02)
+    assert softer == pytest.approx((1 + softness) ** 2 * front, rel=0.02)
+    for priority in (0, -1):
+        ruled = mujoco.MjModel.from_xml_string(SLED.format(0.6, 0.2, priority))
+        with pytest.raises(InputError, match="name `ground`, or give the geoms a higher `priority`"):
+            make("compliance", "a", {"softness": softness, "damping": 0.0})[0].bind(ruled)
+
+
 def test_damping_of_the_ground_decides_whether_a_mass_rings() -> None:
     ring = {}
     for damping in (-0.8, 0.0):

@@ -84,7 +84,7 @@ class FrictionPatch(OnGround):
     The friction of each geom that touches the ground is written anew in every step, by where its middle is; the edge
     is a fifth of the radius wide. Between geoms of one priority MuJoCo takes the larger friction, so while a machine
     stands in the patch its geoms take over the ground's friction, and the ground's is 0. Geoms over which the ground
-    has priority cannot be told apart and keep theirs.
+    has priority cannot be told apart and keep theirs. Named for single geoms, it is theirs alone.
     """
 
     family = "friction_patch"
@@ -171,10 +171,15 @@ class Compliance(OnGround):
     contact: what touches the ground where that has priority or the direct form, else both. A mass that rests on a
     contact of frequency f and impedance d sinks by (1 - d) g / (2 pi f)^2, as on a spring of stiffness
     m (2 pi f)^2 / (1 - d). Softer contact also creeps more under a sideways load.
+
+    Single geoms can be softer only where their own values rule. Where the ground's do, or the mean of both, a geom
+    would need a higher priority, and with it friction and condim of its own towards all that it touches: another model
+    even where the effect vanishes, which is for the model's author to decide.
     """
 
     family = "compliance"
     summary = "Soft ground"
+    remark = "of single geoms where their own values rule: by a `priority` above the ground's, or a direct `solref`"
     PARAMS = (
         Param("softness", "1", -0.5, 30.0, probes=(1.0, 4.0), resolution=0.02, floor=-1.0),
         Param("damping", "1", -0.9, 10.0, probes=(-0.5, 1.0), resolution=0.02, floor=-1.0),
@@ -187,7 +192,10 @@ class Compliance(OnGround):
         self.soft = self.touching[own]
         if not own.all():  # the rest is ruled by the ground, alone or by the mean of both
             if self.where != ("ground",):
-                raise InputError(f"compliance: the ground rules the contact of {self.place}; name `ground`")
+                raise InputError(
+                    f"compliance: the ground has a say in the contact of {self.place}: name `ground`, or give the geoms "
+                    "a higher `priority` than the ground's in the model; their own solref, solimp and friction then rule"
+                )
             self.soft = np.concatenate([self.soft, self.ground, self.touching[~own & (self.above == 0)]])
 
     def model(self, fields: ModelFields, theta: Array) -> None:
