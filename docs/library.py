@@ -237,7 +237,7 @@ def candidates(model: mujoco.MjModel) -> list[Effect]:
         low=model.qpos0 - 4.0,  # cogging is proposed where a joint travels far
         high=model.qpos0 + 4.0,
     )
-    return propose(model, scales)
+    return propose(model, scales) + [e for f in FAMILIES.values() for e in f.asked(model, scales)]
 
 
 class Names:

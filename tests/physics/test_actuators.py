@@ -232,6 +232,30 @@ def test_supply_sag_follows_the_measured_voltage() -> None:
     np.testing.assert_allclose(made, NOISE * (volts / 12.0) ** 2, rtol=1e-12)
 
 
+def test_supply_sag_by_time_falls_evenly_and_never_turns_round() -> None:
+    time = np.linspace(0, 30, 61)
+    made = _made("supply_sag", {"rate": 0.04}, np.full(61, 2.0), exogenous={"exo:time": time})
+    np.testing.assert_allclose(made, 2 * np.maximum(1 - 0.04 * time, 1e-6), rtol=1e-12)
+
+
+def test_supply_sag_by_time_is_looked_for_only_by_name_and_without_a_voltage() -> None:
+    model, one = mujoco.MjModel.from_xml_string(RAIL), np.ones(1)
+
+    def found(signals: dict[str, float], *only: str) -> list[list[str]]:
+        scales = Scales(one, one, one, one, 0.01, {"exo:time": 1.0} | signals)
+        effects = propose(model, scales, only=only, generic=False)
+        return [[p.name for p in e.params] for e in effects if e.family == "supply_sag"]
+
+    assert found({}) == found({}, "loss") == []
+    assert found({}, "loss", "supply_sag") == [["rate"]]
+    assert found({"exo:supply": 12.0}, "supply_sag") == [["exponent", "reference"]]
+    effect, _ = make("supply_sag", "push", {"rate": 0.04})
+    assert (effect.signals, effect.settings) == (("exo:time",), {})
+    every, _ = make("supply_sag", "all", {"rate": 0.04})
+    every.bind(model)
+    assert every.where == ("push",)
+
+
 def test_supply_sag_without_a_voltage_says_so() -> None:
     with pytest.raises(InputError, match="exo:supply"):
         _made("supply_sag", {"exponent": 2.0, "reference": 12.0}, NOISE)
@@ -250,6 +274,7 @@ def _moment(model: mujoco.MjModel, signals: dict[str, np.ndarray]) -> Context:
         ("loss", {"fraction": 0.4}),
         ("offset", {"offset": 0.3}),
         ("supply_sag", {"exponent": 1.0, "reference": 12.0}),
+        ("supply_sag", {"rate": 0.5}),
         ("lag", {"time_constant": 0.02}),
         ("delay", {"delay": 0.01}),
     ],
@@ -259,11 +284,12 @@ def test_demand_inverts_the_effect(family: str, parameters: dict[str, float]) ->
     time = np.arange(400) * DT
     ctrl = 2 * np.sin(6 * time)
     volts = 12.6 - time
-    made = _made(family, parameters, ctrl, exogenous={"exo:supply": volts})
+    signals = {"exo:supply": volts, "exo:time": time}
+    made = _made(family, parameters, ctrl, exogenous=signals)
     effect, theta = make(family, "push", parameters)
     model = mujoco.MjModel.from_xml_string(RAIL)
     effect.bind(model)
-    back = effect.demand(made[:, None], theta, _moment(model, {"exo:supply": volts}))[:, 0]
+    back = effect.demand(made[:, None], theta, _moment(model, signals))[:, 0]
     np.testing.assert_allclose(back[50:-50], ctrl[50:-50], atol=0.02)
 
 

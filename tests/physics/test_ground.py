@@ -150,7 +150,7 @@ def test_single_geoms_are_softer_where_their_own_values_rule() -> None:
     assert softer == pytest.approx((1 + softness) ** 2 * front, rel=0.02)
     for priority in (0, -1):
         ruled = mujoco.MjModel.from_xml_string(SLED.format(0.6, 0.2, priority))
-        with pytest.raises(InputError, match="name `ground`, or give the geoms a higher `priority`"):
+        with pytest.raises(InputError, match="name `ground`, or give geoms a higher `priority`"):
             make("compliance", "a", {"softness": softness, "damping": 0.0})[0].bind(ruled)
 
 

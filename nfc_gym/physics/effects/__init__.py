@@ -67,7 +67,10 @@ def propose(
     named = [f for n, f in FAMILIES.items() if not f.generic and (not only or n in only)]
     generics = [f for f in FAMILIES.values() if f.generic and generic]
     chosen = [f for f in (*named, *generics) if f.family not in exclude]
-    proposed = [effect for family in chosen for effect in family.propose(model, scales)]
+    proposed: list[Effect] = []
+    for family in chosen:
+        own = family.propose(model, scales)
+        proposed += own or (family.asked(model, scales) if family.family in only else [])
     by_id = {e.id: e for e in proposed}
     for effect in proposed:
         alone = [by_id.get(f"{effect.family}:{name}") for name in effect.where]

@@ -208,6 +208,11 @@ class Effect(ABC):
         raise NotImplementedError
 
     @classmethod
+    def asked(cls, model: mujoco.MjModel, scales: Scales) -> "list[Effect]":
+        """What is proposed where nothing else of a family is, and only of a family that was asked for by name."""
+        return []
+
+    @classmethod
     def declare(cls, names: Sequence[str]) -> tuple[Param, ...]:
         """The family's parameters of those names, in its own order; others raise `InputError`."""
         known = [p.name for p in cls.PARAMS]

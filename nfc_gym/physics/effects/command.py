@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from nfc_gym.core.errors import InputError
-from nfc_gym.physics.effects.base import Array, Context, Effect, Scales
+from nfc_gym.physics.effects.base import TIME, Array, Context, Effect, Scales
 from nfc_gym.physics.effects.drive import (
     ENDLESS,
     actuator_places,
@@ -34,6 +34,7 @@ _FOLLOWS = tuple(
     int(d) for d in (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
 )
 _IDLE = 1e-9  # N or N m: a force that is none
+_EMPTY = 1e-6  # of a drive's force, that the emptiest supply leaves: what it would take can still be asked
 
 
 class _OnCommand(Effect):
@@ -274,30 +275,52 @@ class SupplySag(_OnCommand):
     """Commands times (V / reference)^exponent, V the measured supply: a drive that follows its battery.
 
     The exponent is 0 for a regulated drive, 1 for a motor on the bare battery, 2 for the thrust of such a rotor.
+
+    With `rate` in place of both, commands times max(1 - rate t, 0), t the time since the log or the episode began: what
+    a battery that falls evenly and that nobody measured leaves of a drive's force. Whatever else changes as time goes
+    by looks like it, so it is a candidate only where the family is asked for by name and no log has a voltage.
     """
 
     family = "supply_sag"
     summary = "Drive follows the supply voltage"
+    remark = "by `rate` evenly as time goes by; a run looks for that only if a mapping's `only` names it, without volts"
     PARAMS = (
         Param("exponent", "1", -1.0, 4.0, probes=(1.0, 2.0), resolution=0.02),
         Param("reference", "V", 1e-3, 1e4, probes=(12.0,), shape=True),
     )
+    BY_TIME = (Param("rate", "1/s", 0.0, 1.0, probes=(0.003, 0.02), resolution=1e-4),)
     on_drive = True
     divisible = False  # drives of one make on one battery; one that gives less than the others has lost force
     SETTINGS = ("signal",)
     signal = "exo:supply"
 
     @property
+    def timed(self) -> bool:
+        """Whether it goes by time and not by a voltage."""
+        return self.params[0].name == "rate"
+
+    @property
     def signals(self) -> tuple[str, ...]:
-        return (self.signal,)
+        return (TIME,) if self.timed else (self.signal,)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {} if self.timed else super().settings
+
+    @classmethod
+    def declare(cls, names: Sequence[str]) -> tuple[Param, ...]:
+        """By a voltage or by time."""
+        return cls.BY_TIME if tuple(names) == ("rate",) else super().declare(names)
 
     def _factor(self, theta: Array, exogenous: Mapping[str, Array]) -> Array:
+        if self.timed:
+            return np.maximum(1 - theta[..., 0] * exogenous[TIME], _EMPTY)[..., None]
         name = self.signal if self.signal in exogenous else find_supply(exogenous)
         if name is None:
             raise InputError(
                 f"supply_sag reads the supply voltage {self.signal!r}; the log has: {', '.join(exogenous) or 'none'}"
             )
-        return np.power(np.maximum(exogenous[name] / theta[..., 1], 1e-6), theta[..., 0])[..., None]
+        return np.power(np.maximum(exogenous[name] / theta[..., 1], _EMPTY), theta[..., 0])[..., None]
 
     def action(
         self, ctrl: Array, theta: Array, memory: Any, exogenous: Mapping[str, Array], dt: float
@@ -317,14 +340,22 @@ class SupplySag(_OnCommand):
         if signal is None:
             return []
         volts = float(scales.exogenous[signal])
-        known = actuator_names(model)
-        names = [n for n in plain(model) if not is_position(model, known.index(n))]
         # The reference only names the voltage at which nothing changes: free, it would be a gain under another name.
         change = {"probes": (volts,), "low": volts * (1 - 1e-3), "high": volts * (1 + 1e-3)}
         out: list[Effect] = []
-        # One battery feeds all the drives; a drive with a battery of its own would have a signal of its own.
-        for where in [tuple(names)] if names else []:
+        for where in cls._places(model):
             effect = cls(where, sized(cls.PARAMS, reference=change))
             effect.signal = signal
             out.append(effect)
         return out
+
+    @classmethod
+    def asked(cls, model: mujoco.MjModel, scales: Scales) -> list[Effect]:
+        return [cls(where, cls.BY_TIME) for where in cls._places(model)]
+
+    @classmethod
+    def _places(cls, model: mujoco.MjModel) -> list[tuple[str, ...]]:
+        """One battery feeds all the drives; a drive with a battery of its own would have a signal of its own."""
+        known = actuator_names(model)
+        names = tuple(n for n in plain(model) if not is_position(model, known.index(n)))
+        return [names] if names else []

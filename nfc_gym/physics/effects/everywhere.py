@@ -40,7 +40,9 @@ def places_of(effect: Effect, model: mujoco.MjModel) -> tuple[str, ...]:
       InputError: there is none; or several, and the family sits at one alone.
     """
     names = {p.name for p in effect.params}
-    proposed = [e for e in effect.propose(model, _neutral(model)) if names & {p.name for p in e.params}]
+    scales = _neutral(model)
+    every = [*effect.propose(model, scales), *effect.asked(model, scales)]
+    proposed = [e for e in every if names & {p.name for p in e.params}]
     found = tuple(dict.fromkeys(name for e in proposed for name in e.where))
     found = next(((name,) for name in _WHOLE if name in found), found)
     if not found:

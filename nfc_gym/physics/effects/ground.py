@@ -193,8 +193,8 @@ class Compliance(OnGround):
         if not own.all():  # the rest is ruled by the ground, alone or by the mean of both
             if self.where != ("ground",):
                 raise InputError(
-                    f"compliance: the ground has a say in the contact of {self.place}: name `ground`, or give the geoms "
-                    "a higher `priority` than the ground's in the model; their own solref, solimp and friction then rule"
+                    f"compliance: the ground has a say in the contact of {self.place}: name `ground`, or give geoms a "
+                    "higher `priority` than the ground's in the model: their own solref, solimp, friction then rule"
                 )
             self.soft = np.concatenate([self.soft, self.ground, self.touching[~own & (self.above == 0)]])
 
