@@ -1,15 +1,19 @@
 """A healthy case: a small machine, its model, a mapping that uses most of the grammar, and three short logs."""
 
 import copy
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-FORMATS = ("npz", "csv", "parquet", "mat")
+BAGS = ("bag", "mcap") if find_spec("rosbags") else ()  # of ROS 1 and 2, where the extra `ros` is installed
+FORMATS = ("npz", "csv", "parquet", "mat", *BAGS)
+TOPIC = "/log"  # of bags: one message a row, with the columns by name as positions of joints
 
 MODEL = """<mujoco>
   <compiler angle="radian"/>
@@ -94,7 +98,8 @@ class Case:
         """Write all files; returns the mapping's path."""
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "machine.xml").write_text(self.model, encoding="utf-8", errors="surrogatepass")
-        text = self.mapping if isinstance(self.mapping, str) else yaml.safe_dump(self.mapping, sort_keys=False)
+        mapping = in_bags(self.mapping) if self.suffix in BAGS else self.mapping
+        text = mapping if isinstance(mapping, str) else yaml.safe_dump(mapping, sort_keys=False)
         (folder / "mapping.yaml").write_text(text.replace(".npz", f".{self.suffix}"), encoding="utf-8")
         for stem, columns in self.logs.items():
             save(folder / f"{stem}.{self.suffix}", columns)
@@ -103,6 +108,17 @@ class Case:
         for name, edit in self.edits.items():
             (folder / name).write_bytes(edit((folder / name).read_bytes()))
         return folder / "mapping.yaml"
+
+
+def in_bags(value: Any, column: bool = False) -> Any:
+    """A mapping's data with the columns' names that the reader of bags gives; a text stays."""
+    if isinstance(value, dict):
+        return {k: in_bags(v, k in ("column", "columns", "mask")) for k, v in value.items()}
+    if isinstance(value, list):
+        return [in_bags(v, column) for v in value]
+    if not (column and isinstance(value, str)):
+        return value
+    return f"{TOPIC}.time" if value == "t" else f"{TOPIC}.position[{value}]"
 
 
 def save(path: Path, columns: dict[str, np.ndarray]) -> None:
@@ -121,6 +137,8 @@ def _save(path: Path, columns: dict[str, np.ndarray]) -> None:
         import scipy.io
 
         scipy.io.savemat(path, {k[:31]: v for k, v in columns.items() if k.isidentifier()})
+    elif path.suffix[1:] in BAGS:
+        _save_bag(path, columns)
     else:
         import pandas as pd
 
@@ -128,6 +146,34 @@ def _save(path: Path, columns: dict[str, np.ndarray]) -> None:
             {k: pd.Series(list(v) if np.ndim(v) > 1 else np.atleast_1d(v)) for k, v in columns.items()}
         )
         frame.to_csv(path, index=False) if path.suffix == ".csv" else frame.to_parquet(path)
+
+
+def _save_bag(path: Path, columns: dict[str, np.ndarray]) -> None:
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)
+    of, names = store.types, [k for k in columns if k != "t"]
+    rows = np.stack([np.asarray(columns[k], float) for k in names], 1)
+    stamps = [int(s) for s in np.round(1e9 * np.asarray(columns["t"], float))]
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made) / "bag"
+        old = path.suffix == ".bag"
+        writer = Writer1(path) if old else Writer2(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+        with writer as bag:
+            kind, rest = "sensor_msgs/msg/JointState", {"velocity": np.zeros(0), "effort": np.zeros(0)}
+            connection = bag.add_connection(TOPIC, kind, typestore=store)
+            for at, row in zip(stamps, rows, strict=True):
+                stamp = of["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
+                count = {"seq": 0} if old else {}
+                header = of["std_msgs/msg/Header"](stamp=stamp, frame_id="", **count)
+                message = of[kind](header=header, name=names, position=row, **rest)
+                content = store.serialize_ros1(message, kind) if old else store.serialize_cdr(message, kind)
+                bag.write(connection, at, content)
+        if not old:
+            path.write_bytes(next(folder.glob("*.mcap")).read_bytes())
 
 
 def healthy(suffix: str = "npz") -> Case:
