@@ -157,7 +157,8 @@ def _save_bag(path: Path, columns: dict[str, np.ndarray]) -> None:
     store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)
     of, names = store.types, [k for k in columns if k != "t"]
     rows = np.stack([np.asarray(columns[k], float) for k in names], 1)
-    stamps = [int(s) for s in np.round(1e9 * np.asarray(columns["t"], float))]
+    with np.errstate(all="ignore"):  # what is no time of a bag ends in the next line
+        stamps = [int(s) for s in np.round(1e9 * np.asarray(columns["t"], float))]
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made) / "bag"
         old = path.suffix == ".bag"
