@@ -111,6 +111,8 @@ def ground(folder: Path, place: str, network: Network, batch: dict[str, torch.Te
     spread = axes[5].imshow(maps.std(0), origin="lower")
     axes[5].set_title(f"spread of {_MAPS} draws", fontsize=9)
     axes[5].set_axis_off()
+    for axis in axes:
+        axis.invert_xaxis()  # what lies to the left is shown there, as of the ground
     figure.colorbar(spread, ax=axes[5], label="[m]")
     return [*files, _saved(figure, folder / f"{place}_delta_e.png")]
 

@@ -180,6 +180,22 @@ def test_the_tables_print_what_there_is() -> None:
     assert "| JackalFlat_residuals_waves | delta_e: variogram score | 0.1250 ± 0.0004 |" in text
 
 
+def test_all_pictures_of_the_ground_show_the_left_on_the_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    from posteriors import plots
+
+    shown = {}
+    monkeypatch.setattr(plots, "maps_of", lambda *_: np.random.default_rng(0).normal(size=(24, 128, 128)))
+    monkeypatch.setattr(plots, "_saved", lambda figure, file: shown.setdefault(file.name, figure))
+    one = {k: torch.zeros(1, 128, 128) for k in ("map", "delta_e")}
+    plots.ground(tmp_path, "JackalRough", None, one)
+    assert set(shown) == {"JackalRough_ground.png", "JackalRough_delta_e.png"}
+    for figure, panels in zip(shown.values(), (3, 6), strict=True):
+        images = [a for a in figure.axes if a.get_title()]
+        assert [a.xaxis_inverted() for a in images] == [True] * panels
+        plots.plt.close(figure)
+
+
 def test_noise_is_drawn_anew_with_each_pass_and_the_same_for_a_seed() -> None:
     from posteriors.sets import Held
 
