@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from nfc_gym.adaptation.policy import Policy, load_policy
     from nfc_gym.adaptation.pretraining import pretrain
     from nfc_gym.adaptation.sight import Sight
+    from nfc_gym.adaptation.transforms import SplitPiH
 
 _HOME = {
     "AdaptConfig": "algorithm",
@@ -26,6 +27,7 @@ _HOME = {
     "Learned": "afterwards",
     "Policy": "policy",
     "Sight": "sight",
+    "SplitPiH": "transforms",
     "adapt": "algorithm",
     "hand_over": "handover",
     "learn_from_mission": "afterwards",
@@ -35,8 +37,8 @@ _HOME = {
     "sac_agent": "agent",
 }
 __all__ = [
-    "AdaptConfig", "Adapted", "Agent", "FineTuneConfig", "LearnConfig", "Learned", "Policy", "Sight", "adapt",
-    "hand_over", "learn_from_mission", "load_policy", "ppo_agent", "pretrain", "sac_agent",
+    "AdaptConfig", "Adapted", "Agent", "FineTuneConfig", "LearnConfig", "Learned", "Policy", "Sight", "SplitPiH",
+    "adapt", "hand_over", "learn_from_mission", "load_policy", "ppo_agent", "pretrain", "sac_agent",
 ]  # fmt: skip
 
 export(__name__, _HOME, "rl")
