@@ -47,6 +47,19 @@ def test_a_rover_learns_to_approach_its_goal(tmp_path: Path) -> None:
     assert (tmp_path / "jackal.safetensors.log" / "csv" / "scalars" / "return.csv").is_file()
 
 
+def test_curves_go_into_tensorboard_s_event_files_too(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    record = Record(tmp_path, None)
+    for step, value in ((0, 1.5), (4096, 2.5)):
+        record.scalars(step, {"return": value})
+    record._loggers[-1].experiment.flush()  # TensorBoard's writer does so every two minutes, and at the end
+    (written,) = (tmp_path / "tensorboard").rglob("events.out.tfevents.*")
+    events = EventAccumulator(str(written)).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("return")] == [(0, 1.5), (4096, 2.5)]
+    assert (tmp_path / "csv" / "scalars" / "return.csv").is_file()
+
+
 def test_a_policy_acts_the_same_from_its_file_and_through_torchrl(jackal: Path) -> None:
     policy = load_policy(jackal)
     env, plain = gym.make("nfc_gym/JackalFlat-v0"), gym.make("nfc_gym/JackalFlat-v0", context=[])
