@@ -101,6 +101,12 @@ def paired(cells: Cells, place: str, one: str, other: str, rng: np.random.Genera
     return bootstrap([first[k] - second[k] for k in first if k in second], rng)
 
 
+def _gained(cells: Cells, place: str, rng: np.random.Generator) -> Interval:
+    """Mean return that NFC adds to the unadapted policy's, episode by episode; it wants no oracle."""
+    after, before = (cells.of("II", place, m) for m in ("nfc", "unadapted"))
+    return bootstrap([np.subtract(after[k].returns, before[k].returns) for k in after if k in before], rng)
+
+
 def recovered(cells: Cells, place: str, method: str) -> dict[World, float]:
     """Share of (oracle - unadapted) that a method brought back, in each world by itself: what was lost differs.
 
@@ -191,6 +197,10 @@ def _contributions(cells: Cells, place: str, rng: np.random.Generator) -> str:
         value = paired(cells, place, "nfc", other, rng)
         if value.value == value.value:
             out.append(f"- w/ NFC minus {METHODS[other].title}: {shown(value)}")
+    gain = _gained(cells, place, rng)
+    if gain.value == gain.value:
+        out.append(f"- w/ NFC minus {METHODS['unadapted'].title}, return: {shown(gain, 1)}")
+    out += _alarms(cells, "II", place)
     rose = [v["oracle"]["notes"].get("levelled") for k, v in cells.found.items()
             if k[:2] == ("II", place) and "notes" in v.get("oracle", {})]  # fmt: skip
     if rose:
@@ -200,6 +210,18 @@ def _contributions(cells: Cells, place: str, rng: np.random.Generator) -> str:
     return "\n".join(out) + ("\n" if out else "")
 
 
+def _alarms(cells: Cells, table: str, place: str) -> list[str]:
+    """How often something was anomalous, and in how many cells it never was: there the policy was not touched."""
+    found = [v["nfc"]["notes"] for k, v in cells.found.items()
+             if k[:2] == (table, place) and "anomalies" in v.get("nfc", {}).get("notes", {})]  # fmt: skip
+    if not found:
+        return []
+    alarmed, executed = (sum(n) for n in zip(*((n["anomalies"], len(n["history"])) for n in found), strict=True))
+    untouched = sum(n["anomalies"] == 0 for n in found)
+    return [f"- w/ NFC {alarmed} of {executed} trajectories were anomalous; in {untouched} of {len(found)} cells none, "
+            "and the policy was not touched"]  # fmt: skip
+
+
 def table_three(cells: Cells, methods: Iterable[str], rng: np.random.Generator) -> tuple[str, list[dict[str, Any]]]:
     """Text and figures of Table III; a ground's scenarios are taken together, as the paper does."""
     rows, found = [], []
@@ -207,7 +229,7 @@ def table_three(cells: Cells, methods: Iterable[str], rng: np.random.Generator) 
         for place in cells.places("III"):
             ground, own = place.removeprefix("Jackal"), cells.of("III", place, name)
             why = cells.missing("III", place, name)
-            row = [METHODS[name].title, ground, str(sum(len(e.returns) for e in own.values())), _by_scenario(own)]
+            row = [METHODS[name].title, ground, _by_scenario(own)]
             for key, words in paper.FIGURES.items():
                 value = bootstrap([np.array(getattr(e, key), float) for e in own.values()], rng)
                 theirs = paper.drive_of(name, ground, key)
@@ -224,17 +246,20 @@ def table_three(cells: Cells, methods: Iterable[str], rng: np.random.Generator) 
             rows.append(row)
     if not rows:
         return "", []
-    head = ["", "ground", "episodes", "success by scenario", *(f"{words}: ours / the paper's" for words in
+    said = [f"{line} ({place})" for place in cells.places("III") for line in _alarms(cells, "III", place)]
+    head = ["", "ground", "success by scenario (episodes)", *(f"{words}: ours / the paper's" for words in
             paper.FIGURES.values()), RATE]  # fmt: skip
-    return f"## Table III: the Jackal's broken axle, figure of eight\n\n{lines(head, rows)}\n", found
+    return f"## Table III: the Jackal's broken axle, figure of eight\n\n{lines(head, rows)}\n" + "\n".join(
+        [*said, ""]
+    ), found
 
 
 def _by_scenario(own: dict[Key, Episodes]) -> str:
-    """Success in each scenario, over its seeds: rows of a ground need not be of the same scenarios."""
+    """Success and episodes in each scenario, over its seeds: rows of a ground need not be of the same scenarios."""
     found: dict[str, list[float]] = {}
     for key, episodes in own.items():
         found.setdefault(key[2], []).extend(episodes.success)
-    return ", ".join(f"{scenario} {np.mean(each):.2f}" for scenario, each in found.items()) or "-"
+    return ", ".join(f"{scenario} {np.mean(each):.2f} ({len(each)})" for scenario, each in found.items()) or "-"
 
 
 def _plain(value: float) -> Interval:

@@ -187,7 +187,25 @@ def test_the_paper_s_figures_are_goals_of_nfc_alone() -> None:
     assert [(r["goal"], r["holds"]) for r in rows] == [(">= 0.72", True), ("<= 2.1", True), ("<= 3.19", True),
                                                        ("<= 6.26", True)]  # fmt: skip
     assert paper.GOALS["orientation_jerk", "Flat"] == 2.98
-    assert "axle 1.00, axle+mud 1.00" in text
+    assert "| axle 1.00 (2), axle+mud 1.00 (2) |" in text
+
+
+def test_alarms_are_counted_and_what_nfc_adds_needs_no_oracle() -> None:
+    pytest.importorskip("torch", reason="methods learn with torch")
+    from worlds import tables
+
+    cells = tables.Cells()
+    for seed, anomalies in ((0, 0), (1, 2)):
+        notes = {"anomalies": anomalies, "history": [{}] * 5}
+        key = ("II", "AntFlat", "nominal", 7, seed)
+        cells.add(key, "unadapted", cell([100.0, 200.0]))
+        cells.add(key, "nfc", cell([100.0, 200.0]) | {"notes": notes})
+    text, _ = tables.table_two(cells, ["unadapted", "nfc"], np.random.default_rng(0))
+    assert "- w/ NFC 2 of 10 trajectories were anomalous; in 1 of 2 cells none" in text
+    assert "- w/ NFC minus PPO, unadapted, return: 0.0 [0.0, 0.0]" in text
+    cells.add(("III", "JackalFlat", "axle", 7, 0), "nfc", cell([1.0]) | {"notes": {"anomalies": 1, "history": [{}]}})
+    text, _ = tables.table_three(cells, ["nfc"], np.random.default_rng(0))
+    assert "1 of 1 trajectories were anomalous; in 0 of 1 cells none" in text
 
 
 def test_control_rates_stand_beside_the_paper_s() -> None:
