@@ -5,7 +5,7 @@ wrapper (`RandomizePsi`). It is written through the options of a reset, which To
 Transforms, and where a vector environment resets within a step, no Transform is asked.
 """
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -48,8 +48,8 @@ class SplitPiH(Transform):
         if not isinstance(wide, Bounded) or wide.shape[-1] <= self.own:
             raise InputError(f"SplitPiH: own is {self.own}, and the environment's action is {wide}; want a box with "
                              "pi_h behind the robot's own entries, as Hallucinate makes it")  # fmt: skip
-        found = action_spec.clone()
+        found, box = action_spec.clone(), cast(Any, wide.space)
         for key, part in ((ACTION, slice(None, self.own)), (self.key, slice(self.own, None))):
-            low, high = (bound[..., part] for bound in (wide.space.low, wide.space.high))
+            low, high = (bound[..., part] for bound in (box.low, box.high))
             found[key] = Bounded(low, high, low.shape, dtype=wide.dtype, device=wide.device)
         return found
