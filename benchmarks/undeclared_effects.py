@@ -63,12 +63,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    families = sorted({f for r in ROBOTS.values() for f in r.kinds})
+    families = sorted({f for r in ROBOTS.values() for f in r.named})
+    wider = sorted({f for r in ROBOTS.values() for f in r.wider})
     add = parser.add_argument
     add("--quick", action="store_true", help="one tiny trial a robot, with one or two families in the contest")
     add("--robots", nargs="+", type=str.lower, choices=list(ROBOTS), help="default all; with --quick the Quadcopter")
     add("--trials", "--seeds", type=count(0), default=1, help="machines of each single effect, a robot (default 1)")
-    add("--effects", nargs="+", choices=families, metavar="FAMILY", help="only these single effects")
+    some = parser.add_mutually_exclusive_group().add_argument
+    some("--effects", nargs="+", choices=families, metavar="FAMILY", help="only these single effects, usual or wider")
+    some("--wider", action="store_true", help=f"the single effects that are not usual: {', '.join(wider)}")
     add("--pairs", type=count(0), default=0, help="machines with two effects, a robot")
     add("--outside", type=count(0), default=0, help="machines of each effect outside the library, a robot")
     add("--nulls", type=count(0), default=0, help="machines without any effect, a robot")
@@ -119,7 +122,7 @@ def planned(args: argparse.Namespace, seed: int) -> list[Task]:
         return plan.quick(args.robots or ("quadcopter",), seed)
     lanes = []
     for robot in args.robots or ROBOTS:
-        singles = list(plan.singles(robot, args.effects or (), args.trials, seed))
+        singles = list(plan.singles(robot, args.effects or (), args.trials, seed, args.wider))
         pairs = list(plan.pairs(robot, args.pairs, seed))
         lanes.append(plan.woven([singles, pairs, *plan.others(robot, args.outside, args.nulls, seed)]))
     return plan.with_baselines(plan.woven(lanes), args.baselines)

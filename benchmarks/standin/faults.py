@@ -205,6 +205,24 @@ class ComShift(Hidden):
         spec.body(self.where[0]).ipos = spec.body(self.where[0]).ipos + [self.parameters[axis] for axis in "xyz"]
 
 
+class Inertia(Hidden):
+    """A body's mass is spread otherwise: its second moments about its centre are (3,) times what they were."""
+
+    family = "inertia"
+
+    def __init__(self, body: str, spread: Array) -> None:
+        super().__init__((body,), {}, f"{body}'s mass is spread by {', '.join(f'{s:.3g}' for s in spread)}")
+        self.spread = spread
+
+    def shape(self, spec: mujoco.MjSpec) -> None:
+        body = spec.body(self.where[0])
+        moments = np.array(body.inertia)
+        second = moments.sum() / 2 - moments  # of mass along each axis; a moment of inertia is the sum of the others
+        grown = self.spread * second
+        body.inertia = grown.sum() - grown
+        self.parameters = dict(zip("xyz", map(float, body.inertia / moments), strict=True))
+
+
 class Bias(Hidden):
     """A sensor reports a constant too much: one number, or one for each of three axes."""
 

@@ -42,10 +42,12 @@ def seed_of(master: int, *names: object) -> int:
     return int(np.random.SeedSequence([master, zlib.crc32(" ".join(map(str, names)).encode())]).generate_state(1)[0])
 
 
-def singles(robot: str, families: Sequence[str], trials: int, master: int) -> Iterator[Task]:
-    """`trials` of every family of the robot, or of those given."""
+def singles(robot: str, families: Sequence[str], trials: int, master: int, wider: bool = False) -> Iterator[Task]:
+    """`trials` of every usual family of the robot, or of every further one (`wider`), or of those given."""
+    kit = ROBOTS[robot]
+    chosen = kit.named if families else kit.wider if wider else kit.kinds
     for i in range(trials):
-        for family in ROBOTS[robot].kinds:
+        for family in chosen:
             if not families or family in families:
                 yield Task(robot, "single", (family,), seed_of(master, robot, family, i))
 

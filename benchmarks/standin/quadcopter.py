@@ -16,6 +16,7 @@ PSI = {"base_mass": 0.6, "arm_mass": 0.1, "mount_stiffness": 4.0}
 _AT = 0.12  # m, a rotor's x and y
 _YAW = 0.016  # N m for each N, the rotors' reaction torque
 _MAX = 4.905  # N
+_BEFORE = 200  # samples from the start of the flight to that of the log
 _X, _Y = _AT * np.array([1, 1, -1, -1]), _AT * np.array([1, -1, 1, -1])
 _SPIN = _YAW * np.array([-1, 1, 1, -1])
 
@@ -37,8 +38,8 @@ def build(machine: Machine) -> mujoco.MjModel:
 class Pilot:
     """Position loop over an attitude loop over a mixer, with gains for a 1 kg machine; it knows nothing of psi."""
 
-    def __init__(self, rng: np.random.Generator, time: Array) -> None:
-        self.wish = np.stack([excitation(rng, time, s) for s in (1.2, 1.2, 0.6)], 1) + np.array([0.0, 0.0, 3.0])
+    def __init__(self, rng: np.random.Generator, time: Array, height: float = 3.0, climb: float = 0.6) -> None:
+        self.wish = np.stack([excitation(rng, time, s) for s in (1.2, 1.2, climb)], 1) + np.array([0.0, 0.0, height])
         self.heading = excitation(rng, time, 0.8)
         self.dither = np.stack([0.08 * excitation(rng, 4 * time, 1.0) for _ in ROTORS], 1)
 
@@ -61,21 +62,29 @@ class Pilot:
         return np.clip(mix + self.dither[i], 0.1, _MAX)
 
 
-def fly(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
-    """One log: columns by name, (T,) each, at 100 Hz; thrusts as commanded, the battery's volts, and noisy motion."""
+def fly_low(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
+    """A log as `fly` makes it, half a metre above the ground."""
+    return fly(machine, seconds, seed, 0.5, 0.2)
+
+
+def fly(machine: Machine, seconds: float, seed: int, height: float = 3.0, climb: float = 0.6) -> dict[str, Array]:
+    """One log: columns by name, (T,) each, at 100 Hz; thrusts as commanded, the battery's volts, and noisy motion.
+
+    The base flies at `height`, m, up and down by about `climb`.
+    """
     rng = np.random.default_rng(seed)
     model = build(machine)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    data.qpos[2] = 3.0
+    data.qpos[2], data.time = height, -_BEFORE * SAMPLE
     hidden = machine.hidden
     hidden.begin(model)
     sags = [p for p in parts(hidden) if isinstance(p, Sag)]
     time = np.arange(0, seconds, SAMPLE)
-    pilot = Pilot(rng, time)
+    pilot = Pilot(rng, time, height, climb)
     volts = VOLTS + 0.6 * (1 - 2 * time / seconds) + 0.15 * excitation(rng, time, 1.0)
     qpos, qvel, sent = np.zeros((len(time), model.nq)), np.zeros((len(time), model.nv)), np.zeros((len(time), 4))
-    for k in range(-200, len(time)):
+    for k in range(-_BEFORE, len(time)):
         u = pilot.fly(k, data.qpos, data.qvel)
         if k >= 0:
             qpos[k], qvel[k], sent[k] = data.qpos, data.qvel, u

@@ -102,7 +102,7 @@ def _singles(out: Summary, robot: str, rows: Sequence[Row]) -> None:
     for low, high in BINS:
         part = [r for r in rows if low <= r.ratio < high]
         out.share(f"{robot}: named right, X/X_null {low:g} to {high:g}", len(_right(part)), len(part), part)
-    for family in ROBOTS[robot].kinds:
+    for family in ROBOTS[robot].named:
         part = [r for r in rows if r.families == [family]]
         out.share(f"{robot}: named right, {family}", len(_right(part)), len(part), part)
     wrong = [r for r in rows if r.outcome == "wrong"]

@@ -47,7 +47,7 @@ class Case:
 def prepared(task: Task, folder: Path) -> Case:
     """Draw the machine of a trial and write its logs and mapping into an empty folder."""
     rng = np.random.default_rng(task.seed)
-    kit = ROBOTS[task.robot]
+    kit = ROBOTS[task.robot].showing(task.families)
     psi = draw_psi(kit.psi, rng)
     row = Row(task.robot, task.group, list(task.families), task.seed)
     hidden, outside = _hide(row, task, kit, psi, rng, folder / "sizing")
@@ -78,7 +78,7 @@ def _hide(
     row: Row, task: Task, kit: Robot, psi: dict[str, float], rng: np.random.Generator, folder: Path
 ) -> tuple[Hidden, Outside | None]:
     """What the machine hides, each effect sized alone; and how it is judged if the library has no law for it."""
-    table = kit.outside if task.group == "outside" else kit.kinds
+    table = kit.outside if task.group == "outside" else kit.named
     found, ratios = [], []
     for family in task.families:
         for _ in range(_PLACES):

@@ -142,7 +142,7 @@ def run(
     settle: float = 1.0,
 ) -> tuple[Array, Array]:
     """True states (T, nq), (T, nv) before each new command; a second at rest comes first and is not logged."""
-    each = round(SAMPLE / STEP)
+    each = round(SAMPLE / model.opt.timestep)
     rest = round(settle / SAMPLE)
     qpos, qvel = np.zeros((samples, model.nq)), np.zeros((samples, model.nv))
     for k in range(-rest, samples):
