@@ -25,7 +25,7 @@ class Thermal(Hidden):
     """A motor heated by its winding: what it makes falls by a share `fade` of itself at the heat of a steady reference.
 
     dh/dt = ((F / reference)^2 - h) / time_constant, where F is the force that a cold motor would make of its command.
-    At the start it has idled at its first command.
+    Before the log, where the simulation's clock is below 0, it is as warm as if it had long gone on like that.
     """
 
     family = "thermal"
@@ -38,14 +38,11 @@ class Thermal(Hidden):
     def begin(self, model: mujoco.MjModel) -> None:
         self.model, self.id = model, model.actuator(self.where[0]).id
         self.gain, self.step = model.actuator_gainprm[self.id].copy(), model.opt.timestep
-        self.heat, self.left = -1.0, 1.0
+        self.heat, self.left = 0.0, 1.0
 
     def push(self, data: mujoco.MjData) -> None:
-        p = self.parameters
-        if self.heat < 0:
-            self.heat = (self.gain[0] * data.ctrl[self.id] / p["reference"]) ** 2
-        else:
-            cold = data.actuator_force[self.id] / self.left
-            self.heat += self.step / p["time_constant"] * ((cold / p["reference"]) ** 2 - self.heat)
+        p, cold = self.parameters, data.actuator_force[self.id] / self.left
+        share = self.step / p["time_constant"] if data.time >= 0 else 1.0
+        self.heat += share * ((cold / p["reference"]) ** 2 - self.heat)
         self.left = 1 - p["fade"] * self.heat
         self.model.actuator_gainprm[self.id] = self.left * self.gain

@@ -49,6 +49,7 @@ def walk(
     mujoco.mj_resetDataKeyframe(model, data, 0)
     hidden.begin(model)
     turns, before = round(seconds / CONTROL), round(rest / CONTROL)
+    data.time = -before * CONTROL
     each, often = round(CONTROL / model.opt.timestep), round(SAMPLE / model.opt.timestep)
     rows: list[tuple[Array, Array, Array]] = []
     for k in range(-before, turns):

@@ -65,7 +65,7 @@ def estimates(report: Report, hidden: Hidden) -> list[Estimate]:
             at = {claim["where"]} if isinstance(claim["where"], str) else set(claim["where"])
             if claim["family"] != truth.family or at != place:
                 continue
-            for name, true in truth.parameters.items():
+            for name, true in _alike(truth, claim["parameters"]).items():
                 found = claim["parameters"].get(name)  # an effect with values of its own at each place has other names
                 if found and found["high"] > found["low"] and not _fixed(found):
                     rest = (found["value"], found["low"], found["high"])
@@ -73,8 +73,18 @@ def estimates(report: Report, hidden: Hidden) -> list[Estimate]:
     return out
 
 
-def _fixed(found: Mapping[str, float]) -> bool:
+def _alike(truth: Hidden, told: Mapping[str, Mapping[str, float]]) -> Mapping[str, float]:
+    """True values in a claim's own terms: what a drive fades by is told at the claim's reference command."""
+    if truth.family != "thermal" or "reference" not in told:
+        return truth.parameters
+    share = told["reference"]["value"] / truth.parameters["reference"]
+    return {**truth.parameters, "fade": truth.parameters["fade"] * share**2}
+
+
+def _fixed(found: Mapping[str, Any]) -> bool:
     """Whether a parameter only names a reference: its bounds leave it a thousandth either way."""
+    if found.get("given"):
+        return True
     return found["high"] - found["low"] < 2.5e-3 * abs(found["value"]) and found["unit"] == "V"
 
 

@@ -78,9 +78,9 @@ def _spread(body: str, high: float) -> Kind:
     return Kind(make, 0.01, high, "1")
 
 
-def _fading(actuators: Sequence[str], reference: float) -> Kind:
+def _fading(actuators: Sequence[str], reference: float, high: float) -> Kind:
     make: Make = lambda rng, s: Thermal(_place(rng, actuators), s, float(rng.uniform(0.7, 3.0)), reference)  # noqa: E731
-    return Kind(make, 0.002, 0.6, "1")
+    return Kind(make, 0.01 * high, high, "1")
 
 
 def _one_way(joints: Sequence[str], low: float, high: float, drag: float) -> Kind:
@@ -112,7 +112,7 @@ def _patch(geoms: Sequence[str]) -> Kind:
 
 
 def _soft(geoms: Sequence[str], high: float) -> Kind:
-    make: Make = lambda rng, s: Compliance(geoms, s, float(rng.uniform(-0.3, 0.5)))  # noqa: E731
+    make: Make = lambda rng, s: Compliance(geoms, s, min(s, 1.0) * float(rng.uniform(-0.3, 0.5)))  # noqa: E731
     return Kind(make, 0.01, high, "1")
 
 
@@ -138,7 +138,7 @@ _ODOMETERS = [(f"joint:{w}_wheel:vel", (f"{w}_speed",)) for w in _W]
 _ENCODERS = [(f"joint:{j}:pos", (f"{j}_angle",)) for j in _SWING]
 
 QUADCOPTER: dict[str, Kind] = {
-    "thermal": _fading(_R, 2.45),
+    "thermal": _fading(_R, 2.45, 0.05),
     "inertia": _spread("base", 1.8),
     "gust": _gust("base"),
     "ground_effect": Moved(lambda rng, s: GroundEffect("base", s), 0.01, 0.5, "m", quadcopter.fly_low),
@@ -166,5 +166,5 @@ QUADRUPED: dict[str, Kind] = {
 }
 ANT: dict[str, Kind] = {
     "directional_friction": _one_way(_A, 0.02, 10.0, 0.3),
-    "thermal": _fading(_A, 0.5),
+    "thermal": _fading(_A, 0.5, 0.6),
 }

@@ -7,6 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from nfc_gym.measured.hidden import Hidden
+
 # How far up the range of sizes, in its logarithm, so that the effect shows by far.
 CASES = [
     ("quadcopter", f, 0.75) for f in ("supply_sag", "gain", "offset", "com_shift", "sensor_bias", "payload", "wind")
@@ -15,6 +17,10 @@ CASES += [("quadcopter", f, 0.9) for f in ("drag_linear", "drag_quadratic", "rot
 CASES += [("jackal", f, 0.75) for f in ("delay", "lag", "coulomb", "stribeck", "slip", "dead_zone", "loss")]
 CASES += [("jackal", "slope", 0.85), ("jackal", "external_force", 0.85), ("jackal", "armature", 0.95)]
 CASES += [("quadruped", "saturation", 0.75), ("quadruped", "damping_poly", 0.75), ("ant", "spring_offset", 0.75)]
+CASES += [("quadcopter", f, 0.75) for f in ("misalignment", "gust", "thermal", "inertia")]
+CASES += [("quadcopter", "ground_effect", 0.95), ("jackal", "sinkage", 0.8), ("jackal", "compliance", 0.9)]
+CASES += [("jackal", f, 0.8) for f in ("command_gain", "sensor_delay", "sensor_gain")]
+CASES += [("jackal", "directional_friction", 0.9)]
 
 
 @pytest.mark.parametrize(("robot", "family", "size"), CASES)
@@ -23,10 +29,10 @@ def test_the_package_explains_the_stand_in_to_its_noise_floor(
 ) -> None:
     """True effect and true psi in the package's model: X is about 1, while without the effect it is far from it."""
     case = import_module("standin.case")
-    kit = import_module("standin.robots").ROBOTS[robot]
+    kit = import_module("standin.robots").ROBOTS[robot].showing([family])
     rng = np.random.default_rng(7)
     psi = import_module("nfc_gym.measured.standin").draw_psi(kit.psi, rng)
-    kind = kit.kinds[family]
+    kind = kit.named[family]
     machine = case.Machine(psi, kind.make(rng, kind.low ** (1 - size) * kind.high**size))
     # Two segments a log, or one; a quadcopter's motors must have forgotten what came before the log.
     seconds = {"quadcopter": 1.3, "jackal": 0.9}.get(robot, 0.45)
@@ -118,7 +124,10 @@ def test_lift_grows_with_height_from_three_metres() -> None:
     np.testing.assert_allclose(lift.pull(data, np.zeros(3), np.zeros(3)), [0, 0, 0.6])
 
 
-@pytest.mark.parametrize("name", ["faults", "pushes", "outside", "legged", "quadruped", "ant", "quadcopter"])
+OWN = ("faults", "pushes", "outside", "legged", "quadruped", "ant", "quadcopter")
+
+
+@pytest.mark.parametrize("name", [*OWN, "air", "drives", "grounds", "joints", "play", "sensing", "wider"])
 def test_the_stand_ins_share_no_physics_with_the_package(name: str) -> None:
     text = Path(import_module(f"standin.{name}").__file__).read_text()
     assert "nfc_gym.physics" not in "".join(line for line in text.splitlines(True) if "import" in line)
@@ -147,3 +156,28 @@ def test_what_lies_outside_the_library_changes_the_motion(robot: str) -> None:
         log = kit.log(standin.Machine(kit.psi, hidden), 0.6, 1)
         assert np.isfinite(np.stack(list(log.values()))).all(), family
         assert any(np.abs(log[k] - bare[k]).max() > 1e-6 for k in bare), family
+
+
+@pytest.mark.parametrize("robot", ["quadcopter", "jackal", "quadruped", "ant"])
+def test_wider_effects_act_and_do_nothing_at_no_size(robot: str) -> None:
+    """With the same commands and noise, against the spread of each column."""
+    whole, standin = import_module("standin.robots").ROBOTS[robot], import_module("nfc_gym.measured.standin")
+
+    class Finer(Hidden):
+        """Play has a rotor of its own, and a step that suits it."""
+
+        def shape(self, spec: mujoco.MjSpec) -> None:
+            spec.option.timestep = import_module("standin.play").STEP
+
+    for family, kind in whole.wider.items():
+        kit, change = whole.showing([family]), {}
+        hidden = Finer() if family == "backlash" else Hidden()
+        bare = kit.log(standin.Machine(kit.psi, hidden), 0.6, 1)
+        for size in (kind.high, 1e-9 * kind.low):
+            log = kit.log(standin.Machine(kit.psi, kind.make(np.random.default_rng(3), size)), 0.6, 1)
+            assert np.isfinite(np.stack(list(log.values()))).all(), family
+            change[size] = max(np.sqrt(((log[k] - bare[k]) ** 2).mean()) / (np.std(bare[k]) + 1e-3) for k in bare)
+        acts, none = change.values()
+        assert acts > 0.05, family
+        # A rotor tied to its joint rounds otherwise, and touch-downs differ as by a step of two fifths: by 5 %.
+        assert none < (0.08 if family == "backlash" else 1e-5), (family, none)

@@ -59,6 +59,34 @@ def test_every_robot_has_at_least_twelve_effects_and_each_is_tried_as_often() ->
     assert sorted(families) == sorted([(f,) for f in robots["ant"].kinds] * 3)
 
 
+def test_wider_effects_are_tried_where_they_are_asked_for_alone() -> None:
+    robots = modules().robots.ROBOTS
+    assert not any(set(r.kinds) & set(r.wider) for r in robots.values())
+    wider = [(t.robot, t.group, *t.families) for t in tasks("--wider", "--trials", "2")]
+    assert sorted(wider) == sorted([(r, "single", f) for r in ("jackal", "ant") for f in robots[r].wider] * 2)
+    assert {(t.robot, *t.families) for t in tasks("--effects", "thermal", "lag")} == {
+        ("jackal", "lag"), ("ant", "lag"), ("ant", "thermal")
+    }  # fmt: skip
+    both = [*tasks("--trials", "2"), *tasks("--wider", "--trials", "2")]
+    assert len({t.seed for t in both}) == len(both)
+
+
+def test_a_motion_that_shows_the_effect_is_that_of_its_floor_too() -> None:
+    kit = modules().robots.ROBOTS["quadcopter"]
+    assert kit.showing(["thermal"]) is kit
+    standin = import_module("nfc_gym.measured.standin")
+    usual, low = (k.log(standin.Machine(k.psi), 0.3, 1)["z"] for k in (kit, kit.showing(["ground_effect"])))
+    assert usual.min() > 2.0
+    assert 0.2 < low.min() < low.max() < 1.0
+
+
+def test_a_fade_is_judged_at_the_reference_of_the_claim() -> None:
+    m = modules()
+    hot = import_module("standin.drives").Thermal("a", 0.1, 2.0, 2.0)
+    found = m.score.estimates(report(claim("thermal", "a", fade=(0.4, 0.3, 0.5), reference=(4.0, 3.0, 5.0))), hot)
+    assert [(e.name, pytest.approx(e.true)) for e in found] == [("thermal.fade", 0.4), ("thermal.reference", 2.0)]
+
+
 def test_pairs_are_of_two_kinds_and_repeat_with_the_seed() -> None:
     plan = modules().plan
     drawn = [t.families for t in plan.pairs("jackal", 30, 3)]
@@ -76,7 +104,7 @@ def test_the_baselines_run_in_a_share_of_single_effects() -> None:
 def test_excluded_families_are_those_that_a_mapping_knows() -> None:
     known = set(import_module("nfc_gym.measured.entries").FAMILIES)
     for robot in modules().robots.ROBOTS.values():
-        assert set(robot.kinds) <= known
+        assert set(robot.named) <= known
         assert all(set(k.exclude) | set(k.near) <= known for k in robot.outside.values())
 
 
