@@ -64,7 +64,7 @@ class Pilot:
 
 def fly_low(machine: Machine, seconds: float, seed: int) -> dict[str, Array]:
     """A log as `fly` makes it, half a metre above the ground."""
-    return fly(machine, seconds, seed, 0.5, 0.2)
+    return fly(machine, seconds, seed, 0.5, 0.15)
 
 
 def fly(machine: Machine, seconds: float, seed: int, height: float = 3.0, climb: float = 0.6) -> dict[str, Array]:

@@ -141,7 +141,7 @@ QUADCOPTER: dict[str, Kind] = {
     "thermal": _fading(_R, 2.45, 0.05),
     "inertia": _spread("base", 1.8),
     "gust": _gust("base"),
-    "ground_effect": Moved(lambda rng, s: GroundEffect("base", s), 0.01, 0.5, "m", quadcopter.fly_low),
+    "ground_effect": Moved(lambda rng, s: GroundEffect("base", s), 0.01, 0.6, "m", quadcopter.fly_low),
     "sensor_gain": _scaled(_of_body("base", "linvel", "angvel@body"), 1e-3, 0.4),
     "sensor_delay": _late(_of_body("base", *_BODY), 0.1),
     "misalignment": _turned("base"),
