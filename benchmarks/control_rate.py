@@ -8,8 +8,8 @@ plain arrays), an anomaly monitor beside it, and a neural posterior that is give
 every control step, which is far more often than anybody needs it. Networks have the sizes that `nfc-gym train` makes;
 how well they are trained changes no time, so they hardly are. Rates are control steps over the time of a repeat's
 steps, medians of repeats that take turns; below each stands the slowest step. The control period of the environments is
-20 ms, 50 Hz. The replay is timed for robots whose observation is their state: Jackal and Quadcopter. The Humanoid, whose
-windows take the longest to simulate, is timed where --robots names it.
+20 ms, 50 Hz. The replay is timed for robots whose observation is their state: Jackal and Quadcopter. The Humanoid is
+timed where --robots names it, as its windows take the longest to simulate.
 torch runs on one thread, the replay's physics on --threads; `--clock cpu` counts processor time, as if each of them had
 a core, where other work runs beside it.
 """
