@@ -117,11 +117,15 @@ class Backlash(Effect):
         own = self.drive.torque(ctx) / rotor
         pull = own - np.where(hit == 0, (v - before) / dt, 0.0)  # the rotor's acceleration as the joint sees it
         side, pull = np.sign(pull), np.abs(pull)
-        # speed and way towards the flank that the drive pushes, as the joint sees it
-        ahead, way = side * np.where(share > 0, 0.0, speed - v), np.maximum(half - side * place, 0.0)
+        # Its speed as the joint sees it: none where it pushed; where it hit, both went on with a speed that only the
+        # simulation knows, and the rotor's is told from what the joint's was.
+        apart = np.where(share > 0, 0.0, speed - np.where(hit == 0, v, before))
+        ahead, way = side * apart, np.maximum(half - side * place, 0.0)  # towards the flank that the drive pushes
         beyond = ahead**2 - 2 * pull * (2 * half - way)
-        back = (ahead < 0) & (beyond > 0)  # it hits the other flank first
-        kick = np.where(back, -np.sqrt(np.maximum(beyond, 0.0)), 0.0)
+        root = np.sqrt(np.maximum(beyond, 0.0))
+        until = 2 * (2 * half - way) / np.maximum(root - ahead, 1e-300)
+        back = (ahead < 0) & (beyond > 0) & (until < dt)  # it hits the other flank first
+        kick = np.where(back, -root, 0.0)
         ahead, way = np.where(back, 0.0, ahead), np.where(back, 2 * half, way)
         root = np.sqrt(ahead**2 + 2 * pull * way)  # speed with which it arrives
         sooner = 2 * way / np.where(ahead + root > 0, ahead + root, 1.0)
@@ -131,7 +135,7 @@ class Backlash(Effect):
         pushing = np.where(arrival < dt, 1 - arrival / dt, 0.0)
         kick = side * np.where(pushing > 0, kick + root, kick)
         # on its way through the step, or adrift where no force acts
-        drift = np.where(side == 0, speed - v, side * ahead)
+        drift = np.where(side == 0, apart, side * ahead)
         moved = np.where(back, -side * half, place) + dt * (drift + dt / 2 * side * pull)
         inside = np.minimum(np.maximum(moved, -half), half)
         stopped = (side == 0) & (moved != inside)
@@ -141,12 +145,13 @@ class Backlash(Effect):
         return np.where(met, side * half, inside), np.where(met, v, free), pushing, rotor * kick, np.array(v)
 
     def modulate(self, ctx: Context, theta: Array, fields: Mapping[str, Array]) -> None:
-        share = ctx.memory[2]
+        _, _, share, hit, _ = ctx.memory
         for name in self.MODULATES[:3]:
             fields[name][..., self.rows, :] *= share[..., None]
+        together = (share > 0) | (hit != 0)  # what is hit moves the rotor on, too
         armature = fields["dof_armature"]
         whole = armature[..., self.drive.v]
-        armature[..., self.drive.v] = whole - np.where(share > 0, 0.0, np.minimum(whole, self._rotor(ctx, theta)))
+        armature[..., self.drive.v] = np.where(together, whole, np.maximum(whole - self._rotor(ctx, theta), 0.0))
 
     def _rotor(self, ctx: Context, theta: Array) -> Array:
         """(..., n) kg m^2 or kg: inertia of the rotors as it shows at the joints."""
