@@ -28,6 +28,7 @@ class Thermal(Effect):
 
     family = "thermal"
     summary = "Drive fades as it warms up"
+    remark = "of a servo whose command is a speed, heat and fade are of that speed, as its current is not known"
     covers = ("loss", "gain")  # heat that hardly changes while the log lasts
     on_drive = True
     PARAMS = (
