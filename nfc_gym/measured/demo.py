@@ -246,6 +246,14 @@ def _show(console: Console, content: Mapping[str, Any], report: Mapping[str, Any
         "wrong": "[bold red]Wrong:[/bold red] what the loop claims is not what was hidden.",
         "missed": "[bold yellow]Missed:[/bold yellow] the loop claims nothing, though something was hidden.",
     }
+    hidden = f"{content['family']}:{'+'.join(content['where'])}"
+    among = len(claims) == 1 and hidden in (claims[0]["id"], *claims[0]["equivalents"])
+    if outcome == "wrong" and among:
+        alike = 1 + len(claims[0]["equivalents"])
+        words[outcome] = (
+            f"[bold red]Wrong:[/bold red] what was hidden is among {alike} effects that these logs cannot tell apart, "
+            "where two at most count as an answer."
+        )
     console.print(words[outcome])
     console.print(
         f"The report: {out / 'report' / 'report.html'}. The machine was simulated; on yours: "

@@ -77,6 +77,10 @@ def test_a_right_claim_is_told_from_a_wrong_one(tmp_path: Path, fake_loop: dict[
     assert demo(tmp_path / "b", draw=1)["outcome"] == "right"
     fake_loop["effects"] = [claim("backlash:somewhere")]
     assert demo(tmp_path / "c", draw=1)["outcome"] == "wrong"
+    console, hidden = Console(record=True, width=200), f"{first['family']}:{'+'.join(first['where'])}"
+    fake_loop["effects"] = [claim(hidden, "wind:base", "gust:base")]
+    assert demo(tmp_path / "e", console=console, draw=1)["outcome"] == "wrong"
+    assert "what was hidden is among 3 effects that these logs cannot tell apart" in console.export_text()
 
 
 def test_a_changed_envelope_voids_the_demo(tmp_path: Path, fake_loop: dict[str, Any]) -> None:
