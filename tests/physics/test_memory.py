@@ -174,7 +174,7 @@ def two_masses(force: np.ndarray, gap: float, rotor: float) -> np.ndarray:
 
 @pytest.mark.parametrize("held", [7, 50])
 def test_backlash_is_two_masses_also_where_the_drive_turns_before_its_rotor_has_crossed(held: int) -> None:
-    """Impulses come within steps, so that speeds are compared in the mean; a wheel's once grew without end."""
+    """Impulses come within steps, so that speeds are compared in the mean."""
     rotor, gap, count = 0.3, 0.03, 2100
     effect, theta = make("backlash", "rail", {"gap": gap, "rotor": rotor})
     ctrl = np.repeat(np.random.default_rng(1).normal(size=count // held), held) * 5

@@ -122,10 +122,10 @@ class Backlash(Effect):
         apart = np.where(share > 0, 0.0, speed - np.where(hit == 0, v, before))
         ahead, way = side * apart, np.maximum(half - side * place, 0.0)  # towards the flank that the drive pushes
         beyond = ahead**2 - 2 * pull * (2 * half - way)
-        root = np.sqrt(np.maximum(beyond, 0.0))
-        until = 2 * (2 * half - way) / np.maximum(root - ahead, 1e-300)
+        behind = np.sqrt(np.maximum(beyond, 0.0))  # speed with which it comes to the other flank
+        until = 2 * (2 * half - way) / np.maximum(behind - ahead, 1e-300)
         back = (ahead < 0) & (beyond > 0) & (until < dt)  # it hits the other flank first
-        kick = np.where(back, -root, 0.0)
+        kick = np.where(back, -behind, 0.0)
         ahead, way = np.where(back, 0.0, ahead), np.where(back, 2 * half, way)
         root = np.sqrt(ahead**2 + 2 * pull * way)  # speed with which it arrives
         sooner = 2 * way / np.where(ahead + root > 0, ahead + root, 1.0)
