@@ -2,11 +2,12 @@
 
     python benchmarks/inference.py [--quick] [--tasks linear_gaussian two_moons slcp] [--densities score mixture flow]
                                    [--seeds 0 1 2] [--simulations N] [--observations N] [--samples N] [--json FILE]
-                                   [--no-latency] [--steps] [--clock wall|cpu] [--device cpu|cuda]
+                                   [--no-mirror] [--no-latency] [--steps] [--clock wall|cpu] [--device cpu|cuda]
 
 C2ST is the accuracy of a classifier between posterior draws and exact ones, 0.5 being perfect; its baseline column is
 the same classifier between two sets of exact draws. Every seed is a network and simulations of its own,
-and judged on the same observations, drawn from the prior predictive. `--quick` ends within a minute and says little.
+and judged on the same observations, drawn from the prior predictive. SLCP's four draws are shown in other orders in
+each pass, as windows of robots are in mirrors, but with `--no-mirror`. `--quick` ends within a minute and says little.
 """
 
 import argparse
@@ -34,6 +35,7 @@ from nfc_gym.inference.network import Network
 from nfc_gym.inference.posterior import NeuralPosterior, Window
 from nfc_gym.inference.progress import Quiet, Spoken, quiet
 from nfc_gym.inference.random import mixed
+from nfc_gym.inference.reflection import Reflection
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import TrainConfig, train
 
@@ -59,14 +61,17 @@ def seen(x: Array) -> Window:
     return Window(x[None], np.zeros((0, 0)))
 
 
-def posterior_of(task: Task, density: str, linear: bool, n: int, epochs: int, seed: int) -> NeuralPosterior:
-    """A network trained on `n` simulations, a twentieth of them held out."""
+def posterior_of(
+    task: Task, density: str, linear: bool, n: int, epochs: int, seed: int, mirrored: bool = False
+) -> NeuralPosterior:
+    """A network trained on `n` simulations, in the task's mirrors too or not, a twentieth of them held out."""
     every = windows_of(task, n, seed)
     config = NetworkConfig(**{**NETWORK.to_dict(), "density": density, "linear": linear})
     network = Network(config, Sizes.of(every.tensors), task.box, seed)
     training = TrainConfig(**{**asdict(TRAINING), "seed": seed, "epochs": epochs})
     report = Spoken() if sys.stderr.isatty() else quiet
-    outcome = train(network, *every.split(0.05), training, report=report)
+    mirror = Reflection(task.mirrors) if mirrored and task.mirrors else None
+    outcome = train(network, *every.split(0.05), training, report=report, mirror=mirror)
     print(f"{task.name}: {density}, seed {seed}: {outcome.stopped} after {len(outcome.train)} epochs, "
           f"best {outcome.best}, {outcome.seconds:.0f} s", flush=True)  # fmt: skip
     return NeuralPosterior(network)
@@ -80,15 +85,16 @@ def known(table: Table, task: Task, density: str, linear: bool, args: argparse.N
     floor = statistics.mean(
         c2st(a, task.posterior(x, args.samples, rng)) for a, x in zip(exact[:2], observed, strict=False)
     )
-    name = f"{task.name}, {density}{' on the linear base' if linear else ''}, {args.simulations} simulations"
+    how = f"{' on the linear base' if linear else ''}{', in mirrors' if args.mirror and task.mirrors else ''}"
+    name = f"{task.name}, {density}{how}, {args.simulations} simulations"
     scores, misses = [], []
     for seed in args.seeds:
-        posterior = posterior_of(task, density, linear, args.simulations, args.epochs, seed)
+        posterior = posterior_of(task, density, linear, args.simulations, args.epochs, seed, args.mirror)
         each, wrong = [], []
         for x, truth in zip(observed, exact, strict=True):
             given = posterior.given(seen(x))
-            how = {"steps": STEPS} if density == "score" else {}
-            drawn = given.sample(args.samples, np.random.default_rng(seed), **how).psi
+            steps = {"steps": STEPS} if density == "score" else {}
+            drawn = given.sample(args.samples, np.random.default_rng(seed), **steps).psi
             each.append(c2st(truth, drawn))
             if isinstance(task, LinearGaussian):
                 away = given.log_prob(Fidelity(truth[:500])) - task.log_prob(truth[:500], x)
@@ -179,6 +185,8 @@ def main() -> None:
     add("--observations", type=count(1), default=10, help="that it is judged on (default %(default)s)")
     add("--samples", type=count(1), default=10_000,
         help="draws an observation, and as many exact ones (default %(default)s)")  # fmt: skip
+    add("--mirror", action=argparse.BooleanOptionalAction, default=True,
+        help="show simulations in the mirrors that a problem has")  # fmt: skip
     add("--epochs", type=count(1), default=TRAINING.epochs,
         help="passes over the simulations at most (default %(default)s)")  # fmt: skip
     add("--latency", action=argparse.BooleanOptionalAction, default=True, help="time a window of a Jackal's size too")

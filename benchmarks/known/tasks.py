@@ -4,6 +4,7 @@ Two moons and SLCP are those of the simulation-based inference benchmark (Lueckm
 written from its description. Each task says psi's box, simulates, and draws from the posterior of an observation.
 """
 
+from itertools import combinations
 from typing import Protocol
 
 import numpy as np
@@ -12,16 +13,24 @@ from scipy.special import ndtri
 from scipy.stats import multivariate_normal
 
 from nfc_gym.core.errors import InputError
+from nfc_gym.envs.mirror import Mirror, Signed
 from nfc_gym.inference.space import PriorBox
 
 Array = NDArray[np.float64]
 
 
 class Task(Protocol):
-    """One known problem."""
+    """One known problem.
+
+    Attributes:
+      name: of the problem.
+      box: of psi.
+      mirrors: in each of which a simulation is another one that is as likely, as those of robots are.
+    """
 
     name: str
     box: PriorBox
+    mirrors: tuple[Mirror, ...]
 
     def simulate(self, psi: Array, rng: np.random.Generator) -> Array:
         """Observations (n, k) of psi (n, d)."""
@@ -44,7 +53,7 @@ class LinearGaussian:
       size: of psi and of x.
     """
 
-    noise = 0.5
+    noise, mirrors = 0.5, ()
 
     def __init__(self, size: int) -> None:
         self.name, self.box = f"linear_gaussian_{size}", box(f"linear_gaussian_{size}", size, 0.0, 1.0)
@@ -77,7 +86,7 @@ class TwoMoons:
     Given the sign of p0 + p1, psi is a rotation of crescent - x: exact draws need no chain.
     """
 
-    name, box = "two_moons", box("two_moons", 2, -1.0, 1.0)
+    name, box, mirrors = "two_moons", box("two_moons", 2, -1.0, 1.0), ()
 
     @staticmethod
     def crescent(n: int, rng: np.random.Generator) -> Array:
@@ -102,6 +111,13 @@ class TwoMoons:
         return np.concatenate(found)[:n]
 
 
+def exchanged(first: int, second: int) -> Mirror:
+    """What SLCP's observation is after two of its four draws have changed places: psi is as likely as before."""
+    order, none = np.arange(8).reshape(4, 2), np.arange(0)
+    order[[first, second]] = order[[second, first]]
+    return Mirror(Signed(order.ravel(), np.ones(8)), Signed(none, np.ones(0)), np.arange(5))
+
+
 class SLCP:
     """Simple likelihood, complex posterior: four draws of a Gaussian with mean (p0, p1), spreads p2^2, p3^2, tanh p4.
 
@@ -110,6 +126,7 @@ class SLCP:
     """
 
     name, box = "slcp", box("slcp", 5, -3.0, 3.0)
+    mirrors = tuple(exchanged(i, j) for i, j in combinations(range(4), 2))  # one after another: any order of the four
     _CHUNK, _CHUNKS = 2_000_000, 10
 
     @staticmethod

@@ -52,3 +52,19 @@ def test_the_closed_form_is_normalised() -> None:
     x = task.simulate(np.full((1, 2), 0.3), rng)[0]
     everywhere = rng.uniform(size=(200_000, 2))  # the box has volume 1
     assert np.exp(task.log_prob(everywhere, x)).mean() == pytest.approx(1, rel=0.03)
+
+
+def test_slcp_is_as_likely_in_each_of_its_mirrors() -> None:
+    from known.tasks import SLCP
+
+    task, rng = SLCP(), np.random.default_rng(2)
+    psi = task.box.psi_of(rng.uniform(size=(1, 5)))
+    x = task.simulate(psi, rng)[0]
+    a, b, c = (float(s[0]) for s in task.spread(psi))
+    law = multivariate_normal(psi[0, :2], [[a * a, a * b * c], [a * b * c, b * b]], allow_singular=True)
+    assert len({tuple(mirror.states(np.arange(8.0))) for mirror in task.mirrors}) == 6
+    for mirror in task.mirrors:
+        np.testing.assert_array_equal(mirror.psi, np.arange(5))
+        seen = mirror.states(x)
+        assert not np.array_equal(seen, x)
+        assert law.logpdf(seen.reshape(4, 2)).sum() == pytest.approx(law.logpdf(x.reshape(4, 2)).sum())
