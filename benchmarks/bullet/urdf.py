@@ -1,7 +1,7 @@
 """A compiled MuJoCo model as URDF: links, joints, inertias and the shapes that collide."""
 
 from collections.abc import Sequence
-from xml.etree.ElementTree import Element, SubElement, tostring
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import mujoco
 import numpy as np
@@ -109,6 +109,7 @@ def to_urdf(model: mujoco.MjModel) -> str:
         _link(robot, model, body)
         if not free:
             _join(robot, model, body, list(range(first, first + count)))
+    indent(robot)  # Bullet reads by lines, and breaks one after 8191 characters wherever that is: within a number too
     return tostring(robot, encoding="unicode")
 
 

@@ -27,6 +27,16 @@ def test_urdf_keeps_masses_and_joints(name: str) -> None:
     assert moving == {model.joint(j).name for j in range(1, model.njnt)}
 
 
+def test_no_line_of_the_urdf_is_broken_where_bullet_reads_it() -> None:
+    from bullet.simulation import Simulation
+    from bullet.urdf import to_urdf
+    from worlds.world import World
+
+    model = World("QuadrupedFlat", "psi", 5, engine="bullet").machine.compile(0)
+    assert len(to_urdf(model)) > 8191 > max(map(len, to_urdf(model).splitlines()))
+    Simulation(model, None).close()
+
+
 @pytest.mark.parametrize("name", ["jackal", "quadcopter", "quadruped"])
 def test_a_state_comes_back_as_it_was_put(name: str) -> None:
     from bullet.simulation import Simulation
