@@ -1,8 +1,11 @@
 """Simulations of one robot, in this process or in others: PyBullet uses one core each."""
 
 import copy
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
-from multiprocessing import get_context
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import NamedTuple, Protocol
 
@@ -119,14 +122,20 @@ def _equal(one: Heightfield, other: Heightfield) -> bool:
 
 
 class Far:
-    """Simulations of another process."""
+    """Simulations of another process.
+
+    It is none of `multiprocessing`'s: a fork would take this process's threads and graphics card for its own, and what
+    is spawned imports the script that runs, with torch, before it begins.
+    """
 
     def __init__(self, task: Task) -> None:
-        context = get_context("spawn")  # a fork would take this process's threads for its own
-        self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, task), daemon=True)
-        self.process.start()
-        theirs.close()
+        self.pipe, theirs = Pipe()
+        with theirs:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "bullet.worker", str(theirs.fileno())], pass_fds=[theirs.fileno()],
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, stdout=subprocess.DEVNULL,
+            )  # fmt: skip
+        self.pipe.send(task)
 
     def put(self, i: int, ground: Heightfield | None, qpos: Array, qvel: Array) -> None:
         """See `Herd`."""
@@ -143,22 +152,19 @@ class Far:
 
     def close(self) -> None:
         """See `Herd`."""
-        if self.process.is_alive():
-            self.pipe.send(("close", ()))
-            self.process.join(5)
-        self.pipe.close()
+        self.pipe.close()  # at which it ends
+        self.process.wait()
 
 
-def _serve(pipe: Connection, task: Task) -> None:
-    """A worker's loop: what `end` returns is sent back."""
-    herd = Near(task)
+def serve(pipe: Connection) -> None:
+    """A worker's loop, until the other end is closed: a task comes first, and what `end` returns is sent back."""
+    herd = Near(pipe.recv())
     while True:
         try:
             name, args = pipe.recv()
         except (EOFError, KeyboardInterrupt):
-            name, args = "close", ()
+            herd.close()
+            return
         found = getattr(herd, name)(*args)
         if name == "end":
             pipe.send(found)
-        if name == "close":
-            return

@@ -117,6 +117,7 @@ def oracle(job: Job) -> "Learned":
     envs = true_world(job.world, budget.envs, budget, job.seed, **job.settings)
     choice = Choice(ppo_agent(policy), lambda: job.returns(policy))
     found = improve(policy, envs, lambda _: choice.judge(), budget, job.seed, budget.steps, choice.best)
+    envs.close()
     choice.take()
     found.notes["levelled"] = levelled(found.curve)
     return found

@@ -61,7 +61,10 @@ def seen_by(policy: Policy, world: World, num_envs: int, **settings: Any) -> Vec
 def play(policy: Policy, world: World, episodes: int, seed: int, **settings: Any) -> Episodes:
     """Episodes of a policy in a world, all at once."""
     env = seen_by(policy, world, episodes, **settings)
-    return judge(policy, env, seed, LAPS[world.robot] if settings.get("task") == "figure8" else None)
+    try:
+        return judge(policy, env, seed, LAPS[world.robot] if settings.get("task") == "figure8" else None)
+    finally:
+        env.close()
 
 
 def control_rate(policy: Policy, world: World, **settings: Any) -> float:

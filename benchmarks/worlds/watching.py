@@ -143,6 +143,7 @@ def watcher(policy: Policy, world: World, seed: int, steps: int = 750, **setting
     for k in range(ROUNDS):
         env = seen_by(policy, at_home, ROBOTS, **settings)
         robots += windows(policy, env, world.kind.proprio_size, seed + k * ROBOTS, steps)
+        env.close()
         if len(robots) >= 2 * wanted(RATE):
             break
     half = min(len(robots) // 2, ROBOTS // 2)

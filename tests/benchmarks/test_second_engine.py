@@ -156,4 +156,5 @@ def test_workers_change_nothing_but_the_time() -> None:
             env.step(np.tile([0.5, 0.2], (3, 1)))
         states.append(np.concatenate(env.unwrapped.state(), 1))
         env.close()
+        assert all(herd.process.returncode == 0 for herd in env.unwrapped._herds if workers > 1)
     assert np.array_equal(states[0], states[1])
