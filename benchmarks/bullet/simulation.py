@@ -20,6 +20,12 @@ DEAD = 0.05  # rad/s within which dry friction passes through zero
 FLOOR = 1.0  # friction of the ground: Bullet multiplies it with that of what touches it
 
 
+def _limits(limited: Array, ranges: Array) -> tuple[Array, Array]:
+    """(nu,) lower and (nu,) upper, infinite where there is none."""
+    low, high = np.where(limited.astype(bool), ranges.T, [[-np.inf], [np.inf]])
+    return low, high
+
+
 class Simulation:
     """A robot with everything that moves it.
 
@@ -50,7 +56,6 @@ class Simulation:
         self.dry = model.dof_frictionloss[dofs]
         self.stiffness = model.jnt_stiffness.reshape(model.njnt, -1)[self.joints, 0]
         self.rest = model.qpos_spring[[int(model.jnt_qposadr[j]) for j in self.joints]]
-        self.thrust = np.zeros(model.nu)
         self._drives(model)
         self._call("setJointMotorControlArray", self.robot, self.index, pybullet.VELOCITY_CONTROL,
                    forces=[0.0] * len(self.index))  # fmt: skip
@@ -116,6 +121,15 @@ class Simulation:
                 axes = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
                 gear = model.actuator_gear[a].reshape(2, 3) @ axes
                 self.at_site.append((a, link, (model.site_pos[target] - centre) @ axes, gear.ravel()))
+        # What `forces` asks for in every step; without a limit it is infinite.
+        self.moved, self.rows = [a for a, _ in self.at_joint], [k for _, k in self.at_joint]
+        self.gear, self.gain = model.actuator_gear[self.moved, 0], model.actuator_gainprm[:, 0].copy()
+        self.bias = model.actuator_biasprm[:, :3].T.copy()
+        self.commands = _limits(model.actuator_ctrllimited, model.actuator_ctrlrange)
+        self.strength = _limits(model.actuator_forcelimited, model.actuator_forcerange)
+        slow = model.actuator_dyntype != int(mujoco.mjtDyn.mjDYN_NONE)
+        self.follows = np.where(slow, 1 - np.exp(-STEP / np.where(slow, model.actuator_dynprm[:, 0], 1.0)), 1.0)
+        self.thrust = np.zeros(model.nu)
 
     # ---- state ----------------------------------------------------------------------------------------------------
 
@@ -170,28 +184,19 @@ class Simulation:
 
     def forces(self, ctrl: Array, q: Array, v: Array) -> Array:
         """What the actuators make of a command (nu,) while the joints are at q (k,) and v (k,): N or N m."""
-        model = self.model
-        moved = np.zeros((2, model.nu))
-        for a, k in self.at_joint:
-            moved[:, a] = q[k], v[k]
-        command = np.where(model.actuator_ctrllimited.astype(bool), np.clip(ctrl, *model.actuator_ctrlrange.T), ctrl)
-        slow = model.actuator_dyntype != int(mujoco.mjtDyn.mjDYN_NONE)
-        if slow.any():
-            constant = np.where(slow, model.actuator_dynprm[:, 0], 1.0)
-            self.thrust += (1 - np.exp(-STEP / constant)) * (command - self.thrust)
-            command = np.where(slow, self.thrust, command)
-        bias = model.actuator_biasprm
-        force = model.actuator_gainprm[:, 0] * command + bias[:, 0] + bias[:, 1] * moved[0] + bias[:, 2] * moved[1]
-        limited = model.actuator_forcelimited.astype(bool)
-        return np.where(limited, np.clip(force, *model.actuator_forcerange.T), force)
+        low, high = self.commands
+        self.thrust += self.follows * (np.minimum(np.maximum(ctrl, low), high) - self.thrust)
+        force = self.gain * self.thrust + self.bias[0]
+        force[self.moved] += self.bias[1, self.moved] * q[self.rows] + self.bias[2, self.moved] * v[self.rows]
+        low, high = self.strength
+        return np.minimum(np.maximum(force, low), high)
 
     def step(self, ctrl: Array) -> Array:
         """One step of `STEP`; returns the actuators' forces (nu,)."""
         q, v = self.hinges()
         force = self.forces(ctrl, q, v)
         torque = -self.damping * v - self.dry * np.tanh(v / DEAD) - self.stiffness * (q - self.rest)
-        for a, k in self.at_joint:
-            torque[k] += self.model.actuator_gear[a, 0] * force[a]
+        np.add.at(torque, self.rows, self.gear * force[self.moved])
         if self.index:
             self._call("setJointMotorControlArray", self.robot, self.index, pybullet.TORQUE_CONTROL,
                        forces=torque.tolist())  # fmt: skip
