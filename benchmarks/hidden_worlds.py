@@ -7,7 +7,8 @@
 A world counts where the policy loses at least 30 % of the return that it earns at home beyond a random policy's.
 Sizes are drawn from `--seed`, by default drawn itself and printed. `--find K` draws worlds of a scenario one after
 another until K count, and prints those that do not as well; what counts is measured again with other episodes and must
-count then too, since of many worlds some lose much by chance. `--out DIR` keeps every world's row and goes on there.
+count then too, since of many worlds some lose much by chance. A draw that the engine refuses is left out, and said.
+`--out DIR` keeps every world's row and goes on there.
 The paper's scenarios of the Jackal's axle are what is measured where none is named.
 """
 
@@ -91,6 +92,9 @@ def worlds(args: argparse.Namespace, kept: Kept | None, place: str, scenario: st
     found = 0
     for k in range(args.draws if args.find else args.worlds):
         world = World(place, scenario, args.seed + k, engine=args.engine)
+        if args.find and world.refused:
+            print(f"{world.name} is left out: {world.refused}", flush=True)
+            continue
 
         def row(world: World = world) -> dict[str, Any]:
             began = time.monotonic()

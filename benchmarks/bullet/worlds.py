@@ -27,6 +27,12 @@ WHEELS = {"jackal": {f"{end}_{side}_wheel": RADIUS for end in ("front", "rear") 
 ROBOTS = ("jackal", "quadcopter", "quadruped")
 
 
+def refusal(hidden: Hidden) -> str | None:
+    """Why an effect cannot be carried over; None where it can."""
+    return f"{hidden.text}: a force that asks MuJoCo for velocities is not in the second engine" \
+        if overrides(hidden, "push") else None  # fmt: skip
+
+
 class BulletVectorEnv(VectorEnv):
     """Robots of one kind, one simulation after another.
 
@@ -55,8 +61,8 @@ class BulletVectorEnv(VectorEnv):
     ) -> None:
         if robot.name not in ROBOTS:
             raise InputError(f"the {robot.name} is not in the second engine; there are: {', '.join(ROBOTS)}")
-        if overrides(hidden, "push"):
-            raise InputError(f"{hidden.text}: a force that asks MuJoCo for velocities is not in the second engine")
+        if why := refusal(hidden):
+            raise InputError(why)
         given = Settings.of(robot, settings)
         self.num_envs, self.rough, self.render_mode = num_envs, rough, None
         self.autoreset_mode = AutoresetMode(autoreset_mode)

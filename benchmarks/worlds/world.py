@@ -96,6 +96,15 @@ class World:
         """What is hidden. For judges, never for agents."""
         return draw(self.robot, self.scenario, nominal_space(self.kind), self.rng("truth"))
 
+    @property
+    def refused(self) -> str | None:
+        """Why the engine cannot have what is hidden; None where it can."""
+        if self.engine == "mujoco":
+            return None
+        from bullet.worlds import refusal
+
+        return refusal(self.truth.hidden)
+
     @cached_property
     def machine(self) -> type[Robot]:
         """The robot as it truly is."""

@@ -1,5 +1,6 @@
 """The second engine's robots against the MuJoCo models that they are made of, and against falling and rolling."""
 
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -158,3 +159,24 @@ def test_workers_change_nothing_but_the_time() -> None:
         env.close()
         assert all(herd.process.returncode == 0 for herd in env.unwrapped._herds if workers > 1)
     assert np.array_equal(states[0], states[1])
+
+
+def test_a_draw_that_it_refuses_is_left_out_of_a_search(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import hidden_worlds
+    from worlds.world import World
+
+    class Measured(Exception):
+        pass
+
+    def measure(policy: str, world: Any, *_: Any, **__: Any) -> None:
+        raise Measured(world.seed)
+
+    monkeypatch.setattr(hidden_worlds, "measure", measure)
+    refused = [World("QuadcopterFlat", "effect", seed, engine="bullet").refused for seed in range(30)]
+    first = next(k for k in range(30) if refused[k] and not refused[k + 1])
+    asked = ["--engine", "bullet", "--places", "QuadcopterFlat", "--find", "1", "--seed", str(first)]
+    with pytest.raises(Measured, match=str(first + 1)):
+        next(hidden_worlds.worlds(hidden_worlds.parse(asked), None, "QuadcopterFlat", "effect"))
+    assert f"QuadcopterFlat_effect_{first}_bullet is left out: {refused[first]}" in capsys.readouterr().out
