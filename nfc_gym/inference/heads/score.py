@@ -148,7 +148,7 @@ class Score(Density):
         return on
 
     def sample(
-        self, n: int, features: Tensor, blocks: int | None = None, *, steps: int = 12, stochastic: bool = False
+        self, n: int, features: Tensor, blocks: int | None = None, *, steps: int = 10, stochastic: bool = False
     ) -> Tensor:  # fmt: skip
         """(B, n, width) draws by the ODE, or by the reverse SDE in ten times the steps."""
         out = []

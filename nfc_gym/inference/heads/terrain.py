@@ -63,7 +63,7 @@ class Terrain(nn.Module):
         return _mean_square(away[0]) + _mean_square(away[1]) + _mean_square(self.waves.colour(away[1]))
 
     def sample(
-        self, n: int, features: Tensor, elevation: Tensor, score: Score, *, steps: int = 12, stochastic: bool = False
+        self, n: int, features: Tensor, elevation: Tensor, score: Score, *, steps: int = 10, stochastic: bool = False
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Draws (n, D) of y and (n, 128, 128) of maps [m] given a window: features (1, F), elevation (1, 128, 128)."""
         d = score.width(None)
