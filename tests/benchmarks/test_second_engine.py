@@ -1,5 +1,8 @@
 """The second engine's robots against the MuJoCo models that they are made of, and against falling and rolling."""
 
+import os
+import subprocess
+import sys
 from typing import Any
 from xml.etree import ElementTree
 
@@ -180,3 +183,9 @@ def test_a_draw_that_it_refuses_is_left_out_of_a_search(
     with pytest.raises(Measured, match=str(first + 1)):
         next(hidden_worlds.worlds(hidden_worlds.parse(asked), None, "QuadcopterFlat", "effect"))
     assert f"QuadcopterFlat_effect_{first}_bullet is left out: {refused[first]}" in capsys.readouterr().out
+
+
+def test_a_worker_loads_no_torch() -> None:
+    asked = "import sys, bullet.worker; sys.exit('torch' in sys.modules)"
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", asked], env=env, check=True)
