@@ -20,7 +20,7 @@ CASES += [("quadruped", "saturation", 0.75), ("quadruped", "damping_poly", 0.75)
 CASES += [("quadcopter", f, 0.75) for f in ("misalignment", "gust", "thermal", "inertia")]
 CASES += [("quadcopter", "ground_effect", 0.95), ("jackal", "sinkage", 0.8), ("jackal", "compliance", 0.9)]
 CASES += [("jackal", f, 0.8) for f in ("command_gain", "sensor_delay", "sensor_gain")]
-CASES += [("jackal", "directional_friction", 0.9)]
+CASES += [("jackal", "directional_friction", 0.9), ("jackal", "backlash", 0.7)]
 
 
 @pytest.mark.parametrize(("robot", "family", "size"), CASES)
@@ -43,6 +43,28 @@ def test_the_package_explains_the_stand_in_to_its_noise_floor(
     bare = case.chi2(problem, bench.plant, bench.plant.space.vector(psi))
     assert known < (1.4 if robot == "quadcopter" else 2.0)  # wheels and feet touch down beside the model's own steps
     assert bare > 2.5 * known
+
+
+WHEEL = """<mujoco><option gravity="0 0 0" integrator="implicitfast"/><worldbody><body>
+<joint name="wheel" armature=".05"/><geom type="cylinder" size=".1 .05" mass="12"/></body></worldbody>
+<actuator><motor name="drive" joint="wheel" ctrlrange="-1 1" forcerange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("speed", [0.3, 3.0])
+def test_stops_of_play_throw_nothing_back_wherever_in_a_step_they_are_met(speed: float) -> None:
+    """Two masses that meet in a plastic impact: their common speed is that of their momentum."""
+    play, rotor, gap = import_module("standin.play"), 0.05, 0.1
+    for part in np.linspace(0, 1, 6):
+        spec, hidden = mujoco.MjSpec.from_string(WHEEL), play.Backlash("wheel", gap)
+        hidden.shape(spec)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        wheel, own = (int(model.joint(name).dofadr[0]) for name in ("wheel", "rotor"))
+        data.qpos[own], data.qvel[own] = gap / 2 - (2 + part) * speed * play.STEP, speed
+        for _ in range(40):
+            mujoco.mj_step(model, data)
+        assert data.qvel[wheel] == pytest.approx(speed * rotor / (rotor + 12 * 0.1**2 / 2), rel=0.04)
+        assert data.qvel[wheel] - data.qvel[own] < 0.04 * speed
 
 
 ARM = """<mujoco><option gravity="0 0 0" timestep="0.001"/><worldbody><body name="arm"><joint name="hinge"/>
