@@ -132,6 +132,17 @@ def test_a_rotor_that_the_model_forgot_crosses_the_gap_with_the_inertia_of_its_e
     np.testing.assert_allclose(both.qpos, known.qpos, atol=1e-12)
 
 
+@pytest.mark.parametrize("off", [0.0, 0.05])
+def test_a_joint_that_coasts_leaves_its_rotor_behind(off: float) -> None:
+    """What slows it slows its own mass alone, also where the engine keeps a lone body's inertia apart."""
+    rotor, damping, count = 1.5, 0.8, 60
+    effect, theta = make("backlash", "rail", {"gap": 0.5, "rotor": rotor})
+    text = _geared(rotor).replace("axis=", f'damping="{damping}" axis=').replace("<geom ", f'<geom pos="0 {off} 0" ')
+    ctrl = np.where(np.arange(count) < 1, -1.0, 1.0)[:, None]  # the rotor leaves the flank that it was led to
+    v = run(text, effect, theta, count, qvel=[1.0], ctrl=ctrl).qvel[0, 0, 2:, 0]
+    np.testing.assert_allclose(v[1:] / v[:-1], 1 - damping / MASS * DT, rtol=1e-6)
+
+
 def test_backlash_loses_what_plastic_impacts_lose() -> None:
     """The drive's work on its rotor is the energy of both masses, less J M / (J + M) dv^2 / 2 in each impact."""
     rng, rotor, count = np.random.default_rng(0), 0.02, 1000

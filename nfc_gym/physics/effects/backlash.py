@@ -86,7 +86,8 @@ class Backlash(Effect):
 
     family = "backlash"
     summary = "Backlash: dead travel between drive and joint"
-    MODULATES = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_armature")
+    # The engine takes the inertia of a lone body that moves along or about its own axes from dof_M0, not from armature.
+    MODULATES = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_armature", "dof_M0")
     PARAMS = (
         Param("gap", "rad", 0.0, 1.0, probes=(0.01, 0.05)),
         Param("rotor", "kg m^2", 1e-12, 1e6, probes=(0.01,), shape=True),
@@ -151,7 +152,9 @@ class Backlash(Effect):
         together = (share > 0) | (hit != 0)  # what is hit moves the rotor on, too
         armature = fields["dof_armature"]
         whole = armature[..., self.drive.v]
-        armature[..., self.drive.v] = np.where(together, whole, np.maximum(whole - self._rotor(ctx, theta), 0.0))
+        gone = np.where(together, 0.0, np.minimum(whole, self._rotor(ctx, theta)))
+        armature[..., self.drive.v] = whole - gone
+        fields["dof_M0"][..., self.drive.v] -= gone
 
     def _rotor(self, ctx: Context, theta: Array) -> Array:
         """(..., n) kg m^2 or kg: inertia of the rotors as it shows at the joints."""
