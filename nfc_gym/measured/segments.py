@@ -156,13 +156,30 @@ def pick(segments: Segments, index: NDArray[np.intp]) -> Segments:
     picked = _map(segments, lambda a: a[index], segments.qpos[index], segments.qvel[index], past)
     if segments.qacc is not None:
         picked = replace(picked, qacc=segments.qacc[index])
+    if segments.off is not None:
+        picked = replace(picked, off=(segments.off[0][index], segments.off[1][index]))
     return picked if segments.condition is None else replace(picked, condition=segments.condition[index])
+
+
+def moved(segments: Segments, qpos: Array, qvel: Array) -> Segments:
+    """The segments from other starts: (S, nq) and (S, nv)."""
+    return replace(segments, qpos=qpos, qvel=qvel, off=_off(segments, qpos, qvel, 1))
+
+
+def _off(segments: Segments, qpos: Array, qvel: Array, n: int) -> tuple[Array, Array]:
+    """(n S, nq), (n S, nv) by how much starts are off what was measured, those of the segments included."""
+    dq, dv = (np.tile(a, (n, 1)) for a in (segments.qpos, segments.qvel))
+    dq, dv = qpos - dq, qvel - dv
+    if segments.off is None:
+        return dq, dv
+    return dq + np.tile(segments.off[0], (n, 1)), dv + np.tile(segments.off[1], (n, 1))
 
 
 def repeat(segments: Segments, n: int, qpos: Array, qvel: Array) -> Segments:
     """The segments n times over, from other starts: (n S, nq) and (n S, nv)."""
     past = segments.past and segments.past.repeat(n)
     many = _map(segments, lambda a: np.concatenate([a] * n), qpos, qvel, past)
+    many = replace(many, off=_off(segments, qpos, qvel, n))
     if segments.qacc is not None:
         many = replace(many, qacc=np.concatenate([segments.qacc] * n))
     return many if segments.condition is None else replace(many, condition=np.tile(segments.condition, n))

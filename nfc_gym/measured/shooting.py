@@ -14,7 +14,7 @@ from nfc_gym.measured.draws import near_by, starts_off
 from nfc_gym.measured.observe import Observer, observer
 from nfc_gym.measured.problem import Columns, Problem
 from nfc_gym.measured.recent import Blocks
-from nfc_gym.measured.segments import lay, pick, refine, repeat
+from nfc_gym.measured.segments import lay, moved, pick, refine, repeat
 from nfc_gym.measured.states import States, channel_noise
 from nfc_gym.measured.steps import coarser, finer, interpolate
 from nfc_gym.physics.effects.base import overrides
@@ -426,7 +426,7 @@ class RolloutProblem(Problem):
         """The same measurements, begun at starts that are off by as much again as the measured ones may be."""
         dq, dv = (rng.normal(size=sd.shape) * sd for sd in self._start_sd)
         starts = self.segments
-        return self.beginning(replace(starts, qpos=integrate(self._kit.model, starts.qpos, dq), qvel=starts.qvel + dv))
+        return self.beginning(moved(starts, integrate(self._kit.model, starts.qpos, dq), starts.qvel + dv))
 
 
 def _question(plant: Plant, x: Array) -> Hashable:

@@ -139,13 +139,24 @@ class Acting:
             ctrl, self.memories[slot] = effect.action(ctrl, theta, self.memories[slot], exogenous, dt)
         return ctrl
 
-    def recall(self, q: Array, v: Array, ctrl: Array, exogenous: Mapping[str, Array]) -> None:
-        """A step of the measured past, (..., nq), (..., nv), (..., nu): only hidden states of forces go along."""
-        self._follow(Context(self.model, self.dt, q, v, ctrl, exogenous, _unmeasured, self._nominal), None)
+    def recall(
+        self, q: Array, v: Array, ctrl: Array, exogenous: Mapping[str, Array], off: tuple[Array, Array] | None = None
+    ) -> None:
+        """A step of the measured past, (..., nq), (..., nv), (..., nu): only hidden states of forces go along.
 
-    def _follow(self, ctx: Context, fresh: NDArray[np.bool_] | None) -> None:
-        """Hidden states of forces for the step that begins at `ctx`."""
+        Args:
+          off: (..., nq), (..., nv) by how much q and v are off for effects that ask for it (`Segments.off`).
+        """
+        moment = lambda q, v: Context(self.model, self.dt, q, v, ctrl, exogenous, _unmeasured, self._nominal)  # noqa: E731
+        measured = moment(q, v)
+        moved = measured if off is None else moment(q + off[0], v + off[1])
+        self._follow(measured, None, moved)
+
+    def _follow(self, ctx: Context, fresh: NDArray[np.bool_] | None, moved: Context | None = None) -> None:
+        """Hidden states of forces for the step that begins at `ctx`, or at `moved` for effects that ask for that."""
+        measured = ctx
         for effect, theta in self.tracking:
+            ctx = moved if moved is not None and effect.off_before else measured
             if effect not in self.traces:
                 self.traces[effect] = effect.rest(ctx, theta)
             elif fresh is not None:

@@ -206,6 +206,7 @@ class Run:
         alike = not (acting.commanding or tracking or segments.servo or self.activations.differ)
         act = np.zeros((len(segments), model.na)) if alike else self.act
         led = self._lead(act, alike)
+        off = None if segments.off is None else (self._tile(segments.off[0]), self._tile(segments.off[1]))
         for k in range(-segments.history, 0):
             exogenous, q, v = self._exogenous(k), self.qpos, self.qvel
             if past is not None and (tracking or segments.servo):
@@ -216,7 +217,7 @@ class Run:
                 delayed(model, recent, segments.dt, self.fields.touched), act, settle=k == -segments.history and not led
             )
             if tracking:
-                acting.recall(q, v, ctrl, exogenous)
+                acting.recall(q, v, ctrl, exogenous, off)
         if alike and segments.history:
             self.act[...] = self._tile(act)
             recent = deque(map(self._tile, recent))

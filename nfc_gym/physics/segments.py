@@ -45,6 +45,9 @@ class Segments:
       condition: (S,) label of the condition that each segment was recorded in.
       past: what was measured before the starts. Without it, or with no history, joints with a memory begin at rest,
         and slow states of the drives settled at the history's first command.
+      off: (S, nq), (S, nv) by how much the starts are off what was measured, where noise is added to them. States come
+        from several samples and are off alike for a while: effects that ask for it (`Effect.off_before`) take what was
+        measured before the starts as off by the same.
       channels: names of all measured channels, which say what each start was read from (`true_state`); None where
         nobody knows.
     """
@@ -62,6 +65,7 @@ class Segments:
     past: Past | None = None
     channels: frozenset[str] | None = None
     qacc: Array | None = None
+    off: tuple[Array, Array] | None = None
 
     def __len__(self) -> int:
         return len(self.qpos)

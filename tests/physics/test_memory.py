@@ -1,5 +1,6 @@
 """Joints that remember, against closed forms: a spring that yields, play between drive and joint."""
 
+from dataclasses import replace
 from functools import partial
 
 import mujoco
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from machines import make, plant_of, run
 
+from nfc_gym.measured.segments import moved
 from nfc_gym.physics.effects import FAMILIES, Context, Forces, Scales
 from nfc_gym.physics.past import Past, trace
 from nfc_gym.physics.segments import Segments
@@ -88,6 +90,29 @@ def test_hidden_states_are_led_along_the_measured_past() -> None:
         model.opt.timestep = DT / 2
         finer = plant_of(model, effect).shoot(theta[None], fine).qpos[0, 0, ::2]
         assert np.abs(finer - q[cut:]).max() < 0.2 * np.abs(again[1] - q[cut:]).max(), family
+
+
+@pytest.mark.parametrize("family", ["hysteresis", "backlash"])
+def test_noise_of_a_start_is_that_of_what_led_its_rotor_there(family: str) -> None:
+    """A rotor in its gap begins as if all of its past had been off like the start; other memories as measured."""
+    cut, steps, off = 707, 300, 0.05
+    sizes = {"hysteresis": {"level": 3.0, "transition": 0.05}, "backlash": {"gap": 0.02, "rotor": 0.02}}
+    effect, theta = make(family, "rail", sizes[family])
+    ctrl = 4 * np.sign(np.sin(np.arange(cut + steps) * DT * 2 * np.pi / 0.35))[:, None]
+    whole = run(RAIL, effect, theta, cut + steps, ctrl=ctrl)
+    q, v = whole.qpos[0, 0, None, : cut + 1], whole.qvel[0, 0, None, : cut + 1]
+    measured, led = Past.given(q, v), Past.given(q, v + off)
+    as_told = Segments(DT, cut, q[:, -1], v[:, -1], ctrl[None], past=measured)
+    begun = moved(as_told, q[:, -1], v[:, -1] + off)
+    plant = plant_of(MODEL, effect)
+    found, wanted, other = (
+        plant.shoot(theta[None], s).qpos for s in (begun, replace(begun, off=None, past=led), replace(begun, off=None))
+    )
+    if family == "backlash":
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+        assert np.abs(found - other).max() > 1e-4
+    else:
+        np.testing.assert_array_equal(found, other)
 
 
 def test_pasts_are_picked_and_repeated() -> None:

@@ -85,6 +85,8 @@ class Backlash(Effect):
     """
 
     family = "backlash"
+    # A rotor in the gap is led by the last moments before the start, whose states come from the start's own samples.
+    off_before = True
     summary = "Backlash: dead travel between drive and joint"
     # The engine takes the inertia of a lone body that moves along or about its own axes from dof_M0, not from armature.
     MODULATES = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_armature", "dof_M0")

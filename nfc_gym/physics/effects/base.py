@@ -146,6 +146,8 @@ class Effect(ABC):
     MODULATES: ClassVar[tuple[str, ...]] = ()
     # Of an effect on commands: whether it is the drive's, behind a firmware servo, and not on the way of its goal.
     on_drive: ClassVar[bool] = False
+    # Of an effect that remembers motion: whether a start's noise is that of what came before it, too (`Segments.off`).
+    off_before: ClassVar[bool] = False
     # The family's parameters with wide bounds; `propose` matches bounds and probing sizes to the machine.
     PARAMS: ClassVar[tuple[Param, ...]] = ()
     # Of an effect at several places: the same at each of them alone, with bounds and sizes that fit that place.

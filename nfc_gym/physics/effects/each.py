@@ -21,7 +21,7 @@ _HOOKS = (
     "spec", "model", "action", "rest", "follow", "friction", "modulate", "force", "demand", "sense", "unsense", "chart",
     "unchart",
 )  # fmt: skip
-_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "driven", "on_drive")
+_TRAITS = ("family", "summary", "generic", "simpler", "covers", "MODULATES", "driven", "on_drive", "off_before")
 
 
 class Each(Effect):
