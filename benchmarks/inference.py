@@ -62,7 +62,7 @@ def seen(x: Array) -> Window:
 
 
 def posterior_of(
-    task: Task, density: str, linear: bool, n: int, epochs: int, seed: int, mirrored: bool = False
+    task: Task, density: str, linear: bool, n: int, epochs: int, seed: int, mirrored: bool
 ) -> NeuralPosterior:
     """A network trained on `n` simulations, in the task's mirrors too or not, a twentieth of them held out."""
     every = windows_of(task, n, seed)

@@ -69,7 +69,7 @@ class NeuralPosterior:
     ) -> None:  # fmt: skip
         self.parts = parts or network.parts
         self.passes = passes or Passes(network)
-        if network.training:  # to walk all its modules for nothing takes a quarter of a millisecond a window
+        if network.training:  # to walk all its modules for nothing took 0.7 ms of a shared core a window
             network.eval()
         self.network, self.kept, self.notes = network, kept, dict(notes or {})
 

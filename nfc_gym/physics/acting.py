@@ -5,6 +5,7 @@ through this class, so that the same effect makes the same numbers in each.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import mujoco
@@ -147,16 +148,14 @@ class Acting:
         Args:
           off: (..., nq), (..., nv) by how much q and v are off for effects that ask for it (`Segments.off`).
         """
-        moment = lambda q, v: Context(self.model, self.dt, q, v, ctrl, exogenous, _unmeasured, self._nominal)  # noqa: E731
-        measured = moment(q, v)
-        moved = measured if off is None else moment(q + off[0], v + off[1])
+        measured = Context(self.model, self.dt, q, v, ctrl, exogenous, _unmeasured, self._nominal)
+        moved = None if off is None else replace(measured, q=q + off[0], v=v + off[1])
         self._follow(measured, None, moved)
 
-    def _follow(self, ctx: Context, fresh: NDArray[np.bool_] | None, moved: Context | None = None) -> None:
-        """Hidden states of forces for the step that begins at `ctx`, or at `moved` for effects that ask for that."""
-        measured = ctx
+    def _follow(self, here: Context, fresh: NDArray[np.bool_] | None, moved: Context | None = None) -> None:
+        """Hidden states of forces for the step that begins `here`, or at `moved` for effects that ask for that."""
         for effect, theta in self.tracking:
-            ctx = moved if moved is not None and effect.off_before else measured
+            ctx = moved if moved is not None and effect.off_before else here
             if effect not in self.traces:
                 self.traces[effect] = effect.rest(ctx, theta)
             elif fresh is not None:

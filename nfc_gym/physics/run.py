@@ -206,7 +206,9 @@ class Run:
         alike = not (acting.commanding or tracking or segments.servo or self.activations.differ)
         act = np.zeros((len(segments), model.na)) if alike else self.act
         led = self._lead(act, alike)
-        off = None if segments.off is None else (self._tile(segments.off[0]), self._tile(segments.off[1]))
+        off = None
+        if segments.off is not None and any(effect.off_before for effect, _ in acting.tracking):
+            off = self._tile(segments.off[0]), self._tile(segments.off[1])
         for k in range(-segments.history, 0):
             exogenous, q, v = self._exogenous(k), self.qpos, self.qvel
             if past is not None and (tracking or segments.servo):
