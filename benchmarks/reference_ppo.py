@@ -5,10 +5,11 @@
 
 The reference is CleanRL's `ppo_continuous_action.py`, a script that knows nothing of this package and is no part of it:
 get it from https://github.com/vwxyzjn/cleanrl, `pip install tyro tensorboard`, and say where it is; under Gymnasium 1
-its `TransformObservation` wants `env.observation_space` as a third argument. It runs with its own settings on flat
-places (it looks at vectors); its actor is then judged with its own scale of observations. What is trained here varies
-psi; the reference learns in the nominal world, where both are judged: 64 whole episodes without exploring. With --out
-finished runs are kept. `--quick` is a few thousand steps, of this package alone where there is no script.
+its `TransformObservation` wants `env.observation_space` as a third argument. It runs with its own settings, and sees
+what policies of the package see (`Sight`): on rough ground a few cells of the elevation map beside the rest. Its actor
+is then judged with its own scale of observations. What is trained here varies psi; the reference learns in the nominal
+world, where both are judged: 64 whole episodes without exploring. With --out finished runs are kept. `--quick` is a few
+thousand steps, of this package alone where there is no script.
 """
 
 import argparse
@@ -39,7 +40,7 @@ from timing import Table
 
 from nfc_gym.adaptation import pretrain
 from nfc_gym.adaptation.evaluate import evaluate
-from nfc_gym.adaptation.sight import VectorSight
+from nfc_gym.adaptation.sight import Sight, VectorSight
 from nfc_gym.adaptation.worlds import vector_env
 from nfc_gym.core.errors import InputError
 from nfc_gym.simulate.machine import full_id
@@ -83,8 +84,6 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     args = parser.parse_args(argv)
     if args.script is not None and not args.script.is_file():
         parser.error(f"--script {args.script}: no such file")
-    if rough := [p for p in args.places if not p.endswith("Flat")]:
-        parser.error(f"--places {rough[0]}: the reference looks at vectors, want flat places")
     for place in args.places:
         try:
             full_id(place)
@@ -125,10 +124,32 @@ def ours(place: str, seed: int, steps: int, envs: int) -> dict[str, Any]:
     return policy.about["nominal"] | {"seconds": policy.about["seconds"]}
 
 
+class Seen(gymnasium.ObservationWrapper):
+    """An environment of this package as its policies see it: one vector.
+
+    Args:
+      env: made with `context=["elevation"]` on rough ground.
+    """
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self.sight = Sight.of(env)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.sight.size,), np.float32)
+
+    def observation(self, observation: Any) -> NDArray[np.float32]:
+        """The vector."""
+        return self.sight.flat(observation)
+
+
+def plain(environment: str) -> gymnasium.Env:
+    """What the reference is given."""
+    return Seen(gymnasium.make(environment, context=["elevation"] if "Rough" in environment else ["psi"]))
+
+
 def theirs(place: str, seed: int, steps: int, script: Path) -> dict[str, Any]:
     """The script, with its own settings; afterwards its actor and its scale of observations are looked up in it."""
     torch.set_num_threads(1)
-    gymnasium.register(PLAIN, partial(gymnasium.make, full_id(place), context=()))
+    gymnasium.register(PLAIN, partial(plain, full_id(place)))
     sys.argv = [str(script), "--env-id", PLAIN, "--seed", str(seed), "--total-timesteps", str(steps), "--no-cuda"]
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):

@@ -214,6 +214,17 @@ def tdmpc2(job: Job) -> "Learned":
     return planned.improve(agent, envs, job.mean_return, budget, job.seed, EPISODE * budget.executed)
 
 
+def measured_loop(job: Job) -> "Learned":
+    """`nfc-gym close-loop` on what was executed, then `nfc-gym adapt` in the model that it wrote."""
+    if job.world.ground == "Rough":
+        raise NotThere("needs a model of the ground, which on rough ground nobody has")
+    if job.budget.executed < 1:
+        raise NotThere("needs an executed episode or more")
+    from .looped import looped
+
+    return looped(job)
+
+
 @dataclass(frozen=True)
 class Method:
     """One of them.
@@ -235,6 +246,7 @@ METHODS: dict[str, Method] = {
     "nfc": Method("PPO w/ NFC", nfc()),
     "no_fidelity": Method("PPO w/o delta-fidelity", nfc(parts=("psi",))),
     "no_hallucination": Method("PPO w/o hallucination", nfc(hallucinate=False)),
+    "measured_loop": Method("measured loop, then PPO in its model", measured_loop),
     "no_nfc": Method("PPO w/o NFC", no_nfc),
     "randomised": Method("domain randomisation alone", randomised),
     "oracle": Method("oracle", oracle),

@@ -1,6 +1,7 @@
 """A folder of logs in the measured loop's format: the model, the mapping, and a Parquet file an episode."""
 
 import os
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,8 @@ class LogFolder:
       path: the folder; made here. Episodes are numbered after those that it already holds; several processes may write
         to it.
       model_file: the environment's MJCF, where it does not say itself.
+      noise: standard deviations to declare, by kind of channel: `joint:pos`, `body:angvel`, ...; default those of a
+        simulation.
 
     Raises:
       MissingExtra: Parquet or YAML cannot be written.
@@ -47,12 +50,18 @@ class LogFolder:
         there.
     """
 
-    def __init__(self, env: Any, sim: Any, path: str | os.PathLike[str], model_file: str | None) -> None:
+    def __init__(
+        self, env: Any, sim: Any, path: str | os.PathLike[str], model_file: str | None,
+        noise: Mapping[str, float] | None = None,
+    ) -> None:  # fmt: skip
         missing = [name for name in _NEEDED if find_spec(name) is None]
         if missing:
             raise MissingExtra(f"RecordLog needs {', '.join(missing)}: pip install 'nfc_gym[measured]'")
         self.env, self.sim, self.folder, self.model_file = env, sim, folder_of(path), model_file
-        self.columns = columns(sim.nominal)
+        self.columns, self.noise = columns(sim.nominal), dict(noise or {})
+        kinds = sorted({_kind(c.name) for c in self.columns} - {"sensor"})
+        if strange := self.noise.keys() - set(kinds):
+            raise InputError(f"noise of {sorted(strange)[0]!r}: the channels are {', '.join(kinds)}")
         self.controls = [f"ctrl:{name}" for name in names(sim.nominal).actuators]
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"RecordLog: {self.folder} is a file; `path` is the folder that episodes are written to")
@@ -119,7 +128,7 @@ class LogFolder:
             "split": {"by": "log" if self._there() >= 3 else "time"},
             "time": {"column": "time", "unit": "s"},
             "controls": {n: {"column": n, "unit": "1"} for n in self.controls},
-            "channels": {c.name: _channel(c) for c in self.columns},
+            "channels": {c.name: _channel(c, self.noise) for c in self.columns},
             "segments": {"length": float(max(0.4, _SAMPLES * interval))},
         }
         write_whole(self.folder / "mapping.yaml", yaml.safe_dump(mapping, sort_keys=False, allow_unicode=True))
@@ -141,11 +150,18 @@ def _parameter(p: Any, nominal: float) -> dict[str, Any]:
     return {**{k: getattr(p, k) for k in keys}, "of": list(p.of), "nominal": float(nominal), "tied": True}
 
 
-def _channel(column: Any) -> dict[str, Any]:
+def _kind(channel: str) -> str:
+    """`joint:pos` of `joint:left_knee:pos`; of a sensor `sensor`."""
+    kind, *_, last = channel.split(":")
+    return kind if kind == "sensor" else f"{kind}:{last}"
+
+
+def _channel(column: Any, noise: Mapping[str, float]) -> dict[str, Any]:
     places = [column.name] if column.size == 1 else [f"{column.name}[{i}]" for i in range(column.size)]
     quaternion = column.name.endswith(":quat")
     told: dict[str, Any] = {"order": "wxyz"} if quaternion else {"unit": column.unit}
     kind = column.name.split(":")[0]
     if quaternion or kind in ("joint", "body"):
-        told["noise"] = _ATTITUDE if quaternion else (_JOINT if kind == "joint" else _BODY)[column.unit]
+        clean = _ATTITUDE if quaternion else (_JOINT if kind == "joint" else _BODY)[column.unit]
+        told["noise"] = noise.get(_kind(column.name), clean)
     return {"columns": places, **told}
