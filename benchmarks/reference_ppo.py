@@ -43,6 +43,7 @@ from nfc_gym.adaptation.evaluate import evaluate
 from nfc_gym.adaptation.sight import Sight, VectorSight
 from nfc_gym.adaptation.worlds import vector_env
 from nfc_gym.core.errors import InputError
+from nfc_gym.envs.rotations import yaw
 from nfc_gym.simulate.machine import full_id
 
 EPISODES = 64
@@ -125,10 +126,9 @@ def ours(place: str, seed: int, steps: int, envs: int) -> dict[str, Any]:
 
 
 class Seen(gymnasium.ObservationWrapper):
-    """An environment of this package as its policies see it: one vector.
+    """An environment of this package, made with `context=["psi"]`, as its policies see it: one vector.
 
-    Args:
-      env: made with `context=["elevation"]` on rough ground.
+    The cells of the map are looked up without making the whole map, which would take most of a step.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:
@@ -138,12 +138,18 @@ class Seen(gymnasium.ObservationWrapper):
 
     def observation(self, observation: Any) -> NDArray[np.float32]:
         """The vector."""
-        return self.sight.flat(observation)
+        if self.sight.cells is None:
+            return self.sight.flat(observation)
+        base: Any = self.unwrapped
+        qpos = base.data.qpos[None]
+        seen = self.sight.cells.around([base.perceived], qpos[:, :3], yaw(qpos[:, 3:7]))
+        parts = [observation["proprio"], *([observation["goal"]] if self.sight.goal else []), seen.ravel()]
+        return np.concatenate(parts, dtype=np.float32)
 
 
 def plain(environment: str) -> gymnasium.Env:
     """What the reference is given."""
-    return Seen(gymnasium.make(environment, context=["elevation"] if "Rough" in environment else ["psi"]))
+    return Seen(gymnasium.make(environment, context=["psi"]))
 
 
 def theirs(place: str, seed: int, steps: int, script: Path) -> dict[str, Any]:

@@ -60,7 +60,9 @@ def looped(job: Job) -> Learned:
         device=budget.device, threads=budget.threads,
     )  # fmt: skip
     adapted = load_policy(job.folder / "adapted" / POLICY, budget.device)
-    return Learned(adapted, [], found | {"learned": told["effects"], "seconds": told["seconds"]})
+    return Learned(
+        adapted, [], found | {"learned": [e["sentence"] for e in told["effects"]], "seconds": told["seconds"]}
+    )
 
 
 def _explained(job: Job, executed: list[Trajectory], environment: str) -> dict[str, Any]:

@@ -65,7 +65,7 @@ def shown(machine: Machine, seen: Array, predicted: Array, noise: Array) -> NDAr
     return np.concatenate([motion, missed], -1).astype(np.float32)
 
 
-def predicted(machine: Machine, starts: Array, psi: Array, actions: Array) -> Array:
+def predicted(machine: Machine, starts: Array, psi: Array, actions: Array, threads: int = 1) -> Array:
     """(W, H+1, s) observations of simulations without effects on a plane; nan from where one comes apart.
 
     Args:
@@ -73,9 +73,10 @@ def predicted(machine: Machine, starts: Array, psi: Array, actions: Array) -> Ar
       starts: (W, nq + nv + na) where they begin: positions, velocities, states of the actuators.
       psi: (W, d) in physical units.
       actions: (W, H, a).
+      threads: of the physics; 0 takes every core, and the bits are the same.
     """
     n, nq, moving = len(starts), machine.model.nq, machine.model.nq + machine.model.nv
-    sims = machine.simulations(n, 1, [])
+    sims = machine.simulations(n, threads, [])
     sims.begin(np.arange(n), {"psi": psi})
     robot, view = sims.robot, sims.view
     view.qpos[...], view.qvel[...] = starts[:, :nq], starts[:, nq:moving]
@@ -94,7 +95,7 @@ def predicted(machine: Machine, starts: Array, psi: Array, actions: Array) -> Ar
 
 
 def of_windows(
-    machine: Machine, windows: Windows, rows: NDArray[np.intp], noise: float, rng: np.random.Generator
+    machine: Machine, windows: Windows, rows: NDArray[np.intp], noise: float, rng: np.random.Generator, threads: int = 1
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Motion and misfit (W, H+1, 2 s) of some windows of a training set, and which of them (W,) are of use.
 
@@ -108,6 +109,7 @@ def of_windows(
       rows: (W,) which.
       noise: what multiplies the sensor noise of the set's manifest.
       rng: of noise, starts and parameters.
+      threads: of the physics; 0 takes every core, and the bits are the same.
     """
     sd, space, nq = noise * np.array(windows.manifest.state_noise), machine.space, machine.model.nq
     model = machine.model
@@ -122,7 +124,8 @@ def of_windows(
         starts = starts + rng.standard_normal(starts.shape) * _start_noise(machine, sd)
         starts[:, 3:7] /= np.linalg.norm(starts[:, 3:7], axis=1, keepdims=True)
         with np.errstate(all="ignore"):
-            expected = predicted(machine, starts, np.clip(psi, space.low, space.high), batch["actions"].astype(float))
+            psi, actions = np.clip(psi, space.low, space.high), batch["actions"].astype(float)
+            expected = predicted(machine, starts, psi, actions, threads)
             seen = batch["states"] + sd * rng.standard_normal(batch["states"].shape)
             both = shown(machine, seen, expected, sd)
         fine = np.asarray(np.isfinite(both).all((1, 2)))

@@ -42,7 +42,7 @@ class Head(Network):
 
 def train_structure(
     folder: Path, out: Path, training: TrainConfig, *, config: NetworkConfig = NETWORK, noise: float = 1.0,
-    repeats: int = 6, device: str | torch.device = "cpu", report: Report = quiet,
+    repeats: int = 6, device: str | torch.device = "cpu", threads: int = 0, report: Report = quiet,
 ) -> Outcome:  # fmt: skip
     """Train a structure head on a folder of windows into a checkpoint; a run that was stopped goes on.
 
@@ -54,6 +54,7 @@ def train_structure(
       noise: what multiplies the sensor noise that the windows' manifest assumes.
       repeats: how often each window is shown, with other noise and other errors of start and parameters.
       device: to train on.
+      threads: of the physics; 0 takes every core, and the bits are the same.
       report: is told of the progress.
 
     Raises:
@@ -72,8 +73,9 @@ def train_structure(
     require_prior(stored, prior)
     say_unfinished(stored, report)
     cut = len(stored) - max(1, round(HELD_OUT * len(stored)))  # no repeat of a window is on both sides
-    first, shares = taught(stored, np.tile(np.arange(cut), repeats), machine, noise, training.seed)
-    held_out, _ = taught(stored, np.arange(cut, len(stored)), machine, noise, training.seed + 1)
+    report.message(f"{len(stored):,} windows are replayed without their effects, {repeats} times each")
+    first, shares = taught(stored, np.tile(np.arange(cut), repeats), machine, noise, training.seed, threads)
+    held_out, _ = taught(stored, np.arange(cut, len(stored)), machine, noise, training.seed + 1, threads)
     if shares[0] == 1:
         raise InputError(f"{folder}: no window has an effect; simulate them with --effects 0.75")
     config = NetworkConfig(**{**config.to_dict(), "families": tuple(about.families)})
@@ -92,10 +94,10 @@ def train_structure(
 
 
 def taught(
-    stored: Windows, rows: NDArray[np.intp], machine: Machine, noise: float, seed: int
+    stored: Windows, rows: NDArray[np.intp], machine: Machine, noise: float, seed: int, threads: int = 1
 ) -> tuple[TensorWindows, list[float]]:
     """Motion, misfit and family of those windows that can be replayed, and the families' shares among them."""
-    states, fine = of_windows(machine, stored, rows, noise, np.random.default_rng(seed))
+    states, fine = of_windows(machine, stored, rows, noise, np.random.default_rng(seed), threads)
     batch = stored.take(rows[fine], ["actions", "psi", "family"])
     shares = np.bincount(batch["family"], minlength=len(stored.manifest.families)) / max(len(batch["family"]), 1)
     arrays = {"states": states[fine], **batch}
