@@ -1,7 +1,8 @@
 """A reference single-file PPO beside `nfc-gym pretrain`: the same environments and control steps, one core each.
 
     python benchmarks/reference_ppo.py --script ppo_continuous_action.py [--places AntFlat ...] [--seeds 0 1]
-                                       [--steps N] [--envs N] [--out DIR] [--json FILE] [--quick]
+                                       [--methods pretrain reference] [--steps N] [--envs N] [--out DIR] [--json FILE]
+                                       [--quick]
 
 The reference is CleanRL's `ppo_continuous_action.py`, a script that knows nothing of this package and is no part of it:
 get it from https://github.com/vwxyzjn/cleanrl, `pip install tyro tensorboard`, and say where it is; under Gymnasium 1
@@ -52,14 +53,16 @@ PLAIN = "Plain-v0"  # the id that the reference is given: an environment that sh
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = parse(argv)
-    methods = ["pretrain"] + (["reference"] if args.script else [])
-    if not args.script:
+    methods = [m for m in args.methods if m == "pretrain" or args.script]
+    if methods != args.methods:
         print("no --script: the reference is left out")
     table = Table()
     with tempfile.TemporaryDirectory() as scratch:
         kept = Kept(args.out or Path(scratch), {"steps": args.steps, "envs": args.envs})
         for place in args.places:
             found = {m: [cell(kept, m, place, seed, args) for seed in args.seeds] for m in methods}
+            if "pretrain" not in found:
+                continue  # nothing to compare
             means = {m: float(np.mean([f["return"] for f in rows])) for m, rows in found.items()}
             name = f"{place}: return at home after {args.steps:,} steps, mean of seeds"
             reference = means.get("reference")
@@ -76,6 +79,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--script", type=Path, metavar="FILE", help="CleanRL's ppo_continuous_action.py")
     add("--places", nargs="+", default=["AntFlat", "QuadrupedFlat", "HumanoidFlat"], metavar="PLACE")
+    add("--methods", nargs="+", choices=("pretrain", "reference"), default=["pretrain", "reference"])
     add("--seeds", type=count(0), nargs="+", default=[0, 1])
     add("--steps", type=count(1), default=600_000, help="control steps of each run")
     add("--envs", type=count(1), default=256, help="simulations of `nfc-gym pretrain`")

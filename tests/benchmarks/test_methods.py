@@ -162,6 +162,44 @@ def test_algorithm_one_runs_in_a_hidden_world(tmp_path: Path, short: int) -> Non
     assert (tmp_path / "states").is_dir()
 
 
+def test_the_measured_loop_explains_what_was_executed_and_ppo_learns_in_that(
+    tmp_path: Path, short: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import json
+    from dataclasses import replace
+
+    from worlds import looped
+    from worlds.methods import METHODS, run
+    from worlds.world import World
+
+    from nfc_gym.measured.dataset import load
+
+    asked: list[int] = []
+
+    def loop(mapping: Path, out: Path, **_: Any) -> dict[str, Any]:
+        """Finds in no time that the rover is heavier."""
+        asked.append(len(load(mapping).logs))
+        mass = {"name": "base_mass", "unit": "kg", "field": "body_mass", "of": ["base"], "estimate": 20.0}
+        report = {"verdict": "explained", "effects": [], "chi2": {}, "seconds": 0.0,
+                  "parameters": [mass | {"low": 19.0, "high": 21.0}]}  # fmt: skip
+        out.mkdir()
+        (out / "report.json").write_text(json.dumps(report))
+        return report
+
+    monkeypatch.setattr(looped, "close_loop", loop)
+    monkeypatch.setattr(looped, "EPISODE", short)
+    given = job(tmp_path)
+    given = replace(given, budget=replace(given.budget, executed=3))
+    found = METHODS["measured_loop"].make(given)
+    assert asked == [3]
+    assert found.notes["verdict"] == "explained"
+    assert len(found.notes["executed"]) == 3
+    assert (given.folder / "adapted" / "policy.safetensors").is_file()
+    METHODS["measured_loop"].make(given)  # the same once more: the report is read, the learning is over
+    assert asked == [3]
+    assert "rough ground" in run("measured_loop", replace(given, world=World("JackalRough", "axle", 0)), 2)["missing"]
+
+
 def test_a_table_takes_its_references_from_an_earlier_run(tmp_path: Path) -> None:
     import json
 
