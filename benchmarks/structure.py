@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--nulls", type=count(0), default=0, help="machines a robot without any")
     add("--windows", type=count(1), default=Course().windows, help="that a head is trained on")
     add("--epochs", type=count(1), default=Course().epochs, help="of its training, at most")
+    add("--no-mirror", action="store_true", help="show no window in the robot's mirrors")
     add("--jobs", type=count(0), default=1, help="processes that simulate its windows")
     add("--device", default="cpu", help="that it is trained on (default cpu)")
     add("--seed", type=count(0), help="repeats a run; default drawn, or the one that --out was begun with")
@@ -88,11 +90,23 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     seed = begun(folder, args.seed)
     print(f"seed {seed} (drawn at run time unless given)", flush=True)
     course = Course(96, 64, 1, small=True) if args.quick else Course(args.windows, epochs=args.epochs)
-    belongs(folder, {"seed": seed, "windows": course.windows, "epochs": course.epochs, "small": course.small})
+    course = replace(course, mirror=not args.no_mirror)
+    belongs(
+        folder,
+        {
+            "seed": seed,
+            "windows": course.windows,
+            "epochs": course.epochs,
+            "small": course.small,
+            "mirror": course.mirror,
+        },
+    )
     rows: list[dict[str, Any]] = []
     for robot in args.robots:
         head = taught(robot, course, folder, seed, args.jobs, args.device)
-        told = _kept(folder / f"{robot}_judged.json", lambda r=robot, h=head: judged(r, h, course, folder, seed))
+        told = _kept(
+            folder / f"{robot}_judged.json", lambda r=robot, h=head: judged(r, h, course, folder, seed, args.jobs)
+        )
         rows += told_rows(robot, told)
         trials = []
         for i, task in enumerate(tasks(robot, args, seed)):

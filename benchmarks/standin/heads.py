@@ -44,12 +44,14 @@ class Course:
       judged: of a set of their own, to judge it on.
       epochs: at most.
       small: a toy's network.
+      mirror: whether windows are shown in the robot's mirrors too.
     """
 
     windows: int = 40_960
     judged: int = 2048
     epochs: int = TRAINING.epochs
     small: bool = False
+    mirror: bool = True
 
 
 class Declared:
@@ -89,12 +91,13 @@ def taught(robot: str, course: Course, folder: Path, seed: int, jobs: int = 1, d
         config = replace(NETWORK, encoder="nn", width=64, features=64, hidden=64) if course.small else NETWORK
         train_structure(
             windows.folders[0], head, replace(TRAINING, epochs=course.epochs, seed=seed),
-            config=config, noise=NOISE[robot], device=device, threads=jobs, report=Spoken(),
+            config=config, noise=NOISE[robot], device=device, threads=jobs, mirror=course.mirror,
+            report=Spoken(),
         )  # fmt: skip
     return head
 
 
-def judged(robot: str, head: Path, course: Course, folder: Path, seed: int) -> dict[str, Any]:
+def judged(robot: str, head: Path, course: Course, folder: Path, seed: int, jobs: int = 1) -> dict[str, Any]:
     """What a head tells of single windows that it never saw.
 
     X is the mean square misfit of a window in standard deviations of the sensors, with psi, start and noise as off as
@@ -102,9 +105,9 @@ def judged(robot: str, head: Path, course: Course, folder: Path, seed: int) -> d
     families of P(family), windows with it against all others.
     """
     witness = Witness(head)
-    windows = _windows(robot, Declared(robot), course.judged, folder / f"{robot}_judged", seed + 1)
+    windows = _windows(robot, Declared(robot), course.judged, folder / f"{robot}_judged", seed + 1, jobs)
     rows, machine = np.arange(len(windows)), witness.machine
-    states, fine = of_windows(machine, windows, rows, NOISE[robot], np.random.default_rng(seed + 1))
+    states, fine = of_windows(machine, windows, rows, NOISE[robot], np.random.default_rng(seed + 1), jobs)
     batch = windows.take(rows[fine], ["actions", "family"])
     states, family = states[fine], batch["family"]
     told = told_by(witness.network, states.astype(float), batch["actions"].astype(float))

@@ -182,7 +182,7 @@ def train(
     Example: nfc-gym train windows/jackal --out jackal.safetensors
     """
     with outcome(ctx, resumes=True):
-        of_posteriors = _asked(ctx, "encoder", "density", "delta_s", "maps", "delta_e", "families", "mirror")
+        of_posteriors = _asked(ctx, "encoder", "density", "delta_s", "maps", "delta_e", "families")
         _require_used(not structure, "for a posterior: give it without --structure", **of_posteriors)
         terrain = _asked(ctx, "delta_e")
         _require_used(maps, "what the ground is beyond the map that is seen: give --maps too", **terrain)
@@ -202,7 +202,7 @@ def train(
         how = {"report": Spoken(), "noise": noise}
         machine = _machine(windows)
         if structure:
-            done = train_structure(windows, out, training, device=jobs.device_of(device), **how)
+            done = train_structure(windows, out, training, device=jobs.device_of(device), mirror=mirror, **how)
         else:
             config = NetworkConfig(
                 encoder=encoder, density=density, summaries=True, linear=True, elevation=maps, delta_s=delta_s,

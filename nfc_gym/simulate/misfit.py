@@ -10,6 +10,7 @@ through asinh, since effects of all sizes are to be told apart.
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.envs.mirror import Mirror, together
 from nfc_gym.envs.quadcopter import Quadcopter
 from nfc_gym.inference.encoders.place import place_of
 from nfc_gym.inference.windows import Windows
@@ -63,6 +64,11 @@ def shown(machine: Machine, seen: Array, predicted: Array, noise: Array) -> NDAr
     motion, expected = levelled(machine, seen, first), levelled(machine, predicted, first)
     missed = np.arcsinh((motion - expected) / np.maximum(noise, _LEAST))
     return np.concatenate([motion, missed], -1).astype(np.float32)
+
+
+def images(machine: Machine) -> list[Mirror]:
+    """How what is `shown` looks in each of a robot's mirrors: motion and misfit go over into their images alike."""
+    return [mirror._replace(states=together([mirror.states, mirror.states])) for mirror in machine.mirrors]
 
 
 def predicted(machine: Machine, starts: Array, psi: Array, actions: Array, threads: int = 1) -> Array:

@@ -15,11 +15,12 @@ from nfc_gym.inference.data import Batch, StoredWindows, TensorWindows
 from nfc_gym.inference.jobs import require_prior, say_unfinished
 from nfc_gym.inference.network import Network
 from nfc_gym.inference.progress import Report, quiet
+from nfc_gym.inference.reflection import Reflection
 from nfc_gym.inference.space import PriorBox
 from nfc_gym.inference.train import Outcome, TrainConfig, train
 from nfc_gym.inference.windows import Windows
 from nfc_gym.simulate.machine import Machine
-from nfc_gym.simulate.misfit import of_windows
+from nfc_gym.simulate.misfit import images, of_windows
 from nfc_gym.simulate.observed import require_unfeeling
 from nfc_gym.simulate.witness import MISFIT
 
@@ -42,7 +43,7 @@ class Head(Network):
 
 def train_structure(
     folder: Path, out: Path, training: TrainConfig, *, config: NetworkConfig = NETWORK, noise: float = 1.0,
-    repeats: int = 6, device: str | torch.device = "cpu", threads: int = 0, report: Report = quiet,
+    repeats: int = 6, mirror: bool = True, device: str | torch.device = "cpu", threads: int = 0, report: Report = quiet,
 ) -> Outcome:  # fmt: skip
     """Train a structure head on a folder of windows into a checkpoint; a run that was stopped goes on.
 
@@ -53,6 +54,7 @@ def train_structure(
       config: of the network; its families are those of the windows.
       noise: what multiplies the sensor noise that the windows' manifest assumes.
       repeats: how often each window is shown, with other noise and other errors of start and parameters.
+      mirror: whether half of the windows of each step are shown in each of the robot's mirrors.
       device: to train on.
       threads: of the physics; 0 takes every core, and the bits are the same.
       report: is told of the progress.
@@ -82,7 +84,8 @@ def train_structure(
     network = Head(config, Sizes.of(first.tensors), prior, training.seed)
     state = out.with_name(out.name + ".training")
     state.mkdir(parents=True, exist_ok=True)
-    outcome = train(network, first, held_out, training, folder=state, device=device, report=report)
+    image = Reflection(images(machine)) if mirror and machine.mirrors else None
+    outcome = train(network, first, held_out, training, folder=state, device=device, report=report, mirror=image)
     notes = {
         MISFIT: True, "environment": about.environment, "windows": len(stored), "shares": shares,
         "noise": [noise * sd for sd in about.state_noise],

@@ -8,7 +8,7 @@ import pytest
 from nfc_gym.inference.windows import Windows
 from nfc_gym.simulate import simulate
 from nfc_gym.simulate.machine import Machine
-from nfc_gym.simulate.misfit import levelled, of_windows, predicted, shown
+from nfc_gym.simulate.misfit import images, levelled, of_windows, predicted, shown
 
 ROBOTS = ("Quadcopter", "Jackal")
 
@@ -61,3 +61,16 @@ def test_where_and_facing_where_is_left_out(tmp_path: Path, robot: str) -> None:
         )
     turned[..., place] += (3.0, -2.0)
     assert levelled(machine, turned, turned[:, 0]) == pytest.approx(seen, abs=1e-6)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_in_a_mirror_motion_and_misfit_are_their_own_images(tmp_path: Path, robot: str) -> None:
+    stored, machine = windows(tmp_path, robot, 0.0), Machine(f"nfc_gym/{robot}Flat-v0")
+    seen = stored.take(np.arange(24), ["states"])["states"].astype(float)
+    expected = seen + 0.1 * machine.noise * np.random.default_rng(0).standard_normal(seen.shape)
+    both = shown(machine, seen, expected, machine.noise)
+    assert len(images(machine)) == len(machine.mirrors) == 2
+    for image, mirror in zip(images(machine), machine.mirrors, strict=True):
+        there = shown(machine, mirror.states(seen), mirror.states(expected), machine.noise)
+        assert image.states(both) == pytest.approx(there, abs=2e-5)
+        assert np.abs(there - both).max() > 0.1
