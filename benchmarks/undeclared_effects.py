@@ -81,7 +81,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--seed", type=count(0), help="repeats a run; default drawn, or the one that --out was begun with")
     add("--jobs", type=count(1), default=1, help="trials at a time, each a process")
     add("--threads", type=count(0), help="of a trial; default 1, all cores with --jobs 1 and without --quick")
-    add("--out", type=Path, metavar="DIR", help="keeps finished trials and reports: a killed run goes on")
+    add("--out", type=Path, metavar="DIR", help="keeps trials, half-done ones too, and reports: a killed run goes on")
     add("--begin", type=Path, metavar="FILE", help="take over seed and trials that an earlier run's --json wrote")
     add("--most", type=count(0), metavar="N", help="of trials that are not finished only the first N of the plan")
     add("--kept", action="store_true", help="no new trials: figures of those that --out holds")

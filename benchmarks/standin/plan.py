@@ -100,10 +100,11 @@ def with_baselines(tasks: Sequence[Task], share: float) -> list[Task]:
 
 
 class Kept:
-    """Finished trials in a folder, one file each, and their reports; None keeps nothing."""
+    """Trials in a folder: the finished ones, one file each, their reports, and those under way; None keeps nothing."""
 
     def __init__(self, folder: Path | None) -> None:
         self.folder, self.reports = (folder / "trials", folder / "reports") if folder else (None, None)
+        self.begun = folder / "begun" if folder else None
         if self.folder:
             self.folder.mkdir(parents=True, exist_ok=True)
 
@@ -131,7 +132,7 @@ def run(tasks: Sequence[Task], jobs: int, threads: int, kept: Kept) -> Iterator[
         if (row := kept.get(t)) is not None:
             yield row, "kept"
     clock = _Clock(left, jobs)
-    for task, row in _each(left, jobs, threads, kept.reports):
+    for task, row in _each(left, jobs, threads, kept):
         if row is not None:
             kept.put(task, row)
         note = clock.tick(task)
@@ -139,18 +140,18 @@ def run(tasks: Sequence[Task], jobs: int, threads: int, kept: Kept) -> Iterator[
             yield row, note
 
 
-def _each(tasks: Sequence[Task], jobs: int, threads: int, reports: Path | None) -> Iterator[tuple[Task, Row | None]]:
+def _each(tasks: Sequence[Task], jobs: int, threads: int, kept: Kept) -> Iterator[tuple[Task, Row | None]]:
     if jobs == 1:
         for task in tasks:
             try:
-                yield task, one(task, threads, reports)
+                yield task, one(task, threads, kept)
             except Exception as error:
                 _failed(task, error)
                 yield task, None
         return
     # A process a trial: what one leaves behind (threads, memory, MuJoCo's warning hook) is gone before the next.
     pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), max_tasks_per_child=1)
-    running = {pool.submit(one, task, threads, reports): task for task in tasks}
+    running = {pool.submit(one, task, threads, kept): task for task in tasks}
     try:
         for done in as_completed(running):
             task, error = running[done], done.exception()
@@ -165,19 +166,26 @@ def _failed(task: Task, error: BaseException) -> None:
     print(f"{task.name} failed: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
 
 
-def one(task: Task, threads: int, reports: Path | None = None) -> Row:
-    """A trial in a folder of its own, which is removed; its report goes to a folder of that name under `reports`."""
-    folder = Path(tempfile.mkdtemp(prefix="standin_"))
+def one(task: Task, threads: int, kept: Kept) -> Row:
+    """A trial in a folder of its own, which is removed when it is over; its report is kept.
+
+    A trial that was killed goes on from its last finished stage, where trials are kept.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="standin_")) if kept.begun is None else kept.begun / task.name
+    folder.mkdir(parents=True, exist_ok=True)
     try:
         row = trial(task, folder, threads)
-        if reports is not None:
-            own = reports / task.name
+        if kept.reports is not None:
+            own = kept.reports / task.name
             own.mkdir(parents=True, exist_ok=True)
             for name in ("report.html", "report.json"):
                 shutil.copy(folder / "report" / name, own)
-        return row
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    except BaseException as error:
+        if kept.begun is None or isinstance(error, Exception):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+    return row
 
 
 class _Clock:

@@ -70,7 +70,8 @@ def summarise(rows: Sequence[Row], seed: int) -> list[dict[str, Any]]:
         times = [r for r in rows if r.robot == robot]
         if times:
             _time(out, robot, times)
-            out.value(f"{robot}: the whole trial, median", _median(r.cpu for r in times), "core-s", times)
+        if whole := [r for r in times if np.isfinite(r.cpu)]:
+            out.value(f"{robot}: the whole trial, median", _median(r.cpu for r in whole), "core-s", whole)
     return out.rows
 
 

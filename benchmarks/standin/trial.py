@@ -1,12 +1,14 @@
 """One trial: draw a machine, size its effects, write logs, run the loop blind, compare with oracle and baselines."""
 
 import json
+import pickle
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from nfc_gym.core.files import replacing
 from nfc_gym.measured.bench import Bench, make_bench
 from nfc_gym.measured.dataset import load
 from nfc_gym.measured.export import unpack
@@ -20,10 +22,11 @@ from .case import chi2, oracle, sized, true_effects, write_case
 from .kinds import Outside
 from .outside import Both
 from .robots import ROBOTS, Robot
-from .row import Row, Task
+from .row import NAN, Row, Task
 from .score import estimates, misses_foretold, psi_estimates, score
 
 LEAST, MOST = 1.3, 30.0  # X / X_null of what is hidden, log-uniform
+_CASE = "case.pickle"  # of a trial under way
 _PLACES = 3  # that are drawn until an effect acts: friction at a joint that these motions never turn is no effect
 _NEAR = 0.9  # of the least X / X_null that counts as acting
 Model = tuple[Plant, Array]
@@ -44,13 +47,25 @@ class Case:
         return self.machine.hidden
 
 
+def begun(task: Task, folder: Path) -> tuple[Case, bool]:
+    """The case of a trial, and whether an interrupted trial left it in the folder."""
+    kept = folder / _CASE
+    if kept.is_file():
+        machine, ratio, mapping = pickle.loads(kept.read_bytes())
+        return Case(machine, _outside(task), ratio, folder / mapping), True
+    case = prepared(task, folder)
+    with replacing(kept) as part:
+        part.write_bytes(pickle.dumps((case.machine, case.ratio, case.mapping.name)))
+    return case, False
+
+
 def prepared(task: Task, folder: Path) -> Case:
     """Draw the machine of a trial and write its logs and mapping into an empty folder."""
     rng = np.random.default_rng(task.seed)
     kit = ROBOTS[task.robot].showing(task.families)
     psi = draw_psi(kit.psi, rng)
     row = Row(task.robot, task.group, list(task.families), task.seed)
-    hidden, outside = _hide(row, task, kit, psi, rng, folder / "sizing")
+    hidden, outside = _hide(row, task, kit, psi, rng, folder / "sizing"), _outside(task)
     machine = Machine(psi, hidden)
     seeds = [int(s) for s in rng.integers(2**31, size=task.size.logs)]
     exclude = outside.exclude if outside else ()
@@ -59,25 +74,32 @@ def prepared(task: Task, folder: Path) -> Case:
 
 
 def trial(task: Task, folder: Path, threads: int = 1) -> Row:
-    """Run one trial in an empty folder."""
+    """Run one trial in a folder, empty or of the same trial, interrupted: then it goes on from there."""
     began = time.process_time()
     kit, row = ROBOTS[task.robot], Row(task.robot, task.group, list(task.families), task.seed)
-    case = prepared(task, folder)
+    case, resumed = begun(task, folder)
     machine, hidden, outside, psi = case.machine, case.hidden, case.outside, case.machine.psi
-    report = close_loop(case.mapping, folder / "report", seed=task.seed % 2**31, jobs=threads)
+    done = folder / "report" / "report.json"
+    if not done.is_file():
+        close_loop(case.mapping, folder / "report", seed=task.seed % 2**31, jobs=threads)
+    report = json.loads(done.read_text())
     row.hidden, row.seconds, row.ratio = hidden.text, report["seconds"], case.ratio
     score(row, report, hidden, outside)
     row.effect, row.psi = estimates(report, hidden), psi_estimates(report, psi, kit.weighed)
     if outside is None:
         _compare(row, task, folder, report, machine)
-    row.cpu = time.process_time() - began
+    row.cpu = NAN if resumed else time.process_time() - began  # of a process that was killed nobody knows
     return row
 
 
-def _hide(
-    row: Row, task: Task, kit: Robot, psi: dict[str, float], rng: np.random.Generator, folder: Path
-) -> tuple[Hidden, Outside | None]:
-    """What the machine hides, each effect sized alone; and how it is judged if the library has no law for it."""
+def _outside(task: Task) -> Outside | None:
+    """How an effect is judged that the library has no law for."""
+    kind = ROBOTS[task.robot].outside[task.families[0]] if task.group == "outside" else None
+    return kind if isinstance(kind, Outside) else None
+
+
+def _hide(row: Row, task: Task, kit: Robot, psi: dict[str, float], rng: np.random.Generator, folder: Path) -> Hidden:
+    """What the machine hides, each effect sized alone."""
     table = kit.outside if task.group == "outside" else kit.named
     found, ratios = [], []
     for family in task.families:
@@ -89,9 +111,7 @@ def _hide(
         found.append(hidden)
         ratios.append(ratio)
     row.ratio = min(ratios, default=float("nan"))
-    kind = table[task.families[0]] if task.group == "outside" else None
-    hidden = found[0] if len(found) == 1 else Both(found) if found else Hidden()
-    return hidden, kind if isinstance(kind, Outside) else None
+    return found[0] if len(found) == 1 else Both(found) if found else Hidden()
 
 
 def _compare(row: Row, task: Task, folder: Path, report: dict, machine: Machine) -> None:

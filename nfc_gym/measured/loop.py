@@ -233,7 +233,7 @@ def _fold(
     outcome["findings"] += advice.findings
     if found.rounds[-1].reason == REASON:
         outcome["findings"].append({"kind": "advice", "text": ADVICE})
-    outcome["seconds"] = round(time.monotonic() - began, 1)
+    outcome["seconds"] = round(stages.seconds, 1)
     write(out, bench, final, outcome)
     stages.finish()
     claimed = "; ".join(e["sentence"] for e in outcome["effects"]) or "no effect claimed"

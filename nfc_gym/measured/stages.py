@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-_FOLDER, _LOCK = ".stages", ".lock"
+_FOLDER, _LOCK, _SECONDS = ".stages", ".lock", "seconds"
 OUTPUTS = ("report.json", "report.html", "model.xml", "effects.yaml", "fit.json")
 
 
@@ -53,6 +54,12 @@ class Stages:
             shutil.rmtree(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self.folder / "key", key)
+        self._began, self._before = time.monotonic(), float(self.get(_SECONDS) or 0.0)
+
+    @property
+    def seconds(self) -> float:
+        """Spent on the run [s]; what was interrupted counts up to its last finished stage."""
+        return self._before + time.monotonic() - self._began
 
     def get(self, name: str) -> Any:
         """Result of a finished stage, or None."""
@@ -61,7 +68,8 @@ class Stages:
 
     def put(self, name: str, result: Any) -> None:
         """Keep a finished stage."""
-        write_whole(self.folder / f"{name}.json", json.dumps(result))
+        for file, content in ((name, result), (_SECONDS, self.seconds)):
+            write_whole(self.folder / f"{file}.json", json.dumps(content))
 
     def finish(self) -> None:
         """The results are written: forget the stages, and remember whose they are."""

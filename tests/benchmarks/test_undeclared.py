@@ -127,6 +127,47 @@ def test_a_limit_that_does_nothing_down_to_some_value_is_enclosed() -> None:
     assert min(abs(math.log(r / 3.0)) for _, r in tried) < 0.1
 
 
+def test_a_trial_that_was_killed_goes_on_from_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    m = modules()
+    task = tasks("--trials", "1")[0]
+    kept, found = m.plan.Kept(tmp_path), m.row.Row(task.robot, task.group, list(task.families), task.seed)
+    ways: list[BaseException | None] = [KeyboardInterrupt(), ValueError("a bug"), None]
+
+    def trial(task: Any, folder: Path, threads: int) -> Any:
+        there.append((folder / "half").exists())
+        (folder / "half").write_text("")
+        if (raised := ways.pop(0)) is not None:
+            raise raised
+        (folder / "report").mkdir()
+        for name in ("report.html", "report.json"):
+            (folder / "report" / name).write_text("{}")
+        return found
+
+    there: list[bool] = []
+    monkeypatch.setattr(m.plan, "trial", trial)
+    for error in (KeyboardInterrupt, ValueError):
+        with pytest.raises(error):
+            m.plan.one(task, 1, kept)
+    assert m.plan.one(task, 1, kept) is found
+    assert there == [False, True, False]  # one that failed begins anew
+    assert not list(kept.begun.iterdir())
+    assert (kept.reports / task.name / "report.json").is_file()
+
+
+def test_a_machine_is_the_same_when_its_trial_goes_on(tmp_path: Path) -> None:
+    trial = import_module("standin.trial")
+    m = modules()
+    task = m.row.Task("quadcopter", "single", ("wind",), 7, m.row.Size(3, 0.6, ("wind",), 1))
+    first, resumed = trial.begun(task, tmp_path)
+    assert not resumed
+    log = (tmp_path / "logs" / "run_00.csv").read_bytes()
+    again, resumed = trial.begun(task, tmp_path)
+    assert resumed
+    assert again.hidden.text == first.hidden.text
+    assert (again.machine.psi, again.ratio, again.mapping) == (first.machine.psi, first.ratio, first.mapping)
+    assert (tmp_path / "logs" / "run_00.csv").read_bytes() == log
+
+
 # ---- resuming -------------------------------------------------------------------------------------------------------
 
 

@@ -16,7 +16,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from nfc_gym.core import InputError
-from nfc_gym.measured import loop
+from nfc_gym.measured import loop, stages
 from nfc_gym.measured.loop import close_loop
 
 MODEL = """
@@ -207,3 +207,19 @@ def test_a_mapping_without_parameters_is_fitted_too(tmp_path: Path) -> None:
     report = close_loop(mapping, tmp_path / "out", jobs=1, fold="run_0")
     assert [e["id"] for e in report["effects"]] == ["coulomb:hinge"]
     assert report["parameters"] == []
+
+
+def test_the_time_of_a_run_counts_what_was_before_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(stages.time, "monotonic", lambda: now[0])
+    first = stages.Stages(tmp_path, "key", overwrite=False, resume=True)
+    now[0] += 30
+    first.put("calibrated", {})
+    now[0] += 500  # lost: no stage was finished in them
+    again = stages.Stages(tmp_path, "key", overwrite=False, resume=True)
+    now[0] += 5
+    assert again.seconds == 35
+    other = stages.Stages(tmp_path, "key", overwrite=False, resume=False)
+    assert other.seconds == 0
