@@ -11,7 +11,8 @@ from nfc_gym.adaptation.extended import read_found
 from nfc_gym.adaptation.extension import Extension
 from nfc_gym.adaptation.handover import POLICY
 from nfc_gym.adaptation.logs import write_logs
-from nfc_gym.adaptation.trajectory import Trajectory, execute
+from nfc_gym.adaptation.trajectory import execute
+from nfc_gym.core.files import write_whole
 from nfc_gym.measured.loop import close_loop
 
 from .learning import EPISODE, Learned, opened
@@ -25,7 +26,7 @@ NOISE = {
     "body:pos": SENSORS["pos"], "body:quat": SENSORS["quat"], "body:linvel": SENSORS["linvel"],
     "body:angvel": SENSORS["angvel"], "joint:pos": SENSORS["pos"], "joint:vel": SENSORS["vel"],
 }  # fmt: skip
-_REPORT = "report"
+_LOGS, _REPORT = "logs", "report"
 _FEW = 2  # episodes that judge inside `hand_over`, whose figures are not used: the table's own judge
 
 
@@ -41,18 +42,20 @@ class Unwatched:
 
 
 def looped(job: Job) -> Learned:
-    """Execute, close the loop on these logs, fine-tune in the model that was found."""
-    world, budget, environment = job.world, job.budget, f"nfc_gym/{job.world.place}-v0"
-    policy = opened(job.nominal, budget.device)
-    single = world.single(context=["psi"], **job.settings)
-    executed = [execute(policy, single, Unwatched(), 1.0, job.seed + k, EPISODE) for k in range(budget.executed)]
-    report = _explained(job, executed, environment)
+    """Execute, close the loop on these logs, fine-tune in the model that was found.
+
+    What was executed is kept as logs, so that a job that was interrupted goes on from these.
+    """
+    budget, environment = job.budget, f"nfc_gym/{job.world.place}-v0"
+    returns = _executed(job, environment)
+    report = _explained(job)
     found = {
         "verdict": report["verdict"], "claims": [claim["id"] for claim in report["effects"]],
-        "chi2": report["chi2"], "loop_seconds": report["seconds"], "executed": [t.total for t in executed],
+        "chi2": report["chi2"], "loop_seconds": report["seconds"], "executed": returns,
     }  # fmt: skip
     extension = Extension(read_found(job.folder / _REPORT), environment)
     if not extension.effects and not extension.moved:
+        policy = opened(job.nominal, budget.device)
         return Learned(policy, [], found | {"learned": "nothing: all is as the model has it"})
     config = FineTuneConfig(steps=budget.steps, envs=budget.envs, seed=job.seed, curve=max(2, budget.judged))
     told = hand_over(
@@ -60,18 +63,31 @@ def looped(job: Job) -> Learned:
         device=budget.device, threads=budget.threads,
     )  # fmt: skip
     adapted = load_policy(job.folder / "adapted" / POLICY, budget.device)
-    return Learned(
-        adapted, [], found | {"learned": [e["sentence"] for e in told["effects"]], "seconds": told["seconds"]}
-    )
+    learned = [effect["sentence"] for effect in told["effects"]]
+    return Learned(adapted, [], found | {"learned": learned, "seconds": told["seconds"]})
 
 
-def _explained(job: Job, executed: list[Trajectory], environment: str) -> dict[str, Any]:
-    """The loop's report; a finished one is read back, and an interrupted loop goes on from the same logs."""
-    done = job.folder / _REPORT / "report.json"
+def _executed(job: Job, environment: str) -> list[float]:
+    """Returns of the episodes in the true world, whose logs lie in the job's folder afterwards."""
+    done = job.folder / "executed.json"
     if done.is_file():
         return json.loads(done.read_text())
-    joints = job.world.kind.compile(0).njnt > 1
+    world, policy = job.world, opened(job.nominal, job.budget.device)
+    single, count = world.single(context=["psi"], **job.settings), job.budget.executed
+    executed = [execute(policy, single, Unwatched(), 1.0, job.seed + k, EPISODE) for k in range(count)]
+    joints = world.kind.compile(0).njnt > 1
     noise = {kind: sd for kind, sd in NOISE.items() if joints or not kind.startswith("joint")}
-    shutil.rmtree(job.folder / "logs", ignore_errors=True)
-    mapping = write_logs(executed, environment, job.folder / "logs", noise=noise)
-    return close_loop(mapping, job.folder / _REPORT, seed=job.seed, jobs=job.budget.threads)
+    shutil.rmtree(job.folder / _LOGS, ignore_errors=True)
+    write_logs(executed, environment, job.folder / _LOGS, noise=noise)
+    returns = [trajectory.total for trajectory in executed]
+    write_whole(done, json.dumps(returns))
+    return returns
+
+
+def _explained(job: Job) -> dict[str, Any]:
+    """The loop's report; a finished one is read back."""
+    done = job.folder / _REPORT / "report.json"
+    if not done.is_file():
+        mapping = job.folder / _LOGS / "mapping.yaml"
+        close_loop(mapping, job.folder / _REPORT, seed=job.seed, jobs=job.budget.threads)
+    return json.loads(done.read_text())
