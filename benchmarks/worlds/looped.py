@@ -78,7 +78,7 @@ def _executed(job: Job, environment: str) -> list[float]:
     joints = world.kind.compile(0).njnt > 1
     noise = {kind: sd for kind, sd in NOISE.items() if joints or not kind.startswith("joint")}
     shutil.rmtree(job.folder / _LOGS, ignore_errors=True)
-    write_logs(executed, environment, job.folder / _LOGS, noise=noise)
+    write_logs(executed, job.folder / _LOGS, environment=environment, noise=noise)
     returns = [trajectory.total for trajectory in executed]
     write_whole(done, json.dumps(returns))
     return returns

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from nfc_gym.adaptation.algorithm import AdaptConfig, Adapted, adapt
     from nfc_gym.adaptation.finetuning import FineTuneConfig
     from nfc_gym.adaptation.handover import hand_over
+    from nfc_gym.adaptation.logs import write_logs
     from nfc_gym.adaptation.policy import Policy, load_policy
     from nfc_gym.adaptation.pretraining import pretrain
     from nfc_gym.adaptation.sight import Sight
@@ -35,10 +36,11 @@ _HOME = {
     "ppo_agent": "agent",
     "pretrain": "pretraining",
     "sac_agent": "agent",
+    "write_logs": "logs",
 }
 __all__ = [
     "AdaptConfig", "Adapted", "Agent", "FineTuneConfig", "LearnConfig", "Learned", "Policy", "Sight", "SplitPiH",
-    "adapt", "hand_over", "learn_from_mission", "load_policy", "ppo_agent", "pretrain", "sac_agent",
+    "adapt", "hand_over", "learn_from_mission", "load_policy", "ppo_agent", "pretrain", "sac_agent", "write_logs",
 ]  # fmt: skip
 
 export(__name__, _HOME, "rl")

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from nfc_gym.adaptation import normal as normality
-from nfc_gym.adaptation import resume
 from nfc_gym.adaptation.digests import of_detector, of_network
+from nfc_gym.adaptation.gathered import read_mission
 from nfc_gym.adaptation.normal import Normal, quiet_trajectories
 from nfc_gym.adaptation.relearning import relearned
 from nfc_gym.adaptation.settings import require_number
@@ -46,7 +46,7 @@ from nfc_gym.inference.train import TrainConfig
 from nfc_gym.simulate.machine import MOTOR, full_id
 
 Array = NDArray[np.float64]
-REPORT, STATE = "learned.json", "state.safetensors"
+REPORT = "learned.json"
 RATE = 0.05  # false-positive rate of windows, where a detector does not say which it was set for
 _OF = {"posterior": ("simulations", "effects", "motor"), "detector": ("rate",)}  # settings of one part alone
 _TOLD = 256  # windows by which a set is told from another of its size
@@ -176,13 +176,9 @@ def _mission(
 ) -> tuple[list[Trajectory], str, Path | None]:
     """Trajectories, the simulator's id, and where to keep what is learned."""
     if isinstance(mission, str | Path):
-        path = Path(mission)
-        state = path / STATE
-        if not state.is_file():
-            raise InputError(f"{path}: no mission; want a folder that `adapt(..., folder=...)` wrote")
-        environment = environment or resume.described(state).get("environment")
-        trajectories = list(Dataset(path, int(resume.plain(state)["t"])))
-        folder = path / "learned" if folder is None else folder
+        trajectories, own = read_mission(mission)
+        environment = environment or own
+        folder = Path(mission) / "learned" if folder is None else folder
     else:
         trajectories = list(mission)
     if not trajectories:

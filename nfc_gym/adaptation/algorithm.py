@@ -23,6 +23,7 @@ from nfc_gym.adaptation.beliefs import Inference, inference_of, require_spoken, 
 from nfc_gym.adaptation.choice import Choice, weights_of
 from nfc_gym.adaptation.earned import RATE, chance, require_home
 from nfc_gym.adaptation.evaluate import evaluate
+from nfc_gym.adaptation.gathered import STATE
 from nfc_gym.adaptation.gathering import Cluster, RayWorlds, cluster_of, portable, spread
 from nfc_gym.adaptation.given import check_fit, episode_of, run_folder, simulator_of, with_task
 from nfc_gym.adaptation.hallucination import hallucination
@@ -40,7 +41,6 @@ from nfc_gym.core.whole import require_whole
 from nfc_gym.inference.random import mixed
 from nfc_gym.wrappers.anomaly import opened
 
-STATE = "state.safetensors"
 _POINTS = 3  # how often weights are judged on the way of one mission's learning
 
 

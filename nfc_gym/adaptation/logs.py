@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from nfc_gym.adaptation.gathered import read_mission
 from nfc_gym.adaptation.trajectory import Trajectory
 from nfc_gym.core.errors import InputError
 from nfc_gym.envs.robot import DT
@@ -20,15 +21,16 @@ SHORTEST = 50  # control steps of a log: of less, no segment and its start could
 
 
 def write_logs(
-    trajectories: Iterable[Trajectory], environment: str, folder: str | Path, *,
+    mission: str | Path | Iterable[Trajectory], folder: str | Path, *, environment: str | None = None,
     noise: Mapping[str, float] | None = None,
 ) -> Path:  # fmt: skip
-    """Write trajectories as logs that `nfc-gym close-loop` reads.
+    """Write what was executed as logs that `nfc-gym close-loop` reads.
 
     Args:
-      trajectories: of `execute` or of a mission's folder (`Dataset`), with state estimates. Of fewer than `SHORTEST`
-        control steps, as of a robot that fell at once, none is written.
-      environment: id of the simulator, on flat ground: what the logs are compared with.
+      mission: the `folder` of `adapt`, or trajectories, with state estimates. Of those of fewer than `SHORTEST` control
+        steps, as of a robot that fell at once, none is written.
+      environment: id of the simulator, on flat ground: what the logs are compared with; default the mission's own, if
+        its folder says so.
       folder: for `model.xml`, `mapping.yaml`, `episode_0000.parquet`, ...; new or empty.
       noise: standard deviations of the estimates by kind of channel (`body:pos`, `body:quat`, `body:linvel`,
         `body:angvel`, `joint:pos`, `joint:vel`) [m, rad, m/s, rad/s]; default those of a simulation without noise.
@@ -37,9 +39,16 @@ def write_logs(
       The mapping file, in which psi of the environment is what may be calibrated.
 
     Raises:
-      InputError: no trajectory is long enough, or has estimates of this robot's state; rough ground, of which no model
-        is known; a folder that holds logs; a kind of channel that no log has.
+      InputError: no mission, or it does not say whose; no trajectory is long enough, or one has no estimates of this
+        robot's state; rough ground, of which no model is known; a folder that holds logs; a kind of channel that no log
+        has.
     """
+    own: str | None = None
+    if isinstance(mission, str | Path):
+        mission, own = read_mission(mission)
+    environment = environment or own
+    if environment is None:
+        raise InputError("write_logs: say which simulator's mission this was: environment='nfc_gym/...'")
     folder, machine = Path(folder), Machine(environment)
     name = machine.environment
     if folder.exists() and any(folder.iterdir()):
@@ -54,7 +63,7 @@ def write_logs(
         log.columns = [column for column in log.columns if not column.name.startswith("sensor:")]
         log.describe()
         sims = machine.simulations(1, 1, [])
-        for trajectory in trajectories:
+        for trajectory in mission:
             if len(trajectory) >= SHORTEST:
                 log.write(_record(trajectory, machine, sims))
         if not log.count:

@@ -38,7 +38,7 @@ def test_the_measured_loop_reads_back_what_was_estimated_and_commanded(tmp_path:
     from nfc_gym.measured.dataset import load
 
     runs = [driven(seed) for seed in range(3)]
-    mapping = write_logs(runs, JACKAL, tmp_path / "logs", noise={"body:pos": 0.02, "joint:vel": 0.3})
+    mapping = write_logs(runs, tmp_path / "logs", environment=JACKAL, noise={"body:pos": 0.02, "joint:vel": 0.3})
     dataset = load(mapping)
     assert len(dataset.logs) == 3
     log, run = dataset.logs[0], runs[0]
@@ -60,7 +60,7 @@ def test_a_simulation_with_its_own_psi_explains_its_own_logs(tmp_path: Path) -> 
     from nfc_gym.measured.bench import make_bench
     from nfc_gym.measured.dataset import load
 
-    bench = make_bench(load(write_logs([driven(s) for s in range(3)], JACKAL, tmp_path / "logs")), 1)
+    bench = make_bench(load(write_logs([driven(s) for s in range(3)], tmp_path / "logs", environment=JACKAL)), 1)
     problem = bench.problem(list(bench.dataset.logs))
     residual = problem.residual(bench.plant, bench.plant.null[None])
     # The same model, states and commands: what is left is the solver, which does not begin from its last solution here.
@@ -69,15 +69,19 @@ def test_a_simulation_with_its_own_psi_explains_its_own_logs(tmp_path: Path) -> 
 
 def test_what_cannot_be_written_is_refused_by_name(tmp_path: Path) -> None:
     run = driven(0)
+    with pytest.raises(InputError, match="say which simulator's mission"):
+        write_logs([run], tmp_path / "whose")
+    with pytest.raises(InputError, match="no mission; want a folder"):
+        write_logs(tmp_path, tmp_path / "none")
     with pytest.raises(InputError, match="rough ground"):
-        write_logs([run], "nfc_gym/JackalRough-v0", tmp_path / "rough")
+        write_logs([run], tmp_path / "rough", environment="nfc_gym/JackalRough-v0")
     with pytest.raises(InputError, match=f"no trajectory of {SHORTEST} control steps"):
-        write_logs([driven(0, SHORTEST - 1)], JACKAL, tmp_path / "short")
+        write_logs([driven(0, SHORTEST - 1)], tmp_path / "short", environment=JACKAL)
     with pytest.raises(InputError, match="AntFlat-v0 wants"):
-        write_logs([run], "nfc_gym/AntFlat-v0", tmp_path / "ant")
+        write_logs([run], tmp_path / "ant", environment="nfc_gym/AntFlat-v0")
     with pytest.raises(InputError, match="noise of 'wheel:vel': the channels are body:angvel"):
-        write_logs([run], JACKAL, tmp_path / "noise", noise={"wheel:vel": 0.1})
+        write_logs([run], tmp_path / "noise", environment=JACKAL, noise={"wheel:vel": 0.1})
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="full is not empty"):
-        write_logs([run], JACKAL, tmp_path / "full")
+        write_logs([run], tmp_path / "full", environment=JACKAL)
