@@ -12,7 +12,7 @@ from carts import BOX, cart, everything
 from typer.testing import CliRunner, Result
 
 from nfc_gym import InputError
-from nfc_gym.adaptation import afterwards, resume
+from nfc_gym.adaptation import afterwards, gathered, resume
 from nfc_gym.adaptation.afterwards import Learned
 from nfc_gym.adaptation.normal import quiet_windows, windows_of, with_beside
 from nfc_gym.adaptation.trajectory import Dataset
@@ -34,7 +34,7 @@ def mission(tmp_path_factory: pytest.TempPathFactory, detector: WindowDetector) 
     for k in range(TRAJECTORIES):
         dataset.add(cart(400, 2000 + k, 4.0))
     of = {"environment": "nfc_gym/JackalFlat-v0"}
-    resume.save(folder / afterwards.STATE, {"none": torch.nn.Linear(1, 1)}, None, {"t": TRAJECTORIES}, of)
+    resume.save(folder / gathered.STATE, {"none": torch.nn.Linear(1, 1)}, None, {"t": TRAJECTORIES}, of)
     detector_file.save(folder / "given.safetensors", detector)
     return folder
 

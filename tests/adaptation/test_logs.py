@@ -12,7 +12,7 @@ pytest.importorskip("torchrl", reason="missions run on TorchRL")
 
 import nfc_gym  # noqa: F401 (registers the ids)
 from nfc_gym.adaptation.logs import SHORTEST, write_logs
-from nfc_gym.adaptation.trajectory import Trajectory, execute
+from nfc_gym.adaptation.trajectory import Dataset, Trajectory, execute
 from nfc_gym.core.errors import InputError
 
 JACKAL = "nfc_gym/JackalFlat-v0"
@@ -54,6 +54,22 @@ def test_the_measured_loop_reads_back_what_was_estimated_and_commanded(tmp_path:
     assert "noise: 0.02" in text
     assert "noise: 0.3" in text
     assert "sensor:" not in text
+
+
+def test_a_missions_folder_is_enough(tmp_path: Path) -> None:
+    import torch
+
+    from nfc_gym.adaptation import resume
+    from nfc_gym.adaptation.gathered import STATE
+
+    gathered = Dataset(tmp_path / "mission")
+    for seed in range(2):
+        gathered.add(driven(seed))
+    gathered.add(driven(9))  # of a mission that was interrupted before it counted this one
+    of = {"environment": JACKAL}
+    resume.save(tmp_path / "mission" / STATE, {"none": torch.nn.Linear(1, 1)}, None, {"t": 2}, of)
+    write_logs(tmp_path / "mission", tmp_path / "logs")
+    assert len(list((tmp_path / "logs").glob("*.parquet"))) == 2
 
 
 def test_a_simulation_with_its_own_psi_explains_its_own_logs(tmp_path: Path) -> None:
