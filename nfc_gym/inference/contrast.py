@@ -110,8 +110,9 @@ class Contrast(Learner):
     def closeness(self, states: Tensor, actions: Tensor) -> Tensor:
         """(B,) cosine between the halves of windows (B, H+1, s), (B, H, a)."""
         h = self.span
-        halves = ((states[:, : h + 1], actions[:, :h]), (states[:, -h - 1 :], actions[:, -h:]))
-        context, target = (self.project(self.encoder(s, a)) for s, a in halves)
+        # Both halves in one pass: of a single window the calls cost more than the numbers.
+        halves = (torch.cat([states[:, : h + 1], states[:, -h - 1 :]]), torch.cat([actions[:, :h], actions[:, -h:]]))
+        context, target = self.project(self.encoder(*halves)).chunk(2)
         return nn.functional.cosine_similarity(context, target, dim=1)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
@@ -135,7 +136,8 @@ class Contrast(Learner):
           InputError: windows shorter than H, of other widths, or not finite.
         """
         states, actions = checked(self, states, actions)
-        self.eval()
+        if self.training:  # modules are walked through one by one
+            self.eval()
         parts = []
         for at in range(0, len(states), _ROWS):
             pair = (torch.as_tensor(x[at : at + _ROWS], dtype=torch.float32, device=self.spread.device)

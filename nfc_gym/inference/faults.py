@@ -131,7 +131,8 @@ class FaultClassifier(Learner):
     @torch.no_grad()
     def _logits(self, states: Array, actions: Array) -> Array:
         states, actions = checked(self, states, actions)
-        self.eval()
+        if self.training:  # modules are walked through one by one
+            self.eval()
         device = next(self.parameters()).device
         parts = [np.zeros((0, len(self.config.kinds)))]
         for at in range(0, len(states), _ROWS):
