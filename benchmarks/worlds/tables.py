@@ -146,6 +146,8 @@ def table_two(cells: Cells, methods: Iterable[str], rng: np.random.Generator) ->
         rows = []
         for name in methods:
             why, own = cells.missing("II", place, name), groups(cells, place, name)
+            if why is None and not cells.of("II", place, name):
+                continue  # nobody ran it there
             value = bootstrap(list(own.values()), rng)
             returns = bootstrap([np.array(e.returns) for e in cells.of("II", place, name).values()], rng)
             theirs, ours = paper.return_of(name, place), min_max(cells, place, name)
@@ -229,6 +231,8 @@ def table_three(cells: Cells, methods: Iterable[str], rng: np.random.Generator) 
         for place in cells.places("III"):
             ground, own = place.removeprefix("Jackal"), cells.of("III", place, name)
             why = cells.missing("III", place, name)
+            if why is None and not own:
+                continue  # nobody ran it there
             row = [METHODS[name].title, ground, _by_scenario(own)]
             for key, words in paper.FIGURES.items():
                 value = bootstrap([np.array(getattr(e, key), float) for e in own.values()], rng)
