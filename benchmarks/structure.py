@@ -91,22 +91,13 @@ def run(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     print(f"seed {seed} (drawn at run time unless given)", flush=True)
     course = Course(96, 64, 1, small=True) if args.quick else Course(args.windows, epochs=args.epochs)
     course = replace(course, mirror=not args.no_mirror)
-    belongs(
-        folder,
-        {
-            "seed": seed,
-            "windows": course.windows,
-            "epochs": course.epochs,
-            "small": course.small,
-            "mirror": course.mirror,
-        },
-    )
+    settings = {name: getattr(course, name) for name in ("windows", "epochs", "small", "mirror")}
+    belongs(folder, {"seed": seed, **settings})
     rows: list[dict[str, Any]] = []
     for robot in args.robots:
         head = taught(robot, course, folder, seed, args.jobs, args.device)
-        told = _kept(
-            folder / f"{robot}_judged.json", lambda r=robot, h=head: judged(r, h, course, folder, seed, args.jobs)
-        )
+        how = (robot, head, course, folder, seed, args.jobs)
+        told = _kept(folder / f"{robot}_judged.json", lambda how=how: judged(*how))
         rows += told_rows(robot, told)
         trials = []
         for i, task in enumerate(tasks(robot, args, seed)):

@@ -91,8 +91,7 @@ def taught(robot: str, course: Course, folder: Path, seed: int, jobs: int = 1, d
         config = replace(NETWORK, encoder="nn", width=64, features=64, hidden=64) if course.small else NETWORK
         train_structure(
             windows.folders[0], head, replace(TRAINING, epochs=course.epochs, seed=seed),
-            config=config, noise=NOISE[robot], device=device, threads=jobs, mirror=course.mirror,
-            report=Spoken(),
+            config=config, noise=NOISE[robot], device=device, threads=jobs, mirror=course.mirror, report=Spoken(),
         )  # fmt: skip
     return head
 
