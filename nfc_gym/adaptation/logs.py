@@ -40,8 +40,8 @@ def write_logs(
 
     Raises:
       InputError: no mission, or it does not say whose; no trajectory is long enough, or one has no estimates of this
-        robot's state; rough ground, of which no model is known; a folder that holds logs; a kind of channel that no log
-        has.
+        robot's state; rough ground, of which no model is known; a folder that is not empty; noise that is none, or of a
+        kind of channel that no log has.
     """
     own: str | None = None
     if isinstance(mission, str | Path):
@@ -55,6 +55,14 @@ def write_logs(
         raise InputError(f"{folder} is not empty: choose a new folder for the logs")
     if machine.rough:
         raise InputError(f"{name}: logs on rough ground need a model of it; only flat ground can be written")
+    for kind, sd in (noise or {}).items():
+        if not (np.isfinite(sd) and sd > 0):
+            raise InputError(f"noise of {kind!r} is {sd}; want a standard deviation, finite and above 0")
+    # All is looked at before anything is written: what is refused leaves no half of a folder behind.
+    sims = machine.simulations(1, 1, [])
+    records = [_record(trajectory, machine, sims) for trajectory in mission if len(trajectory) >= SHORTEST]
+    if not records:
+        raise InputError(f"no trajectory of {SHORTEST} control steps or more: there is nothing to explain")
     env = gymnasium.make(name, context=[])
     try:
         env.reset(seed=0)
@@ -62,12 +70,8 @@ def write_logs(
         # What a robot feels is not part of a state estimate.
         log.columns = [column for column in log.columns if not column.name.startswith("sensor:")]
         log.describe()
-        sims = machine.simulations(1, 1, [])
-        for trajectory in mission:
-            if len(trajectory) >= SHORTEST:
-                log.write(_record(trajectory, machine, sims))
-        if not log.count:
-            raise InputError(f"no trajectory of {SHORTEST} control steps or more: there is nothing to explain")
+        for record in records:
+            log.write(record)
     finally:
         env.close()
     return folder / "mapping.yaml"

@@ -97,6 +97,10 @@ def test_what_cannot_be_written_is_refused_by_name(tmp_path: Path) -> None:
         write_logs([run], tmp_path / "ant", environment="nfc_gym/AntFlat-v0")
     with pytest.raises(InputError, match="noise of 'wheel:vel': the channels are body:angvel"):
         write_logs([run], tmp_path / "noise", environment=JACKAL, noise={"wheel:vel": 0.1})
+    with pytest.raises(InputError, match="noise of 'body:pos' is -1"):
+        write_logs([run], tmp_path / "noise", environment=JACKAL, noise={"body:pos": -1.0})
+    left = [f for name in ("short", "ant", "noise") if (tmp_path / name).exists() for f in (tmp_path / name).iterdir()]
+    assert not left
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="full is not empty"):
